@@ -1,9 +1,7 @@
 //! How long a scrape of a large robot takes: the capture thread never waits for it, but a core does.
 
-use std::sync::Arc;
-
 use criterion::{Criterion, criterion_group, criterion_main};
-use ros2probe_daemon::surface::{Board, Exposition, Format, Settings, SourceKind};
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources, Settings, SourceKind};
 use ros2probe_testing::sample_robot;
 
 fn scrape(criterion: &mut Criterion) {
@@ -17,10 +15,11 @@ fn scrape(criterion: &mut Criterion) {
             histograms,
             ..Settings::default()
         };
-        let board = Arc::new(Board::new(SourceKind::Wire, settings));
+        let sources = MetricSources::new(SourceKind::Wire, settings);
         let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
-        board.publish(snapshot, sample_robot::agent());
-        let exposition = Exposition::new(board);
+        let state = sources.latest.publish(snapshot, sample_robot::agent());
+        sources.limits.note(&state);
+        let exposition = Exposition::new(sources);
         for format in [Format::OpenMetrics, Format::Classic] {
             group.bench_function(format!("{name}_{format:?}"), |bencher| {
                 bencher.iter(|| exposition.render(format));

@@ -19,17 +19,17 @@ use tokio_util::sync::CancellationToken;
 use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
 use crate::logging::Log;
 use crate::privilege::{self, Identity, Role, Sandbox, Unprivileged};
-use crate::recording::{Recordings, Refusal, Snapshots};
+use crate::recording::{self, Recordings, Refusal, Snapshots};
 use crate::run::replay::Replay;
-use crate::run::{Run, Source};
+use crate::run::{Outputs, Run, Source};
 use crate::state::{StateDirectory, StateWriter};
 use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
 use crate::surface::api::{self, reload};
 use crate::surface::http::Server;
-use crate::surface::otlp::{self, Exporter, Host};
-use crate::surface::{Board, Exposition, Format, Settings};
+use crate::surface::otlp::{self, Exporter, Host, SpanQueue, SpanSink};
+use crate::surface::{Exposition, Format, MetricSources, Settings};
 use crate::watches::Watches;
 use crate::{control, memory};
 
@@ -69,8 +69,10 @@ pub struct Components<'a> {
     pub source: Source,
     /// The model, restored if it knew something before.
     pub observer: Observer,
-    /// Where snapshots are published.
-    pub board: Arc<Board>,
+    /// What metrics are made of.
+    pub sources: MetricSources,
+    /// Spans of sampled messages that wait for being exported.
+    pub spans: Arc<SpanQueue>,
     /// What is watched.
     pub watches: Arc<Watches>,
     /// Writes down what discovery knows.
@@ -103,24 +105,30 @@ impl Components<'_> {
     /// # Errors
     /// Returns [`Refusal`] if a snapshot cannot be kept.
     pub fn assemble(self) -> Result<AssembledAgent, Refusal> {
-        let Self { config, board, .. } = self;
+        let Self {
+            config, sources, ..
+        } = self;
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
             // The other half is for samples that are being assembled.
             bytes: config.limits.payload_bytes / 2,
         };
-        let subscriptions = Subscriptions::new(Arc::clone(&board), caps, self.stop.clone());
+        let subscriptions =
+            Subscriptions::new(Arc::clone(&sources.latest), caps, self.stop.clone());
         let subscriptions = Arc::new(subscriptions);
         let library = Arc::new(self.library);
-        let recordings = Arc::new(Recordings::new(
-            self.recordings,
-            config.recordings.limits,
-            caps.bytes / 2,
-            Arc::clone(&board),
-            Arc::clone(&subscriptions),
-            Arc::clone(&library),
-        ));
-        let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings, &board) {
+        let recordings = Arc::new(Recordings::new(recording::Components {
+            directory: self.recordings,
+            limits: config.recordings.limits,
+            queue_bytes: caps.bytes / 2,
+            latest: Arc::clone(&sources.latest),
+            events: Arc::clone(&sources.events),
+            caps: Arc::clone(&sources.limits),
+            figures: Arc::clone(&sources.recordings),
+            subscriptions: Arc::clone(&subscriptions),
+            library: Arc::clone(&library),
+        }));
+        let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings) {
             // A disk that is missing today is no reason to observe nothing.
             Err(refusal @ Refusal::NoDirectory)
                 if config.recordings.is_in(&config.state_directory) =>
@@ -130,10 +138,19 @@ impl Components<'_> {
             }
             started => started?,
         };
+        let outputs = Outputs {
+            latest: Arc::clone(&sources.latest),
+            events: Arc::clone(&sources.events),
+            limits: Arc::clone(&sources.limits),
+            spans: SpanSink {
+                queue: self.spans,
+                exports: sources.exports,
+            },
+        };
         let run = Run::new(
             self.source,
             self.observer,
-            Arc::clone(&board),
+            outputs,
             Arc::clone(&self.watches),
             Arc::clone(&subscriptions),
             self.stop.clone(),
@@ -142,7 +159,10 @@ impl Components<'_> {
         let history = (seconds > 0).then(|| History::new(seconds, config.limits.topics));
         let (reloader, reloads) = reload::channel();
         let context = api::Context {
-            board,
+            latest: sources.latest,
+            events: sources.events,
+            limits: sources.limits,
+            recording_figures: sources.recordings,
             watches: self.watches,
             subscriptions,
             recordings,
@@ -187,11 +207,20 @@ pub fn run(options: Options) -> Result<()> {
     )?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
-    let board = Board::new(source.kind(), Settings::new(&config));
-    let board = Arc::new(board.counting_lost_lines(log.lost_lines()));
-    let watches = Watches::new(Arc::clone(&board), config.watches.clone(), options.watch);
+    let sources = MetricSources {
+        lost_lines: log.lost_lines(),
+        ..MetricSources::new(source.kind(), Settings::new(&config))
+    };
+    let watches = Watches::new(
+        Arc::clone(&sources.limits),
+        Arc::clone(&sources.events),
+        Arc::clone(&sources.settings),
+        Arc::clone(sources.latest.bell()),
+        config.watches.clone(),
+        options.watch,
+    );
     let watches = Arc::new(watches.context("the watchlist is unusable")?);
-    let (server, mut control) = listeners(&config, &board)?;
+    let (server, mut control) = listeners(&config, &sources)?;
     // A replay is a person's own command, which reads and writes that person's files.
     if matches!(source, Source::Live(_)) {
         announce(privilege::become_own_user());
@@ -216,7 +245,8 @@ pub fn run(options: Options) -> Result<()> {
     };
     let worker = Worker::start(role).context("cannot start the working thread")?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
-    let exporter = export.map(|settings| Exporter::start(settings, &board));
+    let spans = Arc::<SpanQueue>::default();
+    let exporter = export.map(|settings| Exporter::start(settings, &sources, Arc::clone(&spans)));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, &watches);
@@ -245,7 +275,8 @@ pub fn run(options: Options) -> Result<()> {
         config: &config,
         source,
         observer,
-        board: Arc::clone(&board),
+        sources: sources.clone(),
+        spans,
         watches: Arc::clone(&watches),
         keeper: keeper.context("cannot start the threads that keep state")?,
         recordings,
@@ -264,7 +295,7 @@ pub fn run(options: Options) -> Result<()> {
     let parts = components.assemble().context("recordings.snapshots")?;
     if options.report && server.is_none() && control.is_empty() {
         let ended = worker.finish(parts.run);
-        print!("{}", Exposition::new(board).render(Format::Classic)?);
+        print!("{}", Exposition::new(sources).render(Format::Classic)?);
         return ended;
     }
     let runtime = tokio::runtime::Builder::new_current_thread()
@@ -276,7 +307,7 @@ pub fn run(options: Options) -> Result<()> {
         Arc::clone(&parts.context.snapshots),
     );
     let supervisor = Supervisor {
-        board: Arc::clone(&board),
+        sources: sources.clone(),
         config: configured,
         file,
         watches: Arc::clone(&watches),
@@ -298,7 +329,7 @@ pub fn run(options: Options) -> Result<()> {
     watches.finish();
     ended?;
     if options.report {
-        print!("{}", Exposition::new(board).render(Format::Classic)?);
+        print!("{}", Exposition::new(sources).render(Format::Classic)?);
     }
     Ok(())
 }
@@ -320,9 +351,9 @@ pub fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>), C
 }
 
 /// Binds the listeners that are opened before privileges are given up.
-fn listeners(config: &Config, board: &Arc<Board>) -> Result<(Option<Server>, api::Server)> {
+fn listeners(config: &Config, sources: &MetricSources) -> Result<(Option<Server>, api::Server)> {
     let web_config = config.metrics.web_config.as_deref();
-    let bind = |address| Server::bind(address, web_config, Arc::clone(board));
+    let bind = |address| Server::bind(address, web_config, sources.clone());
     let server = config.metrics.listen.map(bind).transpose()?;
     Ok((server, control::open(&config.api)?))
 }

@@ -15,7 +15,7 @@ use crate::surface::api::reload::{NotReloaded, Reloads};
 use crate::surface::events::SourceMonitor;
 use crate::surface::http::Server;
 use crate::surface::otlp::Exporter;
-use crate::surface::{Board, Settings};
+use crate::surface::{AgentEvent, EventLog, MetricSources, Settings, SnapshotCell};
 use crate::watches::Watches;
 use anyhow::{Context as _, Result, anyhow};
 use ros2probe_api::health::Reloaded;
@@ -36,7 +36,7 @@ const DRAIN: Duration = Duration::from_secs(3);
 
 /// The agent around its working thread.
 pub(crate) struct Supervisor {
-    pub(crate) board: Arc<Board>,
+    pub(crate) sources: MetricSources,
     /// As it was read at the start, before the command line changed it.
     pub(crate) config: Config,
     /// Where the configuration came from; read again on SIGHUP and when a client asks.
@@ -45,7 +45,7 @@ pub(crate) struct Supervisor {
     pub(crate) reloads: Reloads,
     pub(crate) stop: CancellationToken,
     pub(crate) log: Log,
-    /// Pushes what is on the board, where something is to be pushed.
+    /// Pushes metrics, where something is to be pushed.
     pub(crate) exporter: Option<Exporter>,
 }
 
@@ -137,7 +137,7 @@ impl Supervisor {
                     }
                 }
                 _ = tick.tick() => {
-                    if watchdog.check(&self.board) {
+                    if watchdog.check(&self.sources.latest, &self.sources.events) {
                         tick = ticks(watchdog.period.map_or(TICK, |period| period.min(TICK)));
                     }
                 }
@@ -185,7 +185,11 @@ impl Supervisor {
             .and_then(|config| self.take_over(&config));
         let _ = sd_notify::notify(&[NotifyState::Ready]);
         done.map_err(|mistakes| {
-            self.board.reload_failed(&mistakes.join("\n"));
+            let error = mistakes.join("\n");
+            self.sources
+                .events
+                .record(AgentEvent::ReloadFailed { error });
+            self.sources.settings.reload_failed();
             for line in &mistakes {
                 tracing::error!(error = line, "the configuration was not reloaded");
             }
@@ -202,10 +206,13 @@ impl Supervisor {
         }
         self.log.set(config.log);
         let in_force = self.watches.in_force();
-        self.board.reloaded(Settings {
-            watches: in_force.watchlist().watches().to_vec(),
+        let shown = in_force.watchlist().watches().to_vec();
+        let watches = shown.len();
+        self.sources.events.record(AgentEvent::Reloaded { watches });
+        self.sources.settings.reloaded(Settings {
+            watches: shown,
             // The caps are those the agent was started with.
-            limits: *self.board.limits().caps(),
+            limits: *self.sources.limits.caps(),
             ..Settings::new(config)
         });
         let watches = in_force.entries().len();
@@ -359,12 +366,12 @@ impl Watchdog {
 
     /// Not a timer: what feeds the watchdog is the capture's progress. Whether the agent has just
     /// become ready.
-    fn check(&mut self, board: &Board) -> bool {
+    fn check(&mut self, latest: &SnapshotCell, events: &EventLog) -> bool {
         let now = Instant::now();
-        let state = board.state();
+        let state = latest.state();
         let ready = state.ready(now);
         for event in self.sight.check(&ready, state.agent.attached_anew, now) {
-            board.events().record(event);
+            events.record(event);
         }
         // A restart does not bring back what is gone.
         if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {

@@ -15,7 +15,7 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 
 use crate::config::{Limit, ManyGlobs, Watch, Watchlist, check_globs};
 use crate::state::StateDirectory;
-use crate::surface::{AgentEvent, Board};
+use crate::surface::{AgentEvent, CaptureBell, EventLog, LimitFigures, SettingsCell};
 use persistence::WatchWriter;
 pub use persistence::{LoadedWatches, load};
 
@@ -89,7 +89,10 @@ pub struct Watches {
     in_force: ArcSwap<InForce>,
     /// For the capture thread: the latest list it has not taken yet.
     news: ArcSwapOption<Watchlist>,
-    board: Arc<Board>,
+    limits: Arc<LimitFigures>,
+    events: Arc<EventLog>,
+    shown: Arc<SettingsCell>,
+    bell: Arc<CaptureBell>,
     keeper: OnceLock<WatchWriter>,
 }
 
@@ -157,7 +160,10 @@ impl Watches {
     /// # Errors
     /// They are too many, or their globs are too many.
     pub fn new(
-        board: Arc<Board>,
+        limits: Arc<LimitFigures>,
+        events: Arc<EventLog>,
+        shown: Arc<SettingsCell>,
+        bell: Arc<CaptureBell>,
         configured: Vec<Watch>,
         command_line: Vec<Watch>,
     ) -> Result<Self, Refused> {
@@ -165,7 +171,10 @@ impl Watches {
             lists: Mutex::default(),
             in_force: ArcSwap::default(),
             news: ArcSwapOption::default(),
-            board,
+            limits,
+            events,
+            shown,
+            bell,
             keeper: OnceLock::new(),
         };
         let lists = Lists {
@@ -207,7 +216,7 @@ impl Watches {
         };
         let added: Vec<_> = watches.into_iter().filter(fits).map(Arc::new).collect();
         let left_out = asked - added.len();
-        self.board.limits().reached(Limit::Watches, left_out);
+        self.limits.reached(Limit::Watches, left_out);
         self.change(|lists, _| {
             lists.added = added;
             Ok(Done::Added)
@@ -286,7 +295,7 @@ impl Watches {
                 .retain(|watch| !is_for(watch, pattern, domain_id));
             Ok(Done::Replaced)
         })?;
-        self.board.events().record(AgentEvent::WatchRemoved {
+        self.events.record(AgentEvent::WatchRemoved {
             watch: pattern.to_owned(),
             domain_id,
         });
@@ -306,7 +315,7 @@ impl Watches {
     }
 
     fn cap(&self) -> usize {
-        self.board.limits().caps().watches
+        self.limits.caps().watches
     }
 
     fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
@@ -332,7 +341,7 @@ impl Watches {
             Ok(done)
         })?;
         if done != Done::Unchanged {
-            self.board.events().record(AgentEvent::WatchAdded {
+            self.events.record(AgentEvent::WatchAdded {
                 watch: watch.pattern.clone(),
                 domain_id: watch.domain_id.map(|id| id.0),
             });
@@ -356,10 +365,10 @@ impl Watches {
         let merged = InForce::merge(&new)?;
         let (count, cap) = (merged.entries.len(), self.cap());
         if count > cap {
-            self.board.limits().reached(Limit::Watches, count - cap);
+            self.limits.reached(Limit::Watches, count - cap);
             return Err(Refused::Full(cap));
         }
-        self.board.limits().set_used(Limit::Watches, count);
+        self.limits.set_used(Limit::Watches, count);
         if new.added != lists.added
             && let Some(keeper) = self.keeper.get()
         {
@@ -367,10 +376,10 @@ impl Watches {
         }
         *lists = new;
         self.news.store(Some(Arc::clone(&merged.watchlist)));
-        self.board.watch(merged.watchlist.watches());
+        self.shown.watch(merged.watchlist.watches());
         self.in_force.store(Arc::new(merged));
         drop(lists);
-        self.board.ring();
+        self.bell.ring();
         Ok(done)
     }
 }
@@ -407,12 +416,19 @@ mod tests {
     use std::sync::Barrier;
 
     use super::*;
-    use crate::surface::{Settings, SourceKind};
+    use crate::surface::{Settings, SnapshotCell, SourceKind};
 
     #[test]
     fn of_two_clients_that_add_the_same_watch_at_once_one_comes_second() {
-        let board = Arc::new(Board::new(SourceKind::Host, Settings::default()));
-        let watches = Watches::new(board, Vec::new(), Vec::new()).unwrap();
+        let watches = Watches::new(
+            Arc::new(LimitFigures::new(Default::default())),
+            Arc::new(EventLog::new()),
+            Arc::new(SettingsCell::new(Settings::default())),
+            Arc::clone(SnapshotCell::new(SourceKind::Host).bell()),
+            Vec::new(),
+            Vec::new(),
+        )
+        .unwrap();
         for round in 0..200 {
             let pattern = format!("/topic_{round}");
             let together = Barrier::new(2);

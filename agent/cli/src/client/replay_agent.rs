@@ -18,7 +18,7 @@ use ros2probe_daemon::config::{Config, Watch};
 use ros2probe_daemon::run::replay::{Replay, ReplayControl, pause_at};
 use ros2probe_daemon::run::{RunError, Source};
 use ros2probe_daemon::surface::api;
-use ros2probe_daemon::surface::{Board, Settings};
+use ros2probe_daemon::surface::{MetricSources, Settings};
 use ros2probe_daemon::watches::Watches;
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::observer::{self, Observer};
@@ -99,14 +99,21 @@ impl ReplayAgent {
             waiter = Some(other);
         }
         let source = Source::Replay(Box::new(replay));
-        let board = Arc::new(Board::new(source.kind(), Settings::new(&config)));
+        let sources = MetricSources::new(source.kind(), Settings::new(&config));
         let watched = match stop {
             Stop::AtEndMeasured | Stop::AtBeginningMeasured | Stop::Never(_) => {
                 Watch::named("/**").into_iter().collect()
             }
             Stop::AtEnd | Stop::AtBeginning => Vec::new(),
         };
-        let watches = Watches::new(Arc::clone(&board), Vec::new(), watched);
+        let watches = Watches::new(
+            Arc::clone(&sources.limits),
+            Arc::clone(&sources.events),
+            Arc::clone(&sources.settings),
+            Arc::clone(sources.latest.bell()),
+            Vec::new(),
+            watched,
+        );
         let watches = watches.map_err(|error| ClientError::Runtime {
             source: std::io::Error::other(error),
         })?;
@@ -121,7 +128,8 @@ impl ReplayAgent {
             config: &config,
             source,
             observer: Observer::new(settings),
-            board: Arc::clone(&board),
+            sources: sources.clone(),
+            spans: Arc::default(),
             watches,
             keeper: None,
             // A capture is recorded by `rp bag record`, not by the agent that replays it.
@@ -139,7 +147,7 @@ impl ReplayAgent {
         let outcome = Arc::new(OnceLock::new());
         let (how, seen, file) = (
             Arc::clone(&outcome),
-            Arc::clone(&board),
+            Arc::clone(&sources.latest),
             capture.to_path_buf(),
         );
         let work = move || {

@@ -221,15 +221,7 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     let (mut imu, _subscriber) = robot.pair(&Stream::small(1_000_000))?;
     imu.go()?;
 
-    let long = "x".repeat(10_000);
-    for name in ["../x", "", ".x", "a/b", "a\nb", &long] {
-        let (status, problem) = robot.ask("POST", "/recordings", &json!({"name": name}))?;
-        ensure!(status == 422, "{name:.40}: {status} {problem}");
-    }
-    let endless = json!({"name": "x".repeat(1 << 20)});
-    let (status, problem) = robot.ask("POST", "/recordings", &endless)?;
-    ensure!(status == 413, "{status} {problem}");
-    ensure!(fs::read_dir(robot.bags())?.count() == 0);
+    names_that_lead_elsewhere_are_refused(&robot)?;
 
     // Every message of the time is in the bag, was let go by, or is counted as missing.
     let wanted = json!({"name": "led", "topics": {"topics": ["/imu"]}});
@@ -263,9 +255,7 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     ensure!((status, &led["state"]) == (200, &json!("ended")), "{led}");
     ensure!(led["error"].is_null(), "{led}");
     let bag = robot.bags().join("led");
-    let numbers_of =
-        |bag: &Path| -> Result<BTreeSet<u64>> { numbers(bag)?.remove("/imu").context("no /imu") };
-    let recorded = numbers_of(&bag)?;
+    let recorded = numbers_of_imu(&bag)?;
     ensure!(recorded.len() as u64 == count(&led, "messages"), "{led:#}");
     let accounted = recorded.len() as u64 + count(&led, "paused") + missing(&led["report"], "/imu");
     ensure!(span(&recorded)? == accounted, "{recorded:?} {led:#}");
@@ -292,7 +282,34 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     client.process.wait(PATIENCE)?;
     repaired(&killed, &imu, end)?;
 
-    // What was before the silence is in a bag of its own.
+    snapshots_are_taken_of_silence_and_on_request(&robot, &mut imu)?;
+
+    // The agent is killed.
+    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
+    robot.ask("POST", "/recordings", &wanted)?;
+    let last = robot.bags().join("last");
+    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
+    robot.agent.process.signal("KILL")?;
+    let end = now();
+    robot.agent.process.wait(PATIENCE)?;
+    repaired(&last, &imu, end)
+}
+
+fn names_that_lead_elsewhere_are_refused(robot: &Robot<'_>) -> Result<()> {
+    let long = "x".repeat(10_000);
+    for name in ["../x", "", ".x", "a/b", "a\nb", &long] {
+        let (status, problem) = robot.ask("POST", "/recordings", &json!({"name": name}))?;
+        ensure!(status == 422, "{name:.40}: {status} {problem}");
+    }
+    let endless = json!({"name": "x".repeat(1 << 20)});
+    let (status, problem) = robot.ask("POST", "/recordings", &endless)?;
+    ensure!(status == 413, "{status} {problem}");
+    ensure!(fs::read_dir(robot.bags())?.count() == 0);
+    Ok(())
+}
+
+/// What was before the silence is in a bag of its own; a request and a signal make one each.
+fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Peer) -> Result<()> {
     imu.process.signal("STOP")?;
     let written = |page: &Scrape| page.sum("ros2probe_snapshots_written_total", &[]);
     robot
@@ -303,9 +320,9 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
         anyhow::bail!("{events:?}");
     };
     let name = taken["attributes"]["recording"].as_str();
-    let before = numbers_of(&robot.bags().join(name.context("no name")?))?;
+    let before = numbers_of_imu(&robot.bags().join(name.context("no name")?))?;
     // It may have been stopped between sending and saying so.
-    let last = sent(&imu)?.last().copied().context("nothing sent")?;
+    let last = sent(imu)?.last().copied().context("nothing sent")?;
     let is_last = before.last().is_some_and(|it| it.abs_diff(last) <= 1);
     ensure!(is_last, "{last} of {before:?}");
     ensure!((100..=2200).contains(&before.len()), "{before:?}");
@@ -322,16 +339,11 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     robot
         .agent
         .scrape_until("three snapshots", |page| written(page) == 3.0)?;
+    Ok(())
+}
 
-    // The agent is killed.
-    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
-    robot.ask("POST", "/recordings", &wanted)?;
-    let last = robot.bags().join("last");
-    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
-    robot.agent.process.signal("KILL")?;
-    let end = now();
-    robot.agent.process.wait(PATIENCE)?;
-    repaired(&last, &imu, end)
+fn numbers_of_imu(bag: &Path) -> Result<BTreeSet<u64>> {
+    numbers(bag)?.remove("/imu").context("no /imu")
 }
 
 #[test]

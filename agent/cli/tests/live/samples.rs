@@ -128,31 +128,36 @@ fn payloads_are_what_was_sent(
             received.keys().all(|number| sent.contains(number)),
             "{sent:?}"
         );
-        // All of it where the machine has time, and what is missing was said.
-        let page = observed.agent.scrape()?;
-        let dropped = dropped(&page);
+        all_is_there_or_counted(&observed, received.len(), missed, lossless_metering)?;
+    }
+    Ok(())
+}
+
+/// All of it where the machine has time, and what is missing was said.
+fn all_is_there_or_counted(
+    observed: &Observed<'_>,
+    received: usize,
+    missed: u64,
+    lossless_metering: bool,
+) -> Result<()> {
+    let page = observed.agent.scrape()?;
+    let dropped = dropped(&page);
+    ensure!(
+        missed == 0 || dropped > 0.0,
+        "{missed} missed: {}",
+        page.doubts()
+    );
+    ensure!(received >= 10, "{} of 40: {}", received, page.doubts());
+    let label = [("topic", "/points")];
+    let counted = page.sum("ros2_topic_messages_total", &label);
+    let lost = page.sum("ros2_topic_lost_messages_total", &label);
+    let records_lost = page.sum("ros2probe_records_dropped_total", &[]);
+    if lossless_metering && records_lost == 0.0 {
         ensure!(
-            missed == 0 || dropped > 0.0,
-            "{missed} missed: {}",
+            (counted, lost) == (40.0, 0.0),
+            "{counted}, {lost}: {}",
             page.doubts()
         );
-        ensure!(
-            received.len() >= 10,
-            "{} of 40: {}",
-            received.len(),
-            page.doubts()
-        );
-        let label = [("topic", "/points")];
-        let counted = page.sum("ros2_topic_messages_total", &label);
-        let lost = page.sum("ros2_topic_lost_messages_total", &label);
-        let records_lost = page.sum("ros2probe_records_dropped_total", &[]);
-        if lossless_metering && records_lost == 0.0 {
-            ensure!(
-                (counted, lost) == (40.0, 0.0),
-                "{counted}, {lost}: {}",
-                page.doubts()
-            );
-        }
     }
     Ok(())
 }

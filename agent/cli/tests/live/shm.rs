@@ -84,39 +84,45 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     let share = 100.0 * (cpu(&page) - cpu(&half)) / began.elapsed().as_secs_f64();
     println!("{share:.2} % of a CPU once nobody is new");
     for stream in &streams {
-        let topic = [("topic", stream.topic.as_str())];
-        let sum = |name: &str| page.sum(name, &topic);
-        let info = [
-            ("topic", stream.topic.as_str()),
-            ("message_type", "sensor_msgs/msg/PointCloud2"),
-            ("reliability", "RELIABLE"),
-            ("durability", "VOLATILE"),
-        ];
-        assert_eq!(page.sum("ros2_topic_info", &info), 1.0, "{}", page.0);
-        let passage = [topic[0], ("passage", "shared_memory")];
-        assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
-        assert_eq!(sum("ros2_topic_pairs"), 1.0);
-        let second = count(&page, stream) - count(&half, stream);
-        assert_eq!(
-            second,
-            stream.stretch as f64,
-            "{}",
-            shared_memory_metrics(&page)
-        );
-        // A DATA is padded to four bytes where another submessage follows it.
-        let bytes = count(&page, stream) * stream.size as f64;
-        assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
-        assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
-        let coverage = sum("ros2_topic_sampled_coverage_ratio");
-        assert!(coverage > COVERAGE && coverage <= 1.0, "{coverage}");
-        let latencies = sum("ros2_topic_latency_seconds_count");
-        let seen = sum("ros2_topic_sampled_seen_messages_total");
-        assert!(
-            latencies > 0.0 && latencies <= seen,
-            "{latencies} of {seen}"
-        );
+        assert_counted(stream, &half, &page);
     }
     Ok(())
+}
+
+/// Between the two pages a stream sent its second stretch.
+fn assert_counted(stream: &Stream, half: &Scrape, page: &Scrape) {
+    let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", &stream.topic)]);
+    let topic = [("topic", stream.topic.as_str())];
+    let sum = |name: &str| page.sum(name, &topic);
+    let info = [
+        ("topic", stream.topic.as_str()),
+        ("message_type", "sensor_msgs/msg/PointCloud2"),
+        ("reliability", "RELIABLE"),
+        ("durability", "VOLATILE"),
+    ];
+    assert_eq!(page.sum("ros2_topic_info", &info), 1.0, "{}", page.0);
+    let passage = [topic[0], ("passage", "shared_memory")];
+    assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
+    assert_eq!(sum("ros2_topic_pairs"), 1.0);
+    let second = count(page) - count(half);
+    assert_eq!(
+        second,
+        stream.stretch as f64,
+        "{}",
+        shared_memory_metrics(page)
+    );
+    // A DATA is padded to four bytes where another submessage follows it.
+    let bytes = count(page) * stream.size as f64;
+    assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
+    assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
+    let coverage = sum("ros2_topic_sampled_coverage_ratio");
+    assert!(coverage > COVERAGE && coverage <= 1.0, "{coverage}");
+    let latencies = sum("ros2_topic_latency_seconds_count");
+    let seen = sum("ros2_topic_sampled_seen_messages_total");
+    assert!(
+        latencies > 0.0 && latencies <= seen,
+        "{latencies} of {seen}"
+    );
 }
 
 #[test]

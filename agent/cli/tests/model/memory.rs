@@ -9,7 +9,7 @@ use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
+use ros2probe::surface::{AgentFacts, Exposition, Format, MetricSources, SourceKind};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -137,26 +137,29 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
         observer.input(Input::Time(Timestamp(now)));
     }
     let modelled = resident() - before;
-    let board = Arc::new(Board::new(
+    let sources = MetricSources::new(
         SourceKind::Host,
         ros2probe::surface::Settings {
             histograms: true,
             ..Default::default()
         },
-    ));
-    let exposition = Exposition::new(Arc::clone(&board));
+    );
+    let exposition = Exposition::new(sources.clone());
     let mut pages = Vec::new();
     let mut kept = Vec::new();
     for _ in 0..2 {
         let agent = AgentFacts::new(SourceKind::Host, Instant::now());
-        board.publish(observer.snapshot(Timestamp(now)), agent);
-        kept.push(board.state());
+        let state = sources
+            .latest
+            .publish(observer.snapshot(Timestamp(now)), agent);
+        sources.limits.note(&state);
+        kept.push(sources.latest.state());
         pages.push(exposition.render(Format::Classic).unwrap());
     }
     let all = resident() - before;
     let mut told = String::new();
     let mut expected = 0;
-    for facts in board.limits().facts(&board.state()) {
+    for facts in sources.limits.facts(&sources.latest.state()) {
         let row = facts.limit.row();
         let is_modelled = matches!(
             facts.limit,

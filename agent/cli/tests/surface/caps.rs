@@ -12,7 +12,7 @@ use crate::rp;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::surface::{AgentFacts, Board, Exposition, Format, SourceKind};
+use ros2probe::surface::{AgentFacts, Exposition, Format, MetricSources, SourceKind};
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -120,10 +120,13 @@ impl World {
             watches: vec![Arc::new(watch())],
             ..ros2probe::surface::Settings::default()
         };
-        let board = Arc::new(Board::new(SourceKind::Wire, settings));
+        let sources = MetricSources::new(SourceKind::Wire, settings);
         let agent = AgentFacts::new(SourceKind::Wire, Instant::now());
-        board.publish(self.observer.snapshot(Timestamp(self.now)), agent);
-        Exposition::new(board).render(Format::Classic).unwrap()
+        let state = sources
+            .latest
+            .publish(self.observer.snapshot(Timestamp(self.now)), agent);
+        sources.limits.note(&state);
+        Exposition::new(sources).render(Format::Classic).unwrap()
     }
 }
 

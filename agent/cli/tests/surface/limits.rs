@@ -21,7 +21,7 @@ use ros2probe::model::snapshot::Snapshot;
 use ros2probe::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
-use ros2probe::surface::{AgentFacts, Board, SourceKind};
+use ros2probe::surface::{AgentFacts, MetricSources, SourceKind};
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
@@ -37,9 +37,12 @@ fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
         limits,
         ..ros2probe::surface::Settings::default()
     };
-    let board = Board::new(SourceKind::Wire, settings);
-    board.publish(snapshot, AgentFacts::new(SourceKind::Wire, Instant::now()));
-    let facts = board.limits().facts(&board.state());
+    let sources = MetricSources::new(SourceKind::Wire, settings);
+    let state = sources
+        .latest
+        .publish(snapshot, AgentFacts::new(SourceKind::Wire, Instant::now()));
+    sources.limits.note(&state);
+    let facts = sources.limits.facts(&sources.latest.state());
     let facts = facts
         .into_iter()
         .find(|facts| facts.limit == limit)
@@ -298,12 +301,12 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
 
 #[test]
 fn messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_reads() {
-    let board = Arc::new(Board::new(SourceKind::Wire, Default::default()));
+    let sources = MetricSources::new(SourceKind::Wire, Default::default());
     let caps = Caps {
         subscriptions: 1,
         bytes: 4_500,
     };
-    let all = Subscriptions::new(Arc::clone(&board), caps, CancellationToken::new());
+    let all = Subscriptions::new(Arc::clone(&sources.latest), caps, CancellationToken::new());
     let all = Arc::new(all);
     let request = || Request {
         topics: Selection::all(),
@@ -318,8 +321,9 @@ fn messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_r
     let standing = |limit| {
         let mut agent = AgentFacts::new(SourceKind::Wire, Instant::now());
         agent.subscriptions = all.facts();
-        board.publish(Snapshot::default(), agent);
-        let mut facts = board.limits().facts(&board.state()).to_vec();
+        let state = sources.latest.publish(Snapshot::default(), agent);
+        sources.limits.note(&state);
+        let mut facts = sources.limits.facts(&sources.latest.state()).to_vec();
         facts.retain(|facts| facts.limit == limit);
         (facts[0].used, facts[0].reached)
     };

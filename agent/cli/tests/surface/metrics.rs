@@ -16,7 +16,7 @@ use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe::surface::events;
 use ros2probe::surface::otlp::Signal;
 use ros2probe::surface::{
-    Ability, AgentFacts, Board, Exposition, Format, Settings, SnapshotFigures, SourceKind,
+    Ability, AgentFacts, Exposition, Format, MetricSources, Settings, SnapshotFigures, SourceKind,
 };
 use ros2probe_testing::local_agent::promtool;
 use ros2probe_testing::sample_robot;
@@ -39,13 +39,14 @@ fn settings() -> Settings {
 }
 
 fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings));
-    board.publish(snapshot, sample_robot::agent());
-    board.exports().enable(Signal::Metrics);
-    board
-        .recordings()
+    let sources = MetricSources::new(SourceKind::Wire, settings);
+    let state = sources.latest.publish(snapshot, sample_robot::agent());
+    sources.limits.note(&state);
+    sources.exports.enable(Signal::Metrics);
+    sources
+        .recordings
         .snapshot("incident", SnapshotFigures::default());
-    Exposition::new(board).render(format).unwrap()
+    Exposition::new(sources).render(format).unwrap()
 }
 
 fn sample<'a>(page: &'a str, series: &str) -> Option<&'a str> {
@@ -213,6 +214,34 @@ fn values_are_what_the_snapshot_says() {
     }
 }
 
+/// Name, cause and value of what is summed by topic.
+const SUMS: [(&str, &str, &str); 12] = [
+    ("ros2_topic_sent_messages_total", "", "1000"),
+    ("ros2_topic_delivered_messages_total", "", "900"),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "before_host",
+        "60",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "reassembly",
+        "20",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "socket_buffer",
+        "15",
+    ),
+    ("ros2_topic_delivery_pending_messages", "", "1"),
+    ("ros2_topic_delivery_recovered_messages_total", "", "3"),
+    ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
+    ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
+    ("ros2_topic_acknowledgement_lag_messages", "", "56"),
+    ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
+    ("ros2_topic_transit_seconds_count", "", "1000"),
+];
+
 #[test]
 fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let snapshot = sample_robot::snapshot(["/points"]);
@@ -229,32 +258,6 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
          ros_node=\"/mapper\",participant=\"{prefix}.000001c1\",process=\"mapper\",pid=\"42\",\
          cgroup=\"/robot.slice\""
     );
-    let sums = [
-        ("ros2_topic_sent_messages_total", "", "1000"),
-        ("ros2_topic_delivered_messages_total", "", "900"),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "before_host",
-            "60",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "reassembly",
-            "20",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "socket_buffer",
-            "15",
-        ),
-        ("ros2_topic_delivery_pending_messages", "", "1"),
-        ("ros2_topic_delivery_recovered_messages_total", "", "3"),
-        ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
-        ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
-        ("ros2_topic_acknowledgement_lag_messages", "", "56"),
-        ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
-        ("ros2_topic_transit_seconds_count", "", "1000"),
-    ];
     let each = [
         ("ros2_writer_sent_messages_total", &sent, "", "1000"),
         (
@@ -295,7 +298,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
         "" => format!("{name}{{{labels}}}"),
         cause => format!("{name}{{{labels},cause=\"{cause}\"}}"),
     };
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&asked, &series), Some(value), "{series}\n{asked}");
     }
@@ -310,7 +313,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let mut plain = settings();
     Arc::make_mut(&mut plain.watches[0]).per_subscriber = false;
     let plain = page(snapshot, plain, Format::Classic);
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&plain, &series), Some(value), "{series}");
     }
@@ -357,8 +360,8 @@ fn series_of_deliveries_are_capped_and_never_twice() {
 
 #[test]
 fn promtool_finds_nothing_to_say() {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    let starting = Exposition::new(board).render(Format::Classic).unwrap();
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let starting = Exposition::new(sources).render(Format::Classic).unwrap();
     assert_eq!(promtool(&starting), "");
     let page = page(
         sample_robot::snapshot(["/points", "/imu"]),
@@ -473,9 +476,10 @@ fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
         source_reason: Some("no cgroup v2 hierarchy".to_owned()),
         ..sample_robot::agent()
     };
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    board.publish(Snapshot::default(), facts);
-    let wire = Exposition::new(board).render(Format::Classic).unwrap();
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let state = sources.latest.publish(Snapshot::default(), facts);
+    sources.limits.note(&state);
+    let wire = Exposition::new(sources).render(Format::Classic).unwrap();
     let info = "source=\"wire\",reason=\"no cgroup v2 hierarchy\"";
     let info = format!("ros2probe_capture_source_info{{{info}}}");
     assert_eq!(sample(&wire, &info), Some("1"), "{wire}");
@@ -492,12 +496,13 @@ fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
 
 #[test]
 fn both_formats_hold_the_same_samples() {
-    let board = Arc::new(Board::new(SourceKind::Wire, settings()));
-    board.publish(
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let state = sources.latest.publish(
         sample_robot::snapshot(["/points", "/imu"]),
         sample_robot::agent(),
     );
-    let exposition = Exposition::new(board);
+    sources.limits.note(&state);
+    let exposition = Exposition::new(sources);
     let (open, classic) = (
         exposition.render(Format::OpenMetrics).unwrap(),
         exposition.render(Format::Classic).unwrap(),

@@ -21,7 +21,8 @@ pub use recorder::{Finished, Recorder, Sources};
 pub use report::{MissingRun, OtherDomain, Report, TopicReport, UnknownWriters, unobserved_lines};
 pub use sample_ring::SampleRing;
 pub use service::{
-    Recording, RecordingOptions, RecordingState, Recordings, Refusal, Status, default_name, schema,
+    Components, Recording, RecordingOptions, RecordingState, Recordings, Refusal, Status,
+    default_name, schema,
 };
 pub use session::{Activity, Command, record};
 pub use snapshot::{Snapshots, WrittenBag};

@@ -24,7 +24,9 @@ use crate::subscriptions::{
     ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
     Subscriptions,
 };
-use crate::surface::{AgentEvent, Board, Slot, Slots};
+use crate::surface::{
+    AgentEvent, EventLog, LimitFigures, RecordingFigures, Slot, Slots, SnapshotCell,
+};
 use ros2probe_bag::{Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
@@ -44,11 +46,37 @@ pub struct Recordings {
     directory: Option<PathBuf>,
     limits: RecordingLimits,
     queue_bytes: usize,
-    board: Arc<Board>,
+    latest: Arc<SnapshotCell>,
+    pub(super) events: Arc<EventLog>,
+    caps: Arc<LimitFigures>,
+    pub(super) figures: Arc<RecordingFigures>,
     subscriptions: Arc<Subscriptions>,
     library: Arc<Library>,
     list: Mutex<Vec<Arc<Recording>>>,
     slots: Arc<Slots>,
+}
+
+/// What recordings are made of.
+#[derive(Debug)]
+pub struct Components {
+    /// Where they are written; `None` = nowhere.
+    pub directory: Option<PathBuf>,
+    /// What they may take of the disk.
+    pub limits: RecordingLimits,
+    /// Bytes of each that may wait for being written.
+    pub queue_bytes: usize,
+    /// What discovery knows.
+    pub latest: Arc<SnapshotCell>,
+    /// Takes their beginnings and ends.
+    pub events: Arc<EventLog>,
+    /// Limits their number and that of topics.
+    pub caps: Arc<LimitFigures>,
+    /// Counts what they write.
+    pub figures: Arc<RecordingFigures>,
+    /// Where messages come from.
+    pub subscriptions: Arc<Subscriptions>,
+    /// Definitions of messages.
+    pub library: Arc<Library>,
 }
 
 /// What a client wants to be recorded.
@@ -148,24 +176,29 @@ pub enum Refusal {
 }
 
 impl Recordings {
-    /// None yet. They are written below `directory` within `limits`, and `queue_bytes` of each may wait
-    /// for that.
+    /// None yet.
     #[must_use]
-    pub fn new(
-        directory: Option<PathBuf>,
-        limits: RecordingLimits,
-        queue_bytes: usize,
-        board: Arc<Board>,
-        subscriptions: Arc<Subscriptions>,
-        library: Arc<Library>,
-    ) -> Self {
-        let slots = board.limits().slots(Limit::Recordings);
+    pub fn new(components: Components) -> Self {
+        let Components {
+            directory,
+            limits,
+            queue_bytes,
+            latest,
+            events,
+            caps,
+            figures,
+            subscriptions,
+            library,
+        } = components;
         Self {
             directory,
             limits,
             queue_bytes,
-            slots,
-            board,
+            slots: caps.slots(Limit::Recordings),
+            latest,
+            events,
+            caps,
+            figures,
             subscriptions,
             library,
             list: Mutex::new(Vec::new()),
@@ -181,12 +214,12 @@ impl Recordings {
         let (name, directory) = self.bag_directory(wanted.name)?;
         let mut list = self.list();
         let Some(place) = self.slots.take() else {
-            self.board.limits().reached(Limit::Recordings, 1);
+            self.caps.reached(Limit::Recordings, 1);
             return Err(Refusal::TooMany(self.slots.cap()));
         };
         let quota = self.quota(&directory);
         quota.check().map_err(|error| refusal(&name, error))?;
-        let before = GraphSnapshot::from(self.board.state().known());
+        let before = GraphSnapshot::from(self.latest.state().known());
         let subscription = self.subscribe(&filter, wanted.domain_id, &name)?;
         let mut options = wanted.options;
         options.storage.chunk_bytes = options.storage.chunk_bytes.min(CHUNK_BYTES);
@@ -197,7 +230,7 @@ impl Recordings {
         let mut recorder =
             Recorder::new(writer, filter, wanted.domain_id, before, sources).within(quota);
         recorder.pause(wanted.paused);
-        let known = self.board.state();
+        let known = self.latest.state();
         let covered = known.known().topics.iter().filter(|topic| {
             let (kind, hidden) = (topic.kind, topic.hidden);
             topic.domain_id == DomainId(wanted.domain_id)
@@ -206,7 +239,7 @@ impl Recordings {
                     .covers(kind, &topic.name, &topic.dds_name, hidden)
         });
         // Messages come of no more than are measured; whoever announces thousands fills no bag.
-        let covered = covered.take(self.board.limits().caps().topics);
+        let covered = covered.take(self.caps.caps().topics);
         let covered = covered.filter_map(|topic| {
             let message_type = topic.message_types.first()?;
             Some((topic.name.as_str(), message_type.as_str()))
@@ -225,17 +258,26 @@ impl Recordings {
             thread: Mutex::default(),
             over: Notify::new(),
         });
-        self.board.events().record(AgentEvent::RecordingStarted {
+        self.events.record(AgentEvent::RecordingStarted {
             recording: recording.name.clone(),
         });
-        let (worker, board) = (Arc::clone(&recording), Arc::clone(&self.board));
-        let work = move || worker.work(recorder, subscription, &commands, &board, place);
+        let worker = Arc::clone(&recording);
+        let (events, figures) = (Arc::clone(&self.events), Arc::clone(&self.figures));
+        let work = move || {
+            worker.work(
+                recorder,
+                (subscription, place),
+                &commands,
+                &events,
+                &figures,
+            );
+        };
         let thread = std::thread::Builder::new().name("recording".to_owned());
         let thread = thread.spawn(work).map_err(|error| {
             // The bag was made just now, and nothing is in it.
             let _ = std::fs::remove_dir_all(&recording.directory);
             let reason = format!("no thread for it: {error}");
-            self.board.events().record(AgentEvent::RecordingEnded {
+            self.events.record(AgentEvent::RecordingEnded {
                 recording: recording.name.clone(),
                 messages: 0,
                 missing: 0,
@@ -326,12 +368,12 @@ impl Recordings {
 
     /// What the snapshot and the library know.
     pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
-        let (board, library) = (Arc::clone(&self.board), Arc::clone(&self.library));
-        let seen = Arc::clone(&self.board);
+        let (latest, library) = (Arc::clone(&self.latest), Arc::clone(&self.library));
+        let seen = Arc::clone(&self.latest);
         Sources {
             graph: Box::new(move || GraphSnapshot::from(seen.state().known())),
             announced: Box::new(move |names| {
-                let state = board.state();
+                let state = latest.state();
                 let topics = state.known().topics.iter();
                 let topics = topics.filter(|topic| topic.domain_id == DomainId(domain_id));
                 let topics: HashMap<_, _> =
@@ -405,16 +447,15 @@ impl Recording {
     fn work(
         &self,
         recorder: Recorder<'static>,
-        mut subscription: Subscription,
+        (mut subscription, slot): (Subscription, Slot),
         commands: &Receiver<Command>,
-        board: &Board,
-        slot: Slot,
+        events: &EventLog,
+        figures: &RecordingFigures,
     ) {
         let next = |patience| {
             let item = subscription.next_blocking(patience);
             Ok::<_, std::convert::Infallible>(item.map_or(NextItem::Pending, NextItem::Item))
         };
-        let figures = board.recordings();
         figures.active.fetch_add(1, Ordering::Relaxed);
         let mut counted = (0, 0, 0);
         let mut count = |report: &Report| {
@@ -436,7 +477,7 @@ impl Recording {
         figures.active.fetch_sub(1, Ordering::Relaxed);
         drop((subscription, slot));
         let error = ended.error.as_ref().map(causes);
-        board.events().record(AgentEvent::RecordingEnded {
+        events.record(AgentEvent::RecordingEnded {
             recording: self.name.clone(),
             messages: ended.report.messages,
             missing: ended.report.missing,

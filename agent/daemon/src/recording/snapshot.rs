@@ -22,7 +22,7 @@ use super::service::{Recordings, Refusal, causes, default_name, refusal};
 use crate::config::SnapshotSettings;
 use crate::subscriptions::{Item, Selection, Subscription};
 use crate::surface::events::Value;
-use crate::surface::{AgentEvent, Board, SnapshotFigures};
+use crate::surface::{AgentEvent, SnapshotFigures};
 use ros2probe_bag::{Options, Writer};
 
 /// How long orders and events wait at most.
@@ -67,7 +67,6 @@ struct Snapshot {
 struct SnapshotTask {
     settings: SnapshotSettings,
     recordings: Arc<Recordings>,
-    board: Arc<Board>,
     ring: SampleRing,
     figures: SnapshotFigures,
     /// The last event that was looked at.
@@ -83,7 +82,6 @@ impl Snapshots {
     pub fn start(
         settings: &[SnapshotSettings],
         recordings: &Arc<Recordings>,
-        board: &Arc<Board>,
     ) -> Result<Self, Refusal> {
         let stop = Arc::new(AtomicBool::new(false));
         let mut list = Vec::new();
@@ -99,10 +97,9 @@ impl Snapshots {
             let keeper = SnapshotTask {
                 settings: settings.clone(),
                 recordings: Arc::clone(recordings),
-                board: Arc::clone(board),
                 ring: SampleRing::new(settings.max_bytes, Some(settings.span)),
                 figures: SnapshotFigures::default(),
-                event: board.events().last(),
+                event: recordings.events.last(),
                 written: None,
             };
             let (stopping, ordered) = (Arc::clone(&stop), Arc::clone(&asked));
@@ -199,7 +196,7 @@ impl SnapshotTask {
 
     /// Whether an expectation has been broken since the last look.
     fn is_violated(&mut self) -> bool {
-        let events = self.board.events();
+        let events = Arc::clone(&self.recordings.events);
         let mut violated = false;
         while events.last() > self.event {
             let batch = events.read(self.event, 256);
@@ -220,7 +217,7 @@ impl SnapshotTask {
             Ok(_) => self.figures.written += 1,
             Err(_) => self.figures.failed += 1,
         }
-        self.board.events().record(AgentEvent::SnapshotTaken {
+        self.recordings.events.record(AgentEvent::SnapshotTaken {
             snapshot: self.settings.name.clone(),
             recording: name,
             messages: outcome.as_ref().map_or(0, |written| written.messages),
@@ -328,7 +325,7 @@ impl SnapshotTask {
         self.figures.messages = self.ring.len() as u64;
         self.figures.bytes = self.ring.bytes() as u64;
         self.figures.crowded_out = self.ring.crowded_out();
-        let figures = self.board.recordings();
+        let figures = &self.recordings.figures;
         figures.snapshot(&self.settings.name, self.figures);
     }
 }

@@ -1,5 +1,5 @@
 //! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
-//! to the board once a second and when a scrape asks for one. Surfaces never reach in here; they read the board.
+//! once a second and when a scrape asks for one. Surfaces never reach in here; they read snapshots.
 
 mod capture_time;
 pub mod replay;
@@ -14,8 +14,9 @@ use tokio_util::sync::CancellationToken;
 
 use crate::state::StateWriter;
 use crate::subscriptions::Subscriptions;
-use crate::surface::Board;
 use crate::surface::events::DropMonitor;
+use crate::surface::otlp::SpanSink;
+use crate::surface::{EventLog, LimitFigures, SnapshotCell};
 use crate::watches::Watches;
 pub use capture_time::CaptureTime;
 use ros2probe_capture::live::{CaptureError, LiveSource};
@@ -46,18 +47,18 @@ pub enum RunError {
     /// The host's interfaces can no longer be captured.
     #[error("capturing ended")]
     Capture(#[from] CaptureError),
-    /// The rest of a capture cannot be read; what came before it is on the board.
+    /// The rest of a capture cannot be read; what came before it is published.
     #[error("the capture was replayed up to a fault")]
     Replay(#[source] PcapError),
 }
 
-/// Source, model and board, for one thread.
+/// Source, model and outputs, for one thread.
 pub struct Run {
     source: Source,
     observer: Observer,
     /// Participants whose last message the kernel filter notes.
     followed: BTreeSet<GuidPrefix>,
-    board: Arc<Board>,
+    outputs: Outputs,
     drops: DropMonitor,
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
@@ -70,13 +71,26 @@ pub struct Run {
     history: Option<History>,
 }
 
+/// Where the loop leaves what it finds.
+#[derive(Debug)]
+pub struct Outputs {
+    /// Takes snapshots.
+    pub latest: Arc<SnapshotCell>,
+    /// Takes events.
+    pub events: Arc<EventLog>,
+    /// Notes which limits a snapshot reaches.
+    pub limits: Arc<LimitFigures>,
+    /// Takes spans of sampled messages.
+    pub spans: SpanSink,
+}
+
 impl Run {
     /// Ready to run.
     #[must_use]
     pub fn new(
         source: Source,
         observer: Observer,
-        board: Arc<Board>,
+        outputs: Outputs,
         watches: Arc<Watches>,
         subscriptions: Arc<Subscriptions>,
         stop: CancellationToken,
@@ -85,7 +99,7 @@ impl Run {
             source,
             observer,
             followed: BTreeSet::new(),
-            board,
+            outputs,
             drops: DropMonitor::default(),
             watches,
             subscriptions,
@@ -109,7 +123,7 @@ impl Run {
         Self { history, ..self }
     }
 
-    /// Works until told to stop or until the capture ends; the last state stays on the board.
+    /// Works until told to stop or until the capture ends; the last state stays published.
     ///
     /// # Errors
     /// When the source fails for good.
@@ -138,7 +152,7 @@ impl Run {
             let subscribed = self.subscriptions.is_open();
             let slice = if !self.observer.has_applied_lists() {
                 Duration::ZERO
-            } else if self.board.is_asked() {
+            } else if self.outputs.latest.is_asked() {
                 PUBLISH_ASKED
             } else if subscribed {
                 SLICE_SUBSCRIBED
@@ -146,9 +160,9 @@ impl Run {
                 SLICE
             };
             let step = self.step(subscribed);
-            let bell = self.board.bell();
+            let bell = self.outputs.latest.bell().descriptor();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
-            self.board.hear();
+            self.outputs.latest.bell().silence();
             let has_applied_lists = self.take_watches();
             let finished = self.source.is_finished();
             if finished {
@@ -165,7 +179,7 @@ impl Run {
                 self.confirm_wishes();
             }
             let age = published.elapsed();
-            let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.board.is_asked());
+            let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.outputs.latest.is_asked());
             let held = self.source.reached_pause();
             if finished || held || polled.is_err() || due {
                 self.publish();
@@ -175,7 +189,7 @@ impl Run {
                 self.source.report_pause();
             }
             if finished {
-                self.board.events().settle();
+                self.outputs.events.settle();
             }
             polled?;
             if finished {
@@ -211,7 +225,7 @@ impl Run {
             return;
         };
         history.take(now, self.observer.measured(now));
-        self.board.remember(history.past());
+        self.outputs.latest.publish_past(history.past());
     }
 
     /// Gives away what has come up since the last time. No reader makes this wait.
@@ -221,8 +235,8 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             live.apply(&output.interest);
         }
-        self.board.events().add(output.events, now);
-        self.board.add_spans(output.spans);
+        self.outputs.events.add(output.events, now);
+        self.outputs.spans.add(output.spans);
         let clock = self.observer.dispatched_until(now);
         if clock.0.saturating_add(SET_BACK) < self.published_until.0 {
             self.published_until = clock;
@@ -294,9 +308,10 @@ impl Run {
             facts.state = Some(keeper.facts());
         }
         for drop in self.drops.check(&facts, Instant::now()) {
-            self.board.events().record(drop);
+            self.outputs.events.record(drop);
         }
-        self.board.publish(snapshot, facts);
+        let state = self.outputs.latest.publish(snapshot, facts);
+        self.outputs.limits.note(&state);
     }
 }
 

@@ -1,6 +1,6 @@
 //! Where packets come from: this host or a capture, behind one face for the working thread.
 //!
-//! Also what the agent says of it: in the log once, at the start, and on the board.
+//! Also what the agent says of it: in the log once, at the start, and in each snapshot.
 
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;

@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::config::watch::{MAX_GLOB_BYTES, MAX_GLOBS};
 use crate::config::{Watch, check_globs};
-use crate::surface::Board;
+use crate::surface::SnapshotCell;
 use channel::Channel;
 use retained::Retained;
 use ros2probe_model::payloads::{Dispatch, Sample, SampleOutcome};
@@ -114,7 +114,7 @@ pub struct Subscriptions {
     retained: Mutex<Retained>,
     /// For the capture thread: the latest wishes it has not taken yet.
     news: ArcSwapOption<Vec<SampleRequest>>,
-    board: Arc<Board>,
+    latest: Arc<SnapshotCell>,
     caps: Caps,
     /// Ends waiting for readers when the agent ends.
     stop: CancellationToken,
@@ -163,13 +163,13 @@ pub struct Facts {
 impl Subscriptions {
     /// None yet. What waits for a reader waits no longer than until `stop`.
     #[must_use]
-    pub fn new(board: Arc<Board>, caps: Caps, stop: CancellationToken) -> Self {
+    pub fn new(latest: Arc<SnapshotCell>, caps: Caps, stop: CancellationToken) -> Self {
         Self {
             channels: ArcSwap::default(),
             changing: Mutex::default(),
             retained: Mutex::default(),
             news: ArcSwapOption::default(),
-            board,
+            latest,
             caps,
             stop,
             queued: Arc::default(),
@@ -208,7 +208,7 @@ impl Subscriptions {
         channels.push(Arc::clone(&channel));
         self.change(channels);
         drop(opened);
-        self.board.ring();
+        self.latest.bell().ring();
         Ok(Subscription {
             channel,
             all: Arc::clone(self),
@@ -269,7 +269,7 @@ impl Subscriptions {
                 continue;
             }
             if channel.depth() == Depth::Payloads {
-                let known = self.board.state();
+                let known = self.latest.state();
                 let topics = || known.known().topics.iter();
                 let is_there = |writer| {
                     let mut publishers = topics().flat_map(|topic| &topic.publishers);
@@ -382,7 +382,7 @@ impl Subscriptions {
         channels.retain(|channel| channel.id() != id);
         self.change(channels);
         drop(changing);
-        self.board.ring();
+        self.latest.bell().ring();
     }
 
     /// Others are open from now on. Called while `changing` is held.

@@ -3,13 +3,13 @@ use std::collections::BTreeMap;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::*;
-use crate::surface::{Settings, SourceKind};
+use crate::surface::{SnapshotCell, SourceKind};
 
 const LONG: Duration = Duration::from_secs(60);
 
 fn subscriptions(caps: Caps) -> Arc<Subscriptions> {
-    let board = Arc::new(Board::new(SourceKind::Wire, Settings::default()));
-    Arc::new(Subscriptions::new(board, caps, CancellationToken::new()))
+    let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
+    Arc::new(Subscriptions::new(latest, caps, CancellationToken::new()))
 }
 
 fn caps() -> Caps {

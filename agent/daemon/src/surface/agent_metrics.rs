@@ -6,7 +6,6 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
-use super::board::{Reload, State};
 use super::catalogue as metric;
 use super::events::EventLog;
 use super::limit_facts::{LimitFacts, LimitFigures};
@@ -15,6 +14,8 @@ use super::otlp::{Exports, Outcome, Reason};
 use super::process::Process;
 use super::recording_facts::{RecordingFigures, SnapshotFigures};
 use super::ros2_metrics::TopicRows;
+use super::settings_cell::Reload;
+use super::snapshot_cell::State;
 use ros2probe_model::payloads::MissedReason;
 
 /// What runs, where its packets come from, and whether it sees.

@@ -1,20 +1,70 @@
-//! The one collection of what is pinned to the board, family by family in the catalogue's order. Scrapes
+//! The one collection of all metrics, family by family in the catalogue's order. Scrapes
 //! and exports both use it, so they show the same.
 
 use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use super::agent_facts::SourceKind;
 use super::agent_metrics;
-use super::board::Board;
 use super::delivery_metrics::{self, Deliveries};
 use super::diagnosis_metrics;
+use super::events::{AgentEvent, EventLog};
+use super::limit_facts::LimitFigures;
 use super::metric_sink::MetricSink;
+use super::otlp::Exports;
+use super::recording_facts::RecordingFigures;
 use super::ros2_metrics::{self, TopicRows};
+use super::settings_cell::{Settings, SettingsCell};
+use super::snapshot_cell::SnapshotCell;
 use ros2probe_model::snapshot::Snapshot;
 
+/// What a collection reads. Each part belongs to its writer; only the composition of the agent and the
+/// collections hold them together.
+#[derive(Clone, Debug)]
+pub struct MetricSources {
+    /// The robot and the agent.
+    pub latest: Arc<SnapshotCell>,
+    /// What is to be shown, and how the last reload went.
+    pub settings: Arc<SettingsCell>,
+    /// What happened lately.
+    pub events: Arc<EventLog>,
+    /// The caps, and what reached them.
+    pub limits: Arc<LimitFigures>,
+    /// What recordings have done.
+    pub recordings: Arc<RecordingFigures>,
+    /// What became of what was to be exported.
+    pub exports: Arc<Exports>,
+    /// Lines of the log that standard error did not take.
+    pub lost_lines: Arc<AtomicU64>,
+}
+
+impl MetricSources {
+    /// Of an agent that was configured just now; its start is the first event.
+    #[must_use]
+    pub fn new(source: SourceKind, settings: Settings) -> Self {
+        let events = EventLog::new();
+        events.record(AgentEvent::Started { source });
+        Self {
+            latest: Arc::new(SnapshotCell::new(source)),
+            events: Arc::new(events),
+            limits: Arc::new(LimitFigures::new(settings.limits)),
+            settings: Arc::new(SettingsCell::new(settings)),
+            recordings: Arc::default(),
+            exports: Arc::default(),
+            lost_lines: Arc::default(),
+        }
+    }
+}
+
 /// Writes everything to `sink`; `previous` is how long that took the last time.
-pub(super) fn collect(sink: &mut MetricSink<'_>, board: &Board, previous: Duration) -> fmt::Result {
-    let (state, settings) = (board.state(), board.settings());
+pub(super) fn collect(
+    sink: &mut MetricSink<'_>,
+    sources: &MetricSources,
+    previous: Duration,
+) -> fmt::Result {
+    let (state, settings) = (sources.latest.state(), sources.settings.settings());
     let nothing = Snapshot::default();
     let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
     let rows = TopicRows::new(snapshot, &settings);
@@ -31,12 +81,16 @@ pub(super) fn collect(sink: &mut MetricSink<'_>, board: &Board, previous: Durati
     ros2_metrics::watches(sink, snapshot, &settings.watches)?;
     agent_metrics::identity(sink, &state, now)?;
     agent_metrics::capture(sink, &state)?;
-    agent_metrics::model(sink, &state, &rows, deliveries.hidden, board.limits())?;
-    agent_metrics::surface(sink, &state, board.reload(), previous, now)?;
+    agent_metrics::model(sink, &state, &rows, deliveries.hidden, &sources.limits)?;
+    agent_metrics::surface(sink, &state, sources.settings.reload(), previous, now)?;
     agent_metrics::kept(sink, &state)?;
     agent_metrics::subscriptions(sink, &state)?;
-    agent_metrics::events(sink, board.events(), board.lost_lines())?;
-    agent_metrics::recordings(sink, board.recordings())?;
-    agent_metrics::exports(sink, board.exports())?;
+    agent_metrics::events(
+        sink,
+        &sources.events,
+        sources.lost_lines.load(Ordering::Relaxed),
+    )?;
+    agent_metrics::recordings(sink, &sources.recordings)?;
+    agent_metrics::exports(sink, &sources.exports)?;
     agent_metrics::process(sink)
 }

@@ -5,10 +5,10 @@ use std::cmp::Reverse;
 use std::fmt;
 use std::net::SocketAddr;
 
-use super::board::Settings;
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
 use super::ros2_metrics::TopicRow;
+use super::settings_cell::Settings;
 use ros2probe_model::cause::LossCause;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{

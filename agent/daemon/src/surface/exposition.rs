@@ -2,12 +2,10 @@
 //! otherwise. Both come from the same writer, so they cannot disagree.
 
 use std::fmt::{self, Write};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use super::board::Board;
-use super::collect::collect;
+use super::collect::{MetricSources, collect};
 use super::metric_sink::MetricSink;
 use super::text::Text;
 
@@ -20,10 +18,10 @@ pub enum Format {
     Classic,
 }
 
-/// Writes scrapes of a board.
+/// Writes scrapes.
 #[derive(Debug)]
 pub struct Exposition {
-    board: Arc<Board>,
+    sources: MetricSources,
     last_scrape_nanoseconds: AtomicU64,
 }
 
@@ -73,11 +71,11 @@ impl Format {
 const OPENMETRICS: &str = "application/openmetrics-text";
 
 impl Exposition {
-    /// Of what is pinned to `board`.
+    /// Of these sources.
     #[must_use]
-    pub fn new(board: Arc<Board>) -> Self {
+    pub fn new(sources: MetricSources) -> Self {
         Self {
-            board,
+            sources,
             last_scrape_nanoseconds: AtomicU64::new(0),
         }
     }
@@ -100,7 +98,7 @@ impl Exposition {
         let start = Instant::now();
         let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));
         let mut text = MetricSink::Text(Text::new(page, format));
-        collect(&mut text, &self.board, last)?;
+        collect(&mut text, &self.sources, last)?;
         if let MetricSink::Text(mut text) = text {
             text.end()?;
         }

@@ -22,14 +22,16 @@ use tokio_util::sync::CancellationToken;
 
 use super::authority;
 use super::basic_auth::{self, Gate};
-use super::board::Board;
+use super::collect::MetricSources;
 use super::compressed_text::{Encoding, TextCompressor};
 use super::connection::Connection;
 use super::exposition::{Exposition, Format};
 use super::large_responses::LargeResponses;
+use super::limit_facts::LimitFigures;
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
 use super::serving::{self, Plain};
+use super::snapshot_cell::SnapshotCell;
 #[cfg(feature = "tls")]
 use super::tls::Acceptor;
 use super::web_config::{WebConfig, WebConfigError};
@@ -69,7 +71,7 @@ pub enum ListenError {
 #[derive(Debug)]
 pub struct Server {
     listener: std::net::TcpListener,
-    board: Arc<Board>,
+    sources: MetricSources,
     gate: Option<Arc<Gate>>,
     #[cfg(feature = "tls")]
     acceptor: Option<Acceptor>,
@@ -77,7 +79,8 @@ pub struct Server {
 
 #[derive(Clone)]
 struct Pages {
-    board: Arc<Board>,
+    latest: Arc<SnapshotCell>,
+    limits: Arc<LimitFigures>,
     exposition: Arc<Exposition>,
 }
 
@@ -89,7 +92,7 @@ impl Server {
     pub fn bind(
         address: SocketAddr,
         web_config: Option<&Path>,
-        board: Arc<Board>,
+        sources: MetricSources,
     ) -> Result<Self, ListenError> {
         let web = web_config.map(WebConfig::load).transpose()?;
         let web = web.unwrap_or_default();
@@ -100,7 +103,7 @@ impl Server {
             listen(address).map_err(|source| ListenError::Address { address, source })?;
         Ok(Self {
             listener,
-            board,
+            sources,
             gate,
             #[cfg(feature = "tls")]
             acceptor,
@@ -121,7 +124,7 @@ impl Server {
     /// When the runtime cannot take the socket over.
     pub async fn serve(self, stop: CancellationToken) -> io::Result<()> {
         let limit = Limit::MetricsClients;
-        let connections = self.board.limits().caps().get(limit);
+        let connections = self.sources.limits.caps().get(limit);
         let full = Refusal::new(
             "text/plain; charset=utf-8",
             &format!(
@@ -134,8 +137,9 @@ impl Server {
         #[cfg(not(feature = "tls"))]
         let full = Some(full);
         let listener = TcpListener::from_std(self.listener)?;
-        let listener = LimitedListener::new(listener, Arc::clone(&self.board), limit, full);
-        let mut router = router(self.board);
+        let listener =
+            LimitedListener::new(listener, Arc::clone(&self.sources.limits), limit, full);
+        let mut router = router(self.sources);
         if let Some(gate) = self.gate {
             router = router.layer(middleware::from_fn_with_state(gate, basic_auth::guard));
         }
@@ -176,8 +180,9 @@ async fn own_names(Extension(local): Extension<Local>, request: Request, next: N
     next.run(request).await
 }
 
-fn router(board: Arc<Board>) -> Router {
-    let exposition = Arc::new(Exposition::new(Arc::clone(&board)));
+fn router(sources: MetricSources) -> Router {
+    let (latest, limits) = (Arc::clone(&sources.latest), Arc::clone(&sources.limits));
+    let exposition = Arc::new(Exposition::new(sources));
     Router::new()
         .route("/", get(async || Html(INDEX)))
         .route("/metrics", get(metrics))
@@ -190,7 +195,11 @@ fn router(board: Arc<Board>) -> Router {
                 format!("{method} is not possible here, GET is\n"),
             )
         })
-        .with_state(Pages { board, exposition })
+        .with_state(Pages {
+            latest,
+            limits,
+            exposition,
+        })
 }
 
 /// Pages that are being made and read.
@@ -207,9 +216,9 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         .collect();
     let format = Format::negotiate(&accepts.join(","));
     let encoding = encoding(&headers);
-    pages.board.refresh(REFRESH_PATIENCE).await;
+    pages.latest.refresh(REFRESH_PATIENCE).await;
     let Some(turn) = PAGES.turn().await else {
-        pages.board.limits().reached(Limit::MetricsClients, 1);
+        pages.limits.reached(Limit::MetricsClients, 1);
         let reason = "other clients are having pages made
 ";
         return (
@@ -264,9 +273,9 @@ fn encoding(headers: &HeaderMap) -> Encoding {
 }
 
 async fn readyz(Extract(pages): Extract<Pages>) -> Response {
-    let state = pages.board.state();
+    let state = pages.latest.state();
     match state.ready(Instant::now()) {
-        Ok(()) => match pages.board.limits().degraded(&state) {
+        Ok(()) => match pages.limits.degraded(&state) {
             Some(reason) => format!("ready\ndegraded: {reason}\n").into_response(),
             None => "ready\n".into_response(),
         },

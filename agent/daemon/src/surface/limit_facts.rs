@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use super::board::State;
+use super::snapshot_cell::State;
 use crate::config::{Limit, Limits};
 
 const LIMITS: usize = Limit::ALL.len();
@@ -107,7 +107,7 @@ impl LimitFigures {
     }
 
     /// Notes what was refused or given up until `state`.
-    pub(super) fn note(&self, state: &State) {
+    pub fn note(&self, state: &State) {
         let mut rises = self.rises.lock().unwrap_or_else(PoisonError::into_inner);
         for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
             let (_, count) = self.usage(limit, state);

@@ -11,9 +11,8 @@ use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use super::board::Board;
 use super::connection::{Connection, Connections};
-use super::limit_facts::{Slot, Slots};
+use super::limit_facts::{LimitFigures, Slot, Slots};
 use crate::config::Limit;
 
 /// How long a client that is turned away may take to read why, and how many may do so at once.
@@ -30,7 +29,7 @@ pub(super) struct LimitedListener<L> {
     listener: L,
     slots: Arc<Slots>,
     connections: Arc<Connections>,
-    board: Arc<Board>,
+    limits: Arc<LimitFigures>,
     limit: Limit,
     refusal: Option<Refusal>,
     leaving: JoinSet<()>,
@@ -41,19 +40,19 @@ pub(super) struct LimitedListener<L> {
 pub(super) struct Refusal(Arc<str>);
 
 impl<L> LimitedListener<L> {
-    /// At most as many connections at a time as `limit` says, which is counted on `board`. Without
+    /// At most as many connections at a time as `limit` says, which `limits` counts. Without
     /// a refusal a further one is closed without a word.
     pub(super) fn new(
         listener: L,
-        board: Arc<Board>,
+        limits: Arc<LimitFigures>,
         limit: Limit,
         refusal: Option<Refusal>,
     ) -> Self {
         Self {
             listener,
-            slots: board.limits().slots(limit),
+            slots: limits.slots(limit),
             connections: Arc::default(),
-            board,
+            limits,
             limit,
             refusal,
             leaving: JoinSet::new(),
@@ -65,7 +64,7 @@ impl<L> LimitedListener<L> {
         if let Some(slot) = self.slots.take() {
             return Some(slot);
         }
-        self.board.limits().reached(self.limit, 1);
+        self.limits.reached(self.limit, 1);
         if !self.connections.make_room() {
             return None;
         }

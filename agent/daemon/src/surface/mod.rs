@@ -6,7 +6,6 @@ mod agent_metrics;
 pub mod api;
 mod authority;
 mod basic_auth;
-pub mod board;
 pub mod catalogue;
 mod collect;
 mod compressed_text;
@@ -26,6 +25,8 @@ mod process;
 pub mod recording_facts;
 mod ros2_metrics;
 mod serving;
+pub mod settings_cell;
+pub mod snapshot_cell;
 mod text;
 #[cfg(feature = "tls")]
 mod tls;
@@ -34,8 +35,10 @@ pub mod web_config;
 pub use agent_facts::{
     Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
-pub use board::{Board, Settings, State};
+pub use collect::MetricSources;
 pub use events::{AgentEvent, EventLog};
 pub use exposition::{Exposition, Format};
 pub use limit_facts::{LimitFacts, LimitFigures, Slot, Slots};
 pub use recording_facts::{RecordingFigures, SnapshotFigures};
+pub use settings_cell::{Settings, SettingsCell};
+pub use snapshot_cell::{CaptureBell, SnapshotCell, State};

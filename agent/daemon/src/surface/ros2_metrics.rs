@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
 
-use super::board::Settings;
 use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
+use super::settings_cell::Settings;
 use crate::config::Watch;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{

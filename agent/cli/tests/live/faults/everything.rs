@@ -80,22 +80,11 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let clients = Clients::start(&doors);
     let askers = askers(&doors);
     real.go()?;
-    let mut peak = 0;
-    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
-    let mut is_sent = false;
-    while !is_sent {
-        // Once more when all is sent.
-        is_sent = began.elapsed() >= span;
-        if is_sent {
-            real.wait_sent()?;
-        }
-        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
-        peak = peak.max(group.needed()?);
-        let page = page(&doors)?;
-        participants = participants.max(filled(&page, "participants"));
-        endpoints = endpoints.max(filled(&page, "endpoints"));
-        std::thread::sleep(Duration::from_millis(200));
-    }
+    let Highest {
+        mut peak,
+        participants,
+        endpoints,
+    } = observe(span, &group, &doors, &mut real)?;
     let took = began.elapsed();
     let cpu = Usage::of(scene.pid())?.since(&before).cpu;
     let waited = group.throttled()?.saturating_sub(throttled);
@@ -140,6 +129,40 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
             answered.join(", "),
         ),
     )
+}
+
+/// The highest values of a span.
+struct Highest {
+    /// Bytes that the group needed.
+    peak: u64,
+    /// How much of these tables was used, of 1.
+    participants: f64,
+    endpoints: f64,
+}
+
+/// Looks until all is sent, and once more.
+fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> Result<Highest> {
+    let began = Instant::now();
+    let mut peak = 0;
+    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
+    let mut is_sent = false;
+    while !is_sent {
+        is_sent = began.elapsed() >= span;
+        if is_sent {
+            real.wait_sent()?;
+        }
+        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        peak = peak.max(group.needed()?);
+        let page = page(doors)?;
+        participants = participants.max(filled(&page, "participants"));
+        endpoints = endpoints.max(filled(&page, "endpoints"));
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    Ok(Highest {
+        peak,
+        participants,
+        endpoints,
+    })
 }
 
 /// Begins all recordings, and streams of samples that are never read.

@@ -59,6 +59,11 @@ fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
         let accepted = ros2probe::config::watch::check_pattern(&format!("/{name}")).is_ok();
         assert_eq!(documented, accepted, "{name}");
     }
+    assert_expectations_are_documented(&document);
+}
+
+/// Limits of an expectation are those of the configuration, and the agent refuses what is beyond.
+fn assert_expectations_are_documented(document: &Value) {
     let schema = ros2probe::config::Config::schema();
     let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
     let body = &document["components"]["schemas"]["WatchRequest"]["properties"];
@@ -172,6 +177,16 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
         assert!(matches!(beyond, 400 | 422), "{what}: beyond it: {beyond}");
         checked += 1;
     };
+    bounds_of_queries(&agent, &document, &mut check);
+    bounds_of_bodies(&agent, &document, &mut check);
+    eprintln!("{checked} bounds");
+    assert!(checked >= 30, "{checked}");
+}
+
+/// What is checked, the status at the bound, and the status beyond it.
+type Check<'a> = &'a mut dyn FnMut(&str, u16, u16);
+
+fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
     for (path, item) in document["paths"].as_object().unwrap() {
         let Some(parameters) = item["get"]["parameters"].as_array() else {
             continue;
@@ -192,7 +207,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
                     }
                     _ => "",
                 };
-                status(&agent, "GET", &format!("{path}?{topic}{name}={value}"), "")
+                status(agent, "GET", &format!("{path}?{topic}{name}={value}"), "")
             };
             let what = format!("{path} {name}");
             if let Some(maximum) = schema["maximum"].as_i64() {
@@ -219,6 +234,9 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
             }
         }
     }
+}
+
+fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
     for (method, path, schema) in [
         ("POST", "/recordings", "RecordingRequest"),
         ("PUT", "/watch/a", "WatchRequest"),
@@ -227,7 +245,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
         for (name, schema) in properties.as_object().unwrap() {
             let ask = |value: Value| {
                 let body = serde_json::json!({ name.as_str(): value }).to_string();
-                status(&agent, method, path, &body)
+                status(agent, method, path, &body)
             };
             let what = format!("{path} {name}");
             for (bound, step) in [("maximum", 1.0), ("minimum", -1.0)] {
@@ -247,8 +265,6 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
             }
         }
     }
-    eprintln!("{checked} bounds");
-    assert!(checked >= 30, "{checked}");
 }
 
 /// The program of a Python package in a place of its own.

@@ -132,6 +132,13 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     assert_eq!(listed(&agent), all);
 
     let health: Value = serde_json::from_str(&ask(&agent, "GET", "/health", "", "").body).unwrap();
+    assert_health(&health);
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+}
+
+/// Of a replay with four watches.
+fn assert_health(health: &Value) {
     assert_eq!(health["ready"], true);
     assert_eq!(health["watches"], 4);
     assert_eq!(health["watches_kept"], false);
@@ -158,6 +165,4 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
         health["uptime_seconds"].as_f64().unwrap() < 3600.0,
         "{health}"
     );
-    agent.signal("-TERM");
-    assert!(agent.wait().success());
 }

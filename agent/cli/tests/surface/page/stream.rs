@@ -20,58 +20,7 @@ fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
     assert_eq!(open["history_seconds"], 600);
     assert!(open["replay"]["begin"].as_f64().unwrap() > 1e9);
 
-    // The graph is that of the other answers.
-    let graph = line(&first, "graph");
-    let topics = get(&agent, "/topics?hidden=true");
-    let is_plain = |topic: &&Value| {
-        let kind = topic["kind"].as_str().unwrap();
-        !["service_request", "service_reply", "discovery"].contains(&kind)
-    };
-    let expected: Vec<_> = rows(&topics["topics"]).iter().filter(is_plain).collect();
-    assert_eq!(rows(&graph["topics"]).len(), expected.len());
-    let mut endpoints = 0;
-    let flags = rows(&open["flags"]);
-    for topic in expected {
-        let mut own = rows(&graph["topics"]).iter();
-        let row = own.find(|row| row[3] == topic["dds_name"] && row[1] == topic["domain_id"]);
-        let row = row.unwrap();
-        assert_eq!((&row[2], &row[4]), (&topic["name"], &topic["kind"]));
-        assert_eq!(row[5], topic["message_types"]);
-        for (side, list) in [
-            ("publishers", "publishers"),
-            ("subscriptions", "subscriptions"),
-        ] {
-            let ends = rows(&graph[side]).iter().filter(|end| end[0] == row[0]);
-            let guids: Vec<_> = ends.clone().map(|end| end[3].clone()).collect();
-            let known = rows(&topic[list]).iter();
-            let known: Vec<_> = known.map(|end| end["guid"].clone()).collect();
-            assert_eq!(guids, known, "{topic}");
-            endpoints += guids.len();
-            for (end, known) in ends.zip(rows(&topic[list])) {
-                assert_eq!(end[5], known["qos"]["reliability"]);
-                let mut nodes = rows(&graph["nodes"]).iter();
-                let node = nodes.find(|node| node[0] == end[1]);
-                assert_eq!(node.map_or(&Value::Null, |node| &node[2]), &known["node"]);
-            }
-        }
-        // Its figures, too.
-        let values = line(&first, "values");
-        let mut figures = rows(&values["topics"]).iter();
-        let figures = figures.find(|figures| figures[0] == row[0]);
-        if !topic["measurement"].is_null() {
-            let figures = figures.unwrap();
-            assert_eq!(figures[3], topic["measurement"]["messages"], "{topic}");
-            assert_eq!(figures[4], topic["measurement"]["lost_messages"]);
-            let bits = figures[8].as_u64().unwrap();
-            let marked = |name: &str| {
-                let place = flags.iter().position(|flag| flag == name).unwrap();
-                bits >> place & 1 == 1
-            };
-            let is_lossy = figures[4].as_u64().unwrap() > 0;
-            assert_eq!(marked("loss"), is_lossy, "{topic}");
-        }
-    }
-    assert!(endpoints > 0);
+    assert_graph(&agent, &first, open);
     let history = line(&first, "history");
     assert!(!rows(&history["topics"]).is_empty());
     assert_eq!(
@@ -112,6 +61,61 @@ fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
         line(&batch, "agent")["watches"].as_u64().unwrap() == 2,
         "{batch:?}"
     );
+}
+
+/// The graph and its figures are those of the other answers.
+fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
+    let graph = line(first, "graph");
+    let topics = get(agent, "/topics?hidden=true");
+    let is_plain = |topic: &&Value| {
+        let kind = topic["kind"].as_str().unwrap();
+        !["service_request", "service_reply", "discovery"].contains(&kind)
+    };
+    let expected: Vec<_> = rows(&topics["topics"]).iter().filter(is_plain).collect();
+    assert_eq!(rows(&graph["topics"]).len(), expected.len());
+    let mut endpoints = 0;
+    let flags = rows(&open["flags"]);
+    for topic in expected {
+        let mut own = rows(&graph["topics"]).iter();
+        let row = own.find(|row| row[3] == topic["dds_name"] && row[1] == topic["domain_id"]);
+        let row = row.unwrap();
+        assert_eq!((&row[2], &row[4]), (&topic["name"], &topic["kind"]));
+        assert_eq!(row[5], topic["message_types"]);
+        for (side, list) in [
+            ("publishers", "publishers"),
+            ("subscriptions", "subscriptions"),
+        ] {
+            let ends = rows(&graph[side]).iter().filter(|end| end[0] == row[0]);
+            let guids: Vec<_> = ends.clone().map(|end| end[3].clone()).collect();
+            let known = rows(&topic[list]).iter();
+            let known: Vec<_> = known.map(|end| end["guid"].clone()).collect();
+            assert_eq!(guids, known, "{topic}");
+            endpoints += guids.len();
+            for (end, known) in ends.zip(rows(&topic[list])) {
+                assert_eq!(end[5], known["qos"]["reliability"]);
+                let mut nodes = rows(&graph["nodes"]).iter();
+                let node = nodes.find(|node| node[0] == end[1]);
+                assert_eq!(node.map_or(&Value::Null, |node| &node[2]), &known["node"]);
+            }
+        }
+        // Its figures, too.
+        let values = line(first, "values");
+        let mut figures = rows(&values["topics"]).iter();
+        let figures = figures.find(|figures| figures[0] == row[0]);
+        if !topic["measurement"].is_null() {
+            let figures = figures.unwrap();
+            assert_eq!(figures[3], topic["measurement"]["messages"], "{topic}");
+            assert_eq!(figures[4], topic["measurement"]["lost_messages"]);
+            let bits = figures[8].as_u64().unwrap();
+            let marked = |name: &str| {
+                let place = flags.iter().position(|flag| flag == name).unwrap();
+                bits >> place & 1 == 1
+            };
+            let is_lossy = figures[4].as_u64().unwrap() > 0;
+            assert_eq!(marked("loss"), is_lossy, "{topic}");
+        }
+    }
+    assert!(endpoints > 0);
 }
 
 #[test]

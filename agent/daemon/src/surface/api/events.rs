@@ -129,7 +129,7 @@ async fn events(
         .map_err(|_| no_id("Last-Event-ID"))?;
     // A client that has received nothing yet sends an empty one.
     let last_event_id = last_event_id.filter(|id| !id.is_empty());
-    let log = Arc::clone(context.board.events());
+    let log = Arc::clone(&context.events);
     let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
         None => (log.last(), false),
         Some(OLDEST) => (0, false),

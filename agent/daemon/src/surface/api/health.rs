@@ -31,7 +31,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "How it is, also when it is not well.", body = Health))
 )]
 async fn health(State(context): State<Context>) -> Json<Health> {
-    let state = context.board.state();
+    let state = context.latest.state();
     let instant = Instant::now();
     let ready = state.ready(instant);
     let (agent, snapshot) = (&state.agent, state.snapshot.as_ref());
@@ -51,7 +51,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     Json(Health {
         ready: ready.is_ok(),
         reason: ready.err(),
-        degraded: context.board.limits().degraded(&state),
+        degraded: context.limits.degraded(&state),
         host: HOST.clone(),
         version: env!("CARGO_PKG_VERSION").into(),
         source: agent.source.label().into(),
@@ -83,8 +83,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
             })
             .collect(),
         limits: context
-            .board
-            .limits()
+            .limits
             .facts(&state)
             .map(|facts| Limit {
                 limit: facts.limit.key().into(),

@@ -33,9 +33,9 @@ pub(super) async fn show(
     name: &str,
     domain: Domain,
 ) -> Result<Response, Problem> {
-    let state = context.board.state();
+    let state = context.latest.state();
     let topic = find(state.known(), name, domain.checked()?)?;
-    let past = context.board.past();
+    let past = context.latest.past();
     let mut view = History {
         topic: topic.name.clone(),
         domain_id: topic.domain_id.0,

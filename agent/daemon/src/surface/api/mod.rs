@@ -53,8 +53,9 @@ use axum::response::{IntoResponse as _, Response};
 use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
-use super::board::{Board, State};
 use super::large_responses::LargeResponses;
+use super::snapshot_cell::{SnapshotCell, State};
+use super::{EventLog, LimitFigures, RecordingFigures};
 use crate::config::{Access, Limit};
 use crate::recording::{Recordings, Snapshots};
 use crate::subscriptions::Subscriptions;
@@ -76,7 +77,13 @@ const PATIENCE: Duration = Duration::from_millis(600);
 #[derive(Clone)]
 pub struct Context {
     /// The latest snapshot.
-    pub board: Arc<Board>,
+    pub latest: Arc<SnapshotCell>,
+    /// What happened lately.
+    pub events: Arc<EventLog>,
+    /// The caps, and what reached them.
+    pub limits: Arc<LimitFigures>,
+    /// What recordings have done.
+    pub recording_figures: Arc<RecordingFigures>,
     /// What is watched.
     pub watches: Arc<Watches>,
     /// Who gets messages one by one.
@@ -100,8 +107,8 @@ pub struct Context {
 impl Context {
     /// What is known at this moment, or a little earlier where the capture has no time.
     async fn state(&self) -> Arc<State> {
-        self.board.refresh(PATIENCE).await;
-        self.board.state()
+        self.latest.refresh(PATIENCE).await;
+        self.latest.state()
     }
 }
 
@@ -153,7 +160,7 @@ struct Streamed;
 /// Few views at a time: see [`super::large`].
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
     let Some(turn) = VIEWS.turn().await else {
-        context.board.limits().reached(Limit::ApiClients, 1);
+        context.limits.reached(Limit::ApiClients, 1);
         let detail = "memory for responses is used up by slow readers";
         return Problem::new(Code::TooManyClients, detail).into_response();
     };

@@ -136,7 +136,7 @@ async fn samples(
         );
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
-    let is_replay = context.board.state().agent.source == SourceKind::Replay;
+    let is_replay = context.latest.state().agent.source == SourceKind::Replay;
     let (depth, queue_bytes, media_type) = if wanted.payload {
         (Depth::Payloads, PAYLOADS_BYTES, SAMPLES)
     } else {
@@ -160,12 +160,12 @@ async fn samples(
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
     let known = if is_replay {
-        context.board.state()
+        context.latest.state()
     } else {
         subscription.in_force(PATIENCE).await;
         context.state().await
     };
-    let most = context.board.limits().caps().topics;
+    let most = context.limits.caps().topics;
     let first = Line::Open(Open {
         topics: topics(known.known(), subscription.selection(), domain_id, most),
     });

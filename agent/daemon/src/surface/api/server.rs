@@ -227,8 +227,8 @@ where
 {
     let router = router(&context, door);
     let limit = Limit::ApiClients;
-    let full = full(context.board.limits().caps().get(limit));
-    let listener = LimitedListener::new(listener, Arc::clone(&context.board), limit, Some(full));
+    let full = full(context.limits.caps().get(limit));
+    let listener = LimitedListener::new(listener, Arc::clone(&context.limits), limit, Some(full));
     serving::serve(listener, Plain, router, |_| (), context.stop).await;
     Ok(())
 }

@@ -74,7 +74,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "Those of the configuration.", body = SnapshotList))
 )]
 async fn list(State(context): State<Context>) -> Json<SnapshotList> {
-    let figures = context.board.recordings().snapshots();
+    let figures = context.recording_figures.snapshots();
     let snapshots = context.snapshots.settings().map(|settings| {
         let known = figures.iter().find(|(name, _)| *name == settings.name);
         let SnapshotFigures {

@@ -26,7 +26,7 @@ use super::security::Granted;
 use super::silence::Circumstances;
 use super::watch::expectations;
 use crate::surface::Ability;
-use crate::surface::board::State as BoardState;
+use crate::surface::State as AgentState;
 use crate::watches::InForce;
 use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
@@ -169,7 +169,7 @@ fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, A
         has_encoded && !topic.contains('/')
     });
     let is_another = || {
-        let state = context.board.state();
+        let state = context.latest.state();
         let mut topics = state.known().topics.iter();
         // With its last slash encoded it is the name of a topic.
         !path.contains('/') || topics.any(|topic| is_called(topic, name))
@@ -203,7 +203,7 @@ struct Desk<'a> {
 }
 
 impl<'a> Desk<'a> {
-    fn new(state: &'a BoardState, in_force: &'a InForce) -> Self {
+    fn new(state: &'a AgentState, in_force: &'a InForce) -> Self {
         let snapshot = state.known();
         let abilities = &state.agent.abilities;
         Self {

@@ -267,8 +267,8 @@ fn answer(
         watch: Arc::new(watch.clone()),
         origin: watches::Origin::Api,
     });
-    let state = context.board.state();
-    // What is on the board of a new one was of another one, if anything.
+    let state = context.latest.state();
+    // A new watch is in no snapshot yet: an entry of its name is of an earlier one.
     let snapshot = state.snapshot.as_ref().filter(|_| done == Done::Unchanged);
     let body = Json(view(&entry, snapshot));
     Ok(match done {

@@ -17,9 +17,8 @@ use tonic::codegen::http::uri::PathAndQuery;
 use tonic::transport::{Channel, Endpoint};
 use tonic::{Code, Status};
 
-use super::exports::{Outcome, Reason, Signal};
+use super::exports::{Exports, Outcome, Reason, Signal};
 use super::settings::{SettingsError, Target};
-use crate::surface::board::Board;
 
 /// Pauses between tries, before what the receiver asks for and before chance takes up to half.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -42,7 +41,7 @@ pub(super) struct Client {
     signal: Signal,
     grpc: Grpc<Channel>,
     target: Target,
-    board: Arc<Board>,
+    exports: Arc<Exports>,
     /// Whether the last request got through; `None` before the first.
     works: Option<bool>,
 }
@@ -52,7 +51,7 @@ impl Client {
     pub(super) fn new(
         signal: Signal,
         target: Target,
-        board: Arc<Board>,
+        exports: Arc<Exports>,
     ) -> Result<Self, SettingsError> {
         let endpoint = Endpoint::from(target.endpoint.clone())
             .user_agent(concat!("ros2probe/", env!("CARGO_PKG_VERSION")));
@@ -67,12 +66,12 @@ impl Client {
         if target.gzip {
             grpc = grpc.send_compressed(CompressionEncoding::Gzip);
         }
-        board.exports().enable(signal);
+        exports.enable(signal);
         Ok(Self {
             signal,
             grpc,
             target,
-            board,
+            exports,
             works: None,
         })
     }
@@ -122,8 +121,7 @@ impl Client {
     /// Counts what is given up.
     pub(super) fn drop(&self, reason: Reason, items: u64) {
         if items > 0 {
-            let exports = self.board.exports();
-            exports.count_dropped(self.signal, reason, items);
+            self.exports.count_dropped(self.signal, reason, items);
         }
     }
 
@@ -137,7 +135,7 @@ impl Client {
     }
 
     pub(super) fn count(&self, outcome: Outcome) {
-        self.board.exports().count_request(self.signal, outcome);
+        self.exports.count_request(self.signal, outcome);
     }
 
     /// One request; how many of its items the receiver rejected.

@@ -18,7 +18,6 @@ use prost::Message as _;
 
 use super::client::Request;
 use super::signal_sender::SignalSender;
-use crate::surface::board::Board;
 use crate::surface::events::EventLog;
 use crate::surface::events::{Batch, Reader, Record, Value};
 
@@ -37,9 +36,9 @@ pub(super) struct Reporter {
 
 impl Reporter {
     /// From the oldest event on.
-    pub(super) fn new(board: &Board, resource: Resource) -> Self {
+    pub(super) fn new(log: Arc<EventLog>, resource: Resource) -> Self {
         Self {
-            log: Arc::clone(board.events()),
+            log,
             resource,
             place: 0,
         }

@@ -15,9 +15,9 @@ use super::exports::Signal;
 use super::metrics::Collector;
 use super::settings::{Settings, SettingsError, Target};
 use super::signal_sender::SignalSender;
-use super::traces::Tracing;
+use super::traces::{SpanQueue, Tracing};
 use crate::privilege::{self, Role, SpawnError};
-use crate::surface::board::Board;
+use crate::surface::collect::MetricSources;
 
 /// Ending takes no longer, whatever the receiver does.
 const ENDING: Duration = Duration::from_secs(2);
@@ -44,18 +44,22 @@ pub enum StartError {
 }
 
 impl Exporter {
-    /// Exports what is on the board from now on, in a thread that may make connections; the caller
+    /// Exports from now on, in a thread that may make connections; the caller
     /// need not keep that.
     ///
     /// # Errors
     /// When a connection cannot be set up; that the receiver is not there is no error.
-    pub fn start(settings: Settings, board: &Arc<Board>) -> Result<Self, StartError> {
+    pub fn start(
+        settings: Settings,
+        sources: &MetricSources,
+        spans: Arc<SpanQueue>,
+    ) -> Result<Self, StartError> {
         // Threads that block look names up, one for each signal at most.
         let mut runtime = Builder::new_current_thread();
         let runtime = runtime.max_blocking_threads(3).enable_all().build();
         let runtime = runtime.map_err(StartError::Runtime)?;
         let stop = CancellationToken::new();
-        let jobs = Jobs::new(settings, board, &stop, &runtime)?;
+        let jobs = Jobs::new(settings, sources, spans, &stop, &runtime)?;
         let (tell, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("otlp".to_owned());
         let thread = privilege::spawn(Role::Export, thread, move || {
@@ -84,7 +88,7 @@ impl Exporter {
 
 /// What the thread does.
 struct Jobs {
-    board: Arc<Board>,
+    spans: Arc<SpanQueue>,
     metrics: Option<(Collector, SignalSender, Duration)>,
     events: Option<(Reporter, SignalSender)>,
     traces: Option<(Tracing, SignalSender)>,
@@ -93,14 +97,16 @@ struct Jobs {
 impl Jobs {
     fn new(
         settings: Settings,
-        board: &Arc<Board>,
+        sources: &MetricSources,
+        spans: Arc<SpanQueue>,
         stop: &CancellationToken,
         runtime: &Runtime,
     ) -> Result<Self, SettingsError> {
         // Connections belong to the runtime from their beginning.
         let _inside = runtime.enter();
         let sender = |signal: Signal, target: Option<Target>| {
-            let client = target.map(|target| Client::new(signal, target, Arc::clone(board)));
+            let client =
+                target.map(|target| Client::new(signal, target, Arc::clone(&sources.exports)));
             Ok(client
                 .transpose()?
                 .map(|client| SignalSender::new(client, stop.clone())))
@@ -109,7 +115,7 @@ impl Jobs {
         let events = sender(Signal::Events, settings.events)?;
         let collector = || {
             Collector::new(
-                Arc::clone(board),
+                sources.clone(),
                 settings.resource.clone(),
                 SystemTime::now(),
             )
@@ -117,10 +123,15 @@ impl Jobs {
         let traces = sender(Signal::Traces, settings.traces)?;
         let tracing = || Tracing::new(settings.resource.clone(), settings.host);
         Ok(Self {
-            board: Arc::clone(board),
+            spans,
             traces: traces.map(|sender| (tracing(), sender)),
             metrics: metrics.map(|sender| (collector(), sender, settings.interval)),
-            events: events.map(|sender| (Reporter::new(board, settings.resource.clone()), sender)),
+            events: events.map(|sender| {
+                (
+                    Reporter::new(Arc::clone(&sources.events), settings.resource.clone()),
+                    sender,
+                )
+            }),
         })
     }
 
@@ -137,7 +148,7 @@ impl Jobs {
         };
         let traces = async {
             if let Some((tracing, sender)) = self.traces {
-                tracing.run(sender, self.board.spans()).await;
+                tracing.run(sender, &self.spans).await;
             }
         };
         tokio::join!(metrics, events, traces);

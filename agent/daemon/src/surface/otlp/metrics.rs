@@ -3,7 +3,6 @@
 //! Points are cumulative, so nothing is kept while the receiver is away: the next collection says
 //! it all.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use opentelemetry_proto::tonic::resource::v1::Resource;
@@ -11,25 +10,24 @@ use tokio::time::{MissedTickBehavior, interval_at};
 
 use super::points::{Collection, Points};
 use super::signal_sender::SignalSender;
-use crate::surface::board::Board;
-use crate::surface::collect::collect;
+use crate::surface::collect::{MetricSources, collect};
 use crate::surface::metric_sink::MetricSink;
 
 /// As long as a scrape waits for the capture thread.
 const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
 
-/// Writes collections of a board.
+/// Writes collections.
 pub(super) struct Collector {
-    board: Arc<Board>,
+    sources: MetricSources,
     points: Points,
     previous: Duration,
 }
 
 impl Collector {
     /// Of an agent that started then.
-    pub(super) fn new(board: Arc<Board>, resource: Resource, started: SystemTime) -> Self {
+    pub(super) fn new(sources: MetricSources, resource: Resource, started: SystemTime) -> Self {
         Self {
-            board,
+            sources,
             points: Points::new(resource, unix_nanoseconds(started)),
             previous: Duration::ZERO,
         }
@@ -45,7 +43,7 @@ impl Collector {
                 now = ticks.tick() => now,
                 () = sender.stopped() => break,
             };
-            self.board.refresh(REFRESH_PATIENCE).await;
+            self.sources.latest.refresh(REFRESH_PATIENCE).await;
             let Collection { requests, dropped } = self.collect(SystemTime::now());
             sender.overflowed(dropped);
             sender.deliver(requests, Some(now + period)).await;
@@ -55,14 +53,14 @@ impl Collector {
         sender.finish(requests, true).await;
     }
 
-    /// What is on the board now.
+    /// All metrics as they are now.
     pub(super) fn collect(&mut self, now: SystemTime) -> Collection {
         let begun = Instant::now();
         self.points.begin(unix_nanoseconds(now));
         // Points are pushed to memory, which does not fail.
         let _ = collect(
             &mut MetricSink::Points(&mut self.points),
-            &self.board,
+            &self.sources,
             self.previous,
         );
         let collection = self.points.end();

@@ -18,7 +18,7 @@ use tonic::{Code, Status};
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::{Exporter, Host, Settings};
 use crate::config::Config;
-use crate::surface::{AgentFacts, Board, SourceKind, board};
+use crate::surface::{self, AgentFacts, MetricSources, SourceKind};
 use ros2probe_model::snapshot::Snapshot;
 
 /// What the receiver does with a request.
@@ -85,19 +85,19 @@ impl Receiver {
 }
 
 /// An agent of a quiet robot that exports every so many seconds.
-fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Board>, Exporter) {
+fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, Exporter) {
     let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
     let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
-    let board = Arc::new(Board::new(SourceKind::Replay, board::Settings::default()));
+    let sources = MetricSources::new(SourceKind::Replay, surface::Settings::default());
     let agent = AgentFacts {
         finished: true,
         ..AgentFacts::new(SourceKind::Replay, Instant::now())
     };
-    board.publish(Snapshot::default(), agent);
-    let exporter = Exporter::start(settings.unwrap(), &board).unwrap();
-    (board, exporter)
+    sources.latest.publish(Snapshot::default(), agent);
+    let exporter = Exporter::start(settings.unwrap(), &sources, Arc::default()).unwrap();
+    (sources.exports, exporter)
 }
 
 async fn until(what: &str, mut holds: impl FnMut() -> bool) {
@@ -122,8 +122,8 @@ async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
     ];
     let (receiver, address) = Receiver::listening(script).await;
     // The pause before it is sent again is up to a second: what comes next must not overtake it.
-    let (board, exporter) = exporting(address, 3, "compression: gzip");
-    let exports = board.exports();
+    let (exports, exporter) = exporting(address, 3, "compression: gzip");
+    let exports = exports.as_ref();
     until("a part is rejected", || {
         exports.requests(Signal::Metrics, Outcome::Partial) == 1
     })
@@ -142,8 +142,8 @@ async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
 #[tokio::test]
 async fn newer_points_take_the_place_of_those_a_slow_receiver_does_not_take() {
     let (receiver, address) = Receiver::listening([Answer::Sleeps, Answer::Sleeps]).await;
-    let (board, exporter) = exporting(address, 1, "timeout_s: 30");
-    let exports = board.exports();
+    let (exports, exporter) = exporting(address, 1, "timeout_s: 30");
+    let exports = exports.as_ref();
     until("it takes some in the end", || receiver.requests() > 0).await;
     let [_, _, retried, failed] = requests(exports);
     assert_eq!((retried, failed), (0, 2));
@@ -156,8 +156,8 @@ async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_de
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     drop(listener);
-    let (board, exporter) = exporting(address, 1, "");
-    let exports = board.exports();
+    let (exports, exporter) = exporting(address, 1, "");
+    let exports = exports.as_ref();
     until("a batch is given up", || {
         exports.dropped(Signal::Metrics, Reason::Superseded) > 0
     })
@@ -182,12 +182,12 @@ async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_de
     let address = listener.local_addr().unwrap();
     let mut mute = Some(listener);
     for _ in 0..2 {
-        let (board, exporter) = exporting(address, 1, "");
+        let (exports, exporter) = exporting(address, 1, "");
         tokio::time::sleep(Duration::from_millis(400)).await;
         let begun = Instant::now();
         exporter.finish().await;
         assert!(begun.elapsed() < Duration::from_millis(2_300));
-        assert!(board.exports().dropped(Signal::Metrics, Reason::Shutdown) > 0);
+        assert!(exports.dropped(Signal::Metrics, Reason::Shutdown) > 0);
         mute = None;
     }
     assert!(mute.is_none());

@@ -5,7 +5,7 @@
 //! ids of what happens at one host depend on that host.
 
 use std::collections::VecDeque;
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
@@ -18,10 +18,11 @@ use prost::Message as _;
 use tokio::sync::Notify;
 
 use super::client::Request;
+use super::exports::{Exports, Reason, Signal};
 use super::points::{attribute, key_value, scope};
 use super::signal_sender::SignalSender;
 use ros2probe_model::identity::Identity;
-use ros2probe_model::trace::{Span, SpanStage};
+use ros2probe_model::trace::{Span, SpanStage, Spans};
 
 /// Spans that wait here, and in one request.
 const WAITING: usize = 4096;
@@ -36,6 +37,28 @@ const FLAGS: u32 = 0b11;
 pub struct SpanQueue {
     waiting: Mutex<VecDeque<Span>>,
     news: Notify,
+}
+
+/// Spans on their way to the exporter, where they are exported.
+#[derive(Clone, Debug, Default)]
+pub struct SpanSink {
+    /// Spans that wait for being exported.
+    pub queue: Arc<SpanQueue>,
+    /// Counts those that do not fit.
+    pub exports: Arc<Exports>,
+}
+
+impl SpanSink {
+    /// Queues spans if the signal is enabled.
+    pub fn add(&self, spans: Spans) {
+        let Spans { spans, lost } = spans;
+        let mut signals = self.exports.signals();
+        if signals.any(|signal| signal == Signal::Traces) {
+            let refused = self.queue.put(spans);
+            self.exports
+                .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
+        }
+    }
 }
 
 impl SpanQueue {

@@ -117,7 +117,7 @@ async fn live(
         access: granted.access().to_string(),
         seen: None,
         sent: Instant::now(),
-        place: context.board.events().last(),
+        place: context.events.last(),
         ended: false,
         permit: Some(permit),
         context,
@@ -155,11 +155,11 @@ impl Pieces for Stream {
 impl Stream {
     /// Waits for the next moment that is shown; whether there is one.
     async fn moment(&self) -> bool {
-        let board = &self.context.board;
+        let latest = &self.context.latest;
         let next = async {
             sleep_until(self.sent + INTERVAL - EARLY).await;
             tokio::select! {
-                () = board.published() => {}
+                () = latest.published() => {}
                 // Nothing is published any more once a capture has ended.
                 () = sleep_until(self.sent + INTERVAL + EARLY * 3) => {}
             }
@@ -172,7 +172,7 @@ impl Stream {
 
     fn batch(&mut self, lines: &mut Vec<u8>) {
         let context = &self.context;
-        let (state, past) = (context.board.state(), context.board.past());
+        let (state, past) = (context.latest.state(), context.latest.past());
         let mut scene = context.live.scene();
         let scene = scene.get_or_insert_default();
         scene.update(&state, &past, &context.watches.in_force());
@@ -182,7 +182,7 @@ impl Stream {
                 begin: state.agent.capture_begin.map(|begin| begin.seconds()),
             });
             let open = Open {
-                run: context.board.events().run(),
+                run: context.events.run(),
                 host: HOST.clone(),
                 version: env!("CARGO_PKG_VERSION"),
                 source: state.agent.source.label(),
@@ -202,7 +202,7 @@ impl Stream {
             let history = values::history(state.known(), &past, &scene.ids);
             Line::History(history).write(lines);
         }
-        let log = context.board.events();
+        let log = &context.events;
         let batch = log.read(self.place, EVENTS);
         self.place = batch.last;
         if batch.lagged > 0 || !batch.records.is_empty() {

@@ -12,7 +12,7 @@ use super::findings::{Circumstances, dropped, findings};
 use super::line::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
-use crate::surface::board::State;
+use crate::surface::State;
 use crate::surface::{Ability as Able, SourceKind};
 use crate::watches::InForce;
 use ros2probe_model::history::Past;

@@ -195,7 +195,7 @@ pub(super) async fn definition(
     name: &str,
     domain: Domain,
 ) -> Result<Response, Problem> {
-    let state = context.board.state();
+    let state = context.latest.state();
     let topic = find(state.known(), name, domain.checked()?)?;
     let hash = topic.type_hashes.first().cloned();
     let name = topic.message_types.first().cloned().unwrap_or_default();
@@ -371,7 +371,7 @@ impl Stream {
             Ok(Err(error)) => (None, Some(error)),
             Err(_) => (None, Some("decoding it failed".to_owned())),
         };
-        let state = self.context.board.state();
+        let state = self.context.latest.state();
         let mut topics = state.known().topics.iter();
         let node = topics.find_map(|topic| {
             let mut publishers = topic.publishers.iter();
@@ -480,18 +480,18 @@ mod tests {
 
     use super::*;
     use crate::subscriptions::{Caps, Subscriptions};
-    use crate::surface::{Board, Settings, SourceKind};
+    use crate::surface::{SnapshotCell, SourceKind};
     use ros2probe_model::payloads::{Dispatch, SampleOutcome, Topic};
 
     #[test]
     fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
         const MESSAGES: u64 = 40;
-        let board = Arc::new(Board::new(SourceKind::Wire, Settings::default()));
+        let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
         let caps = Caps {
             subscriptions: 1,
             bytes: 64 << 20,
         };
-        let all = Arc::new(Subscriptions::new(board, caps, CancellationToken::new()));
+        let all = Arc::new(Subscriptions::new(latest, caps, CancellationToken::new()));
         let choice = Choice::parse("/points").unwrap();
         let mut subscription = all.open(request(choice, 0)).unwrap();
         let topic = Arc::new(Topic {

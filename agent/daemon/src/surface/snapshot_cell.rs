@@ -1,0 +1,297 @@
+//! The latest snapshot, as the capture thread publishes it and surfaces read it.
+//!
+//! A reader takes the latest state and the writer replaces it: neither waits for the other. A reader
+//! may ask for a newer state and wait for it within its patience.
+
+use std::os::fd::BorrowedFd;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, LazyLock};
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+use tokio::sync::Notify;
+
+use super::agent_facts::{AgentFacts, SourceKind};
+use ros2probe_capture::bell::Bell;
+use ros2probe_model::history::Past;
+use ros2probe_model::snapshot::Snapshot;
+
+/// Older than this, the state no longer describes the robot.
+const FRESH: Duration = Duration::from_secs(5);
+
+/// The latest state and the last seconds.
+#[derive(Debug)]
+pub struct SnapshotCell {
+    state: ArcSwap<State>,
+    past: ArcSwap<Past>,
+    /// A reader waits for a newer state.
+    asked: AtomicBool,
+    bell: Arc<CaptureBell>,
+    news: Notify,
+}
+
+/// Wakes the capture thread while it waits for packets. Without a socket pair it does not, and readers
+/// wait until the thread looks by itself.
+#[derive(Debug)]
+pub struct CaptureBell(Option<Bell>);
+
+/// What the capture thread found out.
+#[derive(Clone, Debug)]
+pub struct State {
+    /// The robot; `None` until the first snapshot.
+    pub snapshot: Option<Snapshot>,
+    /// The agent.
+    pub agent: AgentFacts,
+}
+
+impl CaptureBell {
+    fn new() -> Self {
+        Self(Bell::new().ok())
+    }
+
+    /// Wakes the capture thread.
+    pub fn ring(&self) {
+        if let Some(bell) = &self.0 {
+            bell.ring();
+        }
+    }
+
+    /// Readable after [`Self::ring`] until [`Self::silence`].
+    #[must_use]
+    pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.0.as_ref()?.descriptor())
+    }
+
+    /// Takes back all rings so far.
+    pub fn silence(&self) {
+        if let Some(bell) = &self.0 {
+            bell.silence();
+        }
+    }
+}
+
+impl SnapshotCell {
+    /// Without a snapshot, of an agent that starts now.
+    #[must_use]
+    pub fn new(source: SourceKind) -> Self {
+        let agent = AgentFacts::new(source, Instant::now());
+        Self {
+            state: ArcSwap::from_pointee(State {
+                snapshot: None,
+                agent,
+            }),
+            past: ArcSwap::default(),
+            asked: AtomicBool::new(false),
+            bell: Arc::new(CaptureBell::new()),
+            news: Notify::new(),
+        }
+    }
+
+    /// Replaces the state, and returns the new one.
+    pub fn publish(&self, snapshot: Snapshot, agent: AgentFacts) -> Arc<State> {
+        let state = Arc::new(State {
+            snapshot: Some(snapshot),
+            agent,
+        });
+        self.state.store(Arc::clone(&state));
+        self.asked.store(false, Ordering::Relaxed);
+        self.news.notify_waiters();
+        state
+    }
+
+    /// Replaces what was measured in the last seconds.
+    pub fn publish_past(&self, past: Past) {
+        self.past.store(Arc::new(past));
+    }
+
+    /// What was measured in the last seconds.
+    #[must_use]
+    pub fn past(&self) -> Arc<Past> {
+        self.past.load_full()
+    }
+
+    /// The latest state.
+    #[must_use]
+    pub fn state(&self) -> Arc<State> {
+        self.state.load_full()
+    }
+
+    /// Whether a reader waits for a newer state.
+    #[must_use]
+    pub fn is_asked(&self) -> bool {
+        self.asked.load(Ordering::Relaxed)
+    }
+
+    /// The bell of the capture thread.
+    #[must_use]
+    pub const fn bell(&self) -> &Arc<CaptureBell> {
+        &self.bell
+    }
+
+    /// Asks for a newer state and waits for it, but no longer than `patience`: counters that a
+    /// scrape reads should be those of its moment, or rates over short windows would be off.
+    pub async fn refresh(&self, patience: Duration) {
+        let news = self.news.notified();
+        if self.state.load().agent.finished {
+            return;
+        }
+        self.asked.store(true, Ordering::Relaxed);
+        self.bell.ring();
+        // Late or not: the latest state is shown, with its age.
+        let _ = tokio::time::timeout(patience, news).await;
+    }
+
+    /// Returns when a newer state is published, without asking for one.
+    pub async fn published(&self) {
+        self.news.notified().await;
+    }
+}
+
+impl State {
+    /// The robot; nothing at all until the first snapshot.
+    #[must_use]
+    pub fn known(&self) -> &Snapshot {
+        static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
+        self.snapshot.as_ref().unwrap_or(&NOTHING)
+    }
+
+    /// Whether what is shown describes the robot at `now`.
+    ///
+    /// # Errors
+    /// The reason why it does not.
+    pub fn ready(&self, now: Instant) -> Result<(), String> {
+        self.progresses(now)?;
+        self.agent.gone.clone().map_or(Ok(()), Err)
+    }
+
+    /// Whether the capture works, also while what it looks at is gone.
+    ///
+    /// # Errors
+    /// The reason why it does not.
+    pub fn progresses(&self, now: Instant) -> Result<(), String> {
+        if self.snapshot.is_none() {
+            return Err("starting: nothing captured yet".to_owned());
+        }
+        if self.agent.finished {
+            return Ok(());
+        }
+        let stuck = now.saturating_duration_since(self.agent.capture_progress);
+        if stuck > FRESH {
+            return Err(format!(
+                "the capture has made no progress for {} s",
+                stuck.as_secs()
+            ));
+        }
+        let age = now.saturating_duration_since(self.agent.at);
+        if age > FRESH {
+            return Err(format!("the last snapshot is {} s old", age.as_secs()));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ros2probe_capture::system::wait;
+
+    #[test]
+    fn an_agent_is_ready_only_while_it_sees() {
+        let cell = SnapshotCell::new(SourceKind::Wire);
+        let start = Instant::now();
+        assert!(
+            cell.state()
+                .ready(start)
+                .unwrap_err()
+                .starts_with("starting")
+        );
+
+        cell.publish(
+            Snapshot::default(),
+            AgentFacts::new(SourceKind::Wire, start),
+        );
+        assert_eq!(cell.state().ready(start + Duration::from_secs(4)), Ok(()));
+        let reason = cell
+            .state()
+            .ready(start + Duration::from_secs(7))
+            .unwrap_err();
+        assert_eq!(reason, "the capture has made no progress for 7 s");
+
+        let later = start + Duration::from_secs(60);
+        let agent = AgentFacts {
+            capture_progress: later,
+            ..AgentFacts::new(SourceKind::Wire, start)
+        };
+        cell.publish(Snapshot::default(), agent);
+        assert_eq!(
+            cell.state().ready(later).unwrap_err(),
+            "the last snapshot is 60 s old"
+        );
+    }
+
+    #[test]
+    fn an_agent_whose_cgroup_is_gone_works_and_is_not_ready() {
+        let start = Instant::now();
+        let gone = "the cgroup /robot was removed".to_owned();
+        let mut state = State {
+            snapshot: Some(Snapshot::default()),
+            agent: AgentFacts {
+                gone: Some(gone.clone()),
+                ..AgentFacts::new(SourceKind::Host, start)
+            },
+        };
+        assert_eq!(state.ready(start), Err(gone));
+        assert_eq!(state.progresses(start), Ok(()));
+        let later = start + Duration::from_hours(1);
+        assert!(state.progresses(later).is_err());
+        state.agent.gone = None;
+        assert_eq!(state.ready(start), Ok(()));
+    }
+
+    #[test]
+    fn a_finished_replay_stays_ready() {
+        let start = Instant::now();
+        let agent = AgentFacts {
+            finished: true,
+            ..AgentFacts::new(SourceKind::Replay, start)
+        };
+        let state = State {
+            snapshot: Some(Snapshot::default()),
+            agent,
+        };
+        assert_eq!(state.ready(start + Duration::from_hours(1)), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn who_asks_gets_the_next_state_and_waits_for_a_stuck_writer_only_so_long() {
+        let cell = SnapshotCell::new(SourceKind::Wire);
+        let writer = async {
+            while !cell.is_asked() {
+                tokio::task::yield_now().await;
+            }
+            cell.publish(
+                Snapshot::default(),
+                AgentFacts::new(SourceKind::Wire, Instant::now()),
+            );
+        };
+        tokio::join!(cell.refresh(Duration::from_secs(3600)), writer);
+        assert!(cell.state().snapshot.is_some() && !cell.is_asked());
+        cell.refresh(Duration::from_millis(1)).await;
+    }
+
+    #[tokio::test]
+    async fn asking_rings_the_bell_until_it_is_heard() {
+        let cell = SnapshotCell::new(SourceKind::Wire);
+        let rings = || {
+            let listener = cell.bell().descriptor().unwrap();
+            wait(&[listener], Duration::ZERO).unwrap() == Some(0)
+        };
+        assert!(!rings());
+        for _ in 0..3 {
+            cell.refresh(Duration::ZERO).await;
+        }
+        assert!(rings());
+        cell.bell().silence();
+        assert!(!rings() && cell.is_asked());
+    }
+}
