@@ -18,6 +18,8 @@ MIRI_WIRE := cursor:: walk:: record:: rtps:: testing:: --skip never
 MIRI_CAPTURE := ring::block ring::turns shm::cell shm::port shm::segment shm::inbox
 MIRI_THREADS := ring::turns
 
+SOURCES := https://github.com/ros2probe/ros2probe/blob/main
+
 # Node of target/tools is there only where the system's is too old for the page's tests.
 export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 # Comes with Rust and links for both architectures: no cross toolchain.
@@ -132,6 +134,13 @@ miri: ## rings and the walk under Miri, which finds what the compiler may not as
 	@$(MIRI) --package ros2probe-capture --lib -- $(MIRI_CAPTURE)
 	@MIRI_MORE=-Zmiri-many-seeds=0..16 $(MIRI) --package ros2probe-capture --lib -- $(MIRI_THREADS)
 
+book: ## the documentation as a website in target/book, with its links, sizes and prose checked
+	@.ci/prerequisites.sh book
+	cargo test --package ros2probe-testing --test documents --test prose --quiet
+	mdbook build docs --dest-dir $(TARGET)/book
+	@# Links out of the book lead to the repository.
+	sed -i -E 's#href="\.\./([^"#]*)\.html#href="$(SOURCES)/\1.md#g; s#href="\.\./#href="$(SOURCES)/#g' $(TARGET)/book/*.html
+
 deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses sources: without network
 	@.ci/prerequisites.sh deny
 	cargo deny check $(DENY)
@@ -139,4 +148,4 @@ deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri deny prerequisites
+.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri book deny prerequisites

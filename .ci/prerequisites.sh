@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
 #
-#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|deny...   install what those targets need
+#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|book|deny...   install what those targets need
 #   prerequisites.sh types                    install what the dashboards are type-checked with
 #   prerequisites.sh page                     install the browser that the page is tested in
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
@@ -273,7 +273,7 @@ rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
     version=$(rustc --version | sed -E 's/rustc 1\.([0-9]+).*/\1/')
-    [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup update stable"
+    [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup toolchain install (rust-toolchain.toml names it)"
     cargo clippy --version >/dev/null 2>&1 || component clippy
     cargo fmt --version >/dev/null 2>&1 || component rustfmt
 }
@@ -395,6 +395,14 @@ for need; do
             rustup component add miri --toolchain "$(nightly)"
         }
         ;;
+    book)
+        rust
+        mdbook --version >/dev/null 2>&1 || {
+            packages gcc libc6-dev
+            say "installing mdbook 0.5.4"
+            cargo install mdbook --version 0.5.4 --locked
+        }
+        ;;
     deny)
         rust
         cargo deny --version 2>/dev/null | grep -q '^cargo-deny 0\.20\.' || {
@@ -403,6 +411,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, fast, dist, types, page, ebpf, fuzz, miri, deny" ;;
+    *) die "prerequisites.sh: $need is none of demo, test, fast, dist, types, page, ebpf, fuzz, miri, book, deny" ;;
     esac
 done

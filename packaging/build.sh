@@ -48,9 +48,9 @@ chmod 755 "$built/rp"
 gzip -9n "$parts"/man/*
 for shell in bash zsh fish; do "$rp" completions "$shell" >"$parts/rp.$shell"; done
 sed '1s|\$schema=|&/usr/share/ros2probe/|' "$root/config/ros2probe.yaml" >"$parts/ros2probe.yaml"
-for page in README.md SECURITY.md docs/install.md; do
-    [ ! -f "$root/$page" ] || cp "$root/$page" "$parts/pages"
-done
+mkdir -p "$parts/pages/docs"
+cp "$root/README.md" "$root/SECURITY.md" "$parts/pages"
+cp "$root"/docs/*.md "$parts/pages/docs"
 gzip -9n <"$root/CHANGELOG.md" >"$parts/CHANGELOG.md.gz"
 cat >"$parts/changelog" <<END
 ros2probe ($version) stable; urgency=medium

@@ -17,7 +17,7 @@ pub struct Event<'a> {
     /// When it happened, in UTC.
     #[cfg_attr(feature = "openapi", schema(format = DateTime))]
     pub time: String,
-    /// What it is, as the README lists.
+    /// What it is, as `docs/events.md` lists.
     #[cfg_attr(feature = "openapi", schema(example = "ros2.message.lost"))]
     pub name: Cow<'static, str>,
     /// `INFO`, `WARN` or `ERROR`.

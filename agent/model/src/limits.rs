@@ -1,7 +1,7 @@
 //! The caps that an operator may set (`limits:`), once: key, default, range, what one entry costs,
 //! what happens when it is reached. The configuration's keys, its schema, the table of the documents
 //! and the metrics `ros2probe_limit*` come from here; caps that protect a parser or the kernel's memory are
-//! constants where they apply, and are listed in the README beside these.
+//! constants where they apply, and are listed in `docs/limits-*.md`.
 //!
 //! The defaults fit a Raspberry Pi 4 and `MemoryMax=` of the unit: all of them reached at once, a
 //! test adds up what their entries take.

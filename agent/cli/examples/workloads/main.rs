@@ -59,7 +59,7 @@ struct Workload {
     /// Bytes and rate of each topic.
     topics: &'static [(usize, f64)],
     stacks: &'static [Stack],
-    /// CPU seconds that the reference implementation needs for 20 s (BENCHMARKS.md), where known.
+    /// CPU seconds that the reference implementation needs for 20 s (docs/benchmarks.md), where known.
     reference: Option<f64>,
 }
 

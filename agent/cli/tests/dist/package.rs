@@ -295,9 +295,15 @@ fn complete(archive: &Archive) -> Result<()> {
             .with_context(|| format!("no {path}"))?;
         ensure!(entry.mode == mode, "{path}: {:o}", entry.mode);
     }
+    let book = book()?;
+    for path in &book {
+        let entry = others.get(path).with_context(|| format!("no {path}"))?;
+        ensure!(entry.mode == 0o644, "{path}: {:o}", entry.mode);
+    }
     let unexpected: Vec<_> = others
         .keys()
         .filter(|path| FILES.iter().all(|(known, _)| path.as_str() != *known))
+        .filter(|path| !book.contains(path))
         .filter(|path| !path.ends_with("/SECURITY.md"))
         .collect();
     ensure!(unexpected.is_empty(), "not expected: {unexpected:?}");
@@ -323,7 +329,21 @@ fn complete(archive: &Archive) -> Result<()> {
     archive.compressed_without_dates()
 }
 
-const FILES: [(&str, u32); 19] = [
+/// Where the package has each page of `docs/`, so that the links of the README lead to them.
+fn book() -> Result<Vec<String>> {
+    let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
+    let mut pages = Vec::new();
+    for entry in std::fs::read_dir(docs)? {
+        let name = entry?.file_name().to_string_lossy().into_owned();
+        if name.ends_with(".md") {
+            pages.push(format!("usr/share/doc/ros2probe/docs/{name}"));
+        }
+    }
+    ensure!(pages.len() > 30, "{} pages", pages.len());
+    Ok(pages)
+}
+
+const FILES: [(&str, u32); 18] = [
     ("etc/ros2probe/ros2probe.yaml", 0o644),
     ("usr/bin/rp", 0o755),
     ("usr/lib/systemd/system/ros2probe.service", 0o644),
@@ -332,7 +352,6 @@ const FILES: [(&str, u32); 19] = [
     ("usr/share/doc/ros2probe/README.md", 0o644),
     ("usr/share/doc/ros2probe/changelog.gz", 0o644),
     ("usr/share/doc/ros2probe/copyright", 0o644),
-    ("usr/share/doc/ros2probe/install.md", 0o644),
     ("usr/share/doc/ros2probe/libraries.gz", 0o644),
     ("usr/share/fish/vendor_completions.d/rp.fish", 0o644),
     ("usr/share/lintian/overrides/ros2probe", 0o644),

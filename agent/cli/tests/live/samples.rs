@@ -393,7 +393,7 @@ impl Drop for Reader {
     }
 }
 
-/// What `BENCHMARKS.md` says of streams: `cargo test --release --test live samples:: -- --ignored
+/// What `docs/benchmarks-parts.md` says of streams: `cargo test --release --test live samples:: -- --ignored
 /// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]

@@ -276,7 +276,7 @@ fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
     Ok(())
 }
 
-/// What `BENCHMARKS.md` says of names: `cargo test --test live shm:: -- --ignored --nocapture`.
+/// What `docs/benchmarks-parts.md` says of names: `cargo test --test live shm:: -- --ignored --nocapture`.
 #[test]
 #[ignore = "takes two minutes and prints a figure"]
 fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
@@ -301,7 +301,7 @@ fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
     Ok(())
 }
 
-/// What `BENCHMARKS.md` says of the peers: `cargo test --test live shm:: -- --ignored --nocapture`.
+/// What `docs/benchmarks-parts.md` says of the peers: `cargo test --test live shm:: -- --ignored --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
 fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {

@@ -347,11 +347,11 @@ fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
     assert!(!socket.exists());
 }
 
-/// The commands of a section of the README and what they print.
+/// The commands of a section of `docs/api.md` and what they print.
 fn commands(section: &str) -> Vec<(String, String)> {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../README.md");
-    let readme = std::fs::read_to_string(path).unwrap();
-    let (_, section) = readme.split_once(&format!("\n## {section}\n")).unwrap();
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/api.md");
+    let page = std::fs::read_to_string(path).unwrap();
+    let (_, section) = page.split_once(&format!("\n## {section}\n")).unwrap();
     let (_, block) = section.split_once("```console\n$ ").unwrap();
     let (block, _) = block.split_once("\n```").unwrap();
     let commands = block.split("\n$ ").map(|command| {
@@ -374,10 +374,10 @@ fn masked(text: &str) -> String {
 }
 
 #[test]
-fn what_the_readme_prints_is_what_is_printed() {
+fn what_the_book_prints_is_what_is_printed() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "0.3"]);
     agent.wait_for_log("ready");
-    for (command, expected) in commands("Observe a topic at runtime") {
+    for (command, expected) in commands("Measure a topic at run time") {
         let here = command.replace("localhost:17401", &agent.api.to_string());
         let here = here.replace("localhost:17400", &agent.address.to_string());
         let deadline = Instant::now() + PATIENCE;
@@ -392,7 +392,7 @@ fn what_the_readme_prints_is_what_is_printed() {
             let may_repeat = !command.contains("-X") && Instant::now() < deadline;
             assert!(
                 may_repeat,
-                "{command}\n{said}\nbut the README has\n{expected}"
+                "{command}\n{said}\nbut docs/api.md has\n{expected}"
             );
             std::thread::sleep(Duration::from_millis(20));
         }

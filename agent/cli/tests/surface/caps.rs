@@ -1,4 +1,4 @@
-//! Fixed caps of docs/limits.md, driven over from outside; others have a test beside the constant.
+//! Fixed caps of docs/limits-*.md, driven over from outside; others have a test beside the constant.
 
 use std::collections::BTreeSet;
 use std::fs::File;

@@ -17,6 +17,7 @@ mod config;
 mod dashboards;
 mod discover;
 mod doctor;
+mod documents;
 mod doors;
 mod events;
 mod fuzz_seeds;

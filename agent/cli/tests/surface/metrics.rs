@@ -89,33 +89,76 @@ fn the_page_shows_the_whole_catalogue_and_nothing_else() {
     }
 }
 
+/// The page of `docs/` that lists a metric.
+fn page_of(metric: &str) -> &'static str {
+    let begins = |prefixes: &[&str]| prefixes.iter().any(|prefix| metric.starts_with(prefix));
+    if begins(&["ros2probe_", "process_"]) {
+        "metrics-agent.md"
+    } else if begins(&["ros2_topic_"]) {
+        "metrics-topics.md"
+    } else if begins(&[
+        "ros2_writer_",
+        "ros2_subscriber_",
+        "ros2_reader_",
+        "ros2_socket_",
+    ]) {
+        "metrics-endpoints.md"
+    } else {
+        "metrics-graph.md"
+    }
+}
+
+/// The rows of the catalogue that a page lists, below the head of the table.
+fn metrics_on(page: &str) -> String {
+    let table = markdown();
+    let is_shown = |(number, line): &(usize, &str)| match line.split('`').nth(1) {
+        Some(metric) if *number > 1 => page_of(metric) == page,
+        _ => true,
+    };
+    let shown = table.split_inclusive('\n').enumerate().filter(is_shown);
+    shown.map(|(_, line)| line).collect()
+}
+
 #[test]
-fn the_readme_s_tables_are_those_of_the_sources() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../README.md");
-    let mut readme = std::fs::read_to_string(&path).unwrap();
-    let hint = "run `UPDATE_README=1 cargo test -p ros2probe --test surface metrics::` and commit";
-    for (begin, end, wanted) in [
-        ("catalogue.rs -->\n", "<!-- metrics: end", markdown()),
+fn the_book_s_tables_are_those_of_the_sources() {
+    let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
+    let hint = "run `UPDATE_DOCS=1 cargo test -p ros2probe --test surface metrics::` and commit";
+    let metrics = |page| {
         (
+            page,
+            "catalogue.rs -->\n",
+            "<!-- metrics: end",
+            metrics_on(page),
+        )
+    };
+    for (page, begin, end, wanted) in [
+        metrics("metrics-graph.md"),
+        metrics("metrics-topics.md"),
+        metrics("metrics-endpoints.md"),
+        metrics("metrics-agent.md"),
+        (
+            "events.md",
             "events/table.rs -->\n",
             "<!-- events: end",
             events::markdown(),
         ),
         (
+            "limits.md",
             "model/src/limits.rs -->\n",
             "<!-- limits: end",
             limits_markdown(),
         ),
     ] {
-        let (before, rest) = readme.split_once(begin).unwrap();
+        let path = docs.join(page);
+        let text = std::fs::read_to_string(&path).unwrap();
+        let (before, rest) = text.split_once(begin).unwrap();
         let (table, after) = rest.split_once(end).unwrap();
-        if std::env::var_os("UPDATE_README").is_none() {
-            assert_eq!(table, wanted, "{hint}");
+        assert!(wanted.lines().count() > 3, "{page} lists nothing");
+        if std::env::var_os("UPDATE_DOCS").is_some() {
+            std::fs::write(path, format!("{before}{begin}{wanted}{end}{after}")).unwrap();
+        } else {
+            assert_eq!(table, wanted, "{page}: {hint}");
         }
-        readme = format!("{before}{begin}{wanted}{end}{after}");
-    }
-    if std::env::var_os("UPDATE_README").is_some() {
-        std::fs::write(path, readme).unwrap();
     }
 }
 

@@ -64,7 +64,7 @@ impl JsonSchema for LimitsShape {
     }
 }
 
-/// The caps of the configuration as a Markdown table, for the README.
+/// The caps of the configuration as a Markdown table, for `docs/limits.md`.
 #[must_use]
 pub fn markdown() -> String {
     let mut table = "| `limits.` | default | what | at the cap | told in detail by |\n\

@@ -1,5 +1,5 @@
 //! Every event the agent tells, once: name, severity, attributes, help. The streams, the log records
-//! of OpenTelemetry, the README's table and the tests work from it; nothing else spells a name.
+//! of OpenTelemetry, the table of `docs/events.md` and the tests work from it; nothing else spells a name.
 //!
 //! Attributes bear the names of the metrics' labels, so that events and series can be joined.
 
@@ -328,7 +328,7 @@ pub const EVENTS: &[Definition] = &[
     SUPPRESSED,
 ];
 
-/// The table in Markdown, for the README.
+/// The table in Markdown, for `docs/events.md`.
 #[must_use]
 pub fn markdown() -> String {
     let mut table =

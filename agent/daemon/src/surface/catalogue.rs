@@ -1,5 +1,5 @@
-//! Every metric the agent exports, once: name, type, unit, labels, help, stability. The renderer, the README's table
-//! and the tests work from it; nothing else spells a metric name.
+//! Every metric the agent exports, once: name, type, unit, labels, help, stability. The renderer, the
+//! tables of `docs/metrics-*.md` and the tests work from it; nothing else spells a metric name.
 //!
 //! Names follow the Prometheus naming practices; labels of topic series are `domain_id` and `topic`
 //! alone, details are in one info series.
@@ -513,7 +513,7 @@ pub const CATALOGUE: &[Metric] = &[
     PROCESS_START_TIME,
 ];
 
-/// The catalogue as a Markdown table, for the README.
+/// The catalogue as a Markdown table, for `docs/metrics-*.md`.
 #[must_use]
 pub fn markdown() -> String {
     let mut table = "| metric | type | labels | meaning |\n| --- | --- | --- | --- |\n".to_owned();

@@ -1,4 +1,4 @@
-//! The table of limits: what the page, /health and docs/limits.md say of each cap.
+//! The table of limits: what the page, /health and docs/limits-*.md say of each cap.
 
 use super::*;
 
@@ -24,10 +24,17 @@ fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health()
     assert_eq!(shown.len(), Limit::ALL.len());
 }
 
+/// The pages of the book that list constants, one behind the other.
+fn pages_of_fixed_caps(root: &Path) -> String {
+    let pages = ["capture", "model", "agent"].map(|page| format!("docs/limits-{page}.md"));
+    let text = |page: &String| std::fs::read_to_string(root.join(page)).unwrap();
+    pages.iter().map(text).collect()
+}
+
 #[test]
 fn the_table_of_fixed_caps_says_what_the_sources_say() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let page = std::fs::read_to_string(root.join("docs/limits.md")).unwrap();
+    let page = pages_of_fixed_caps(&root);
     let rows: Vec<Vec<&str>> = page
         .lines()
         .filter(|line| line.starts_with("| ") && line.contains("` in `"))
@@ -72,7 +79,7 @@ fn assert_test(path: &str, name: &str) {
 #[test]
 fn every_cap_names_the_test_that_drives_it_over() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let page = std::fs::read_to_string(root.join("docs/limits.md")).unwrap();
+    let page = pages_of_fixed_caps(&root);
     let rows = page.lines().filter(|line| line.starts_with("| "));
     let rows = rows.filter_map(|line| {
         let (name, path) = line.split(" | ").nth(2)?.split_once("` in `")?;
