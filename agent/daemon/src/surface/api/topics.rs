@@ -106,7 +106,7 @@ struct TopicDetails<'a> {
 
 /// Pairs of publisher and subscriber between which messages pass in one way.
 #[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Transport)]
+#[schema(as = Passage)]
 struct PassageView {
     /// `network`; `shared_memory`, of which samples are seen; `data_sharing`, `same_process` or
     /// `iceoryx`, which are not seen.
