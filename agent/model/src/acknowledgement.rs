@@ -1,8 +1,8 @@
 //! What the readers of one reliable writer acknowledged, and how far behind they are.
 //!
 //! How old the oldest unacknowledged sample is needs the times of samples: the latest are kept
-//! exactly, older ones ever more coarsely, so that a reader that hangs for an hour is told in bounded
-//! memory. Nothing is kept of a writer that nobody acknowledges.
+//! exactly, older ones ever more coarsely, so that a reader that hangs for an hour is told in
+//! bounded memory. Nothing is kept of a writer that nobody acknowledges.
 
 use std::collections::VecDeque;
 

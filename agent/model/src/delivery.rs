@@ -1,20 +1,18 @@
 //! What one receiver got of one writer's samples, or what left for one destination.
 //!
 //! A delivery begins with what the receiver saw first; its losses are gaps below the highest number
-//! that it saw or that a HEARTBEAT told it, and samples that left this host for where it listens. So
-//! who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a cause.
-//! What leaves has no losses: what was not sent is nobody's.
+//! that it saw or that a HEARTBEAT told it, and samples that left this host for where it listens.
+//! So who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a
+//! cause. What leaves has no losses: what was not sent is nobody's.
 
 mod accounting;
+mod departed;
 
 use std::collections::BTreeSet;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
-
-use accounting::Accounting;
-pub use accounting::Totals;
 
 use super::cause::LossCause;
 use super::journal::Journal;
@@ -27,6 +25,8 @@ use super::size::Size;
 use super::snapshot::{Delivered, Direction};
 use super::undelivered::Undelivered;
 use super::writer::settle_window;
+use accounting::Accounting;
+pub use accounting::Totals;
 
 /// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
 /// delivery begins anew.
@@ -34,8 +34,8 @@ const EXCUSED: u64 = 512;
 /// What left this host a moment ago may be under way still.
 const UNDER_WAY: u64 = SECOND;
 /// A receiver that is silent for so long and of which nothing tells whether it lives has lost what
-/// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a socket
-/// was closed.
+/// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a
+/// socket was closed.
 const SILENCE: u64 = 18 * SECOND;
 const FIRST_MOMENTS: u64 = 5 * SECOND;
 /// Samples that are lost in one go and wait for their cause when two deliveries become one.
@@ -44,9 +44,9 @@ const LONG_RUN: u64 = 256;
 /// Who gets the samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Receiver {
-    /// A participant, by whatever ways.
+    /// A participant, by any route.
     Participant(GuidPrefix),
-    /// Whoever is at the end of this way.
+    /// The receivers at the end of this route.
     Route(Route),
 }
 
@@ -73,7 +73,7 @@ pub struct DeliveryContext<'a> {
 #[derive(Debug)]
 pub struct Delivery {
     receiver: Receiver,
-    /// By which way new samples come.
+    /// By which route new samples come.
     main: Route,
     reception: Reception,
     tally: Delivered,
@@ -152,13 +152,13 @@ impl Delivery {
         self.receiver = Receiver::Participant(prefix);
     }
 
-    /// By which way new samples come.
+    /// By which route new samples come.
     #[must_use]
     pub const fn main(&self) -> Route {
         self.main
     }
 
-    /// New samples come another way.
+    /// New samples come by another route.
     pub const fn move_to(&mut self, route: Route) {
         self.main = route;
     }
@@ -203,7 +203,7 @@ impl Delivery {
         self.reception.sequence().has(number)
     }
 
-    /// This sample came another way that may be the same receiver's.
+    /// This sample came by another route that may be the same receiver's.
     pub fn know(&mut self, number: u64, totals: &mut Totals) {
         self.reception.sequence_mut().know(number);
         if self.loss_causes.resolve(number) {
@@ -337,40 +337,6 @@ impl Delivery {
         self.reception.sequence_mut().acknowledged(base);
     }
 
-    /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What does
-    /// not arrive at a receiver that was `alive` afterwards is lost.
-    pub fn expect(
-        &mut self,
-        newest: u64,
-        alive: Option<Timestamp>,
-        left_by: impl Fn(Timestamp) -> Option<u64>,
-        context: &mut DeliveryContext<'_>,
-    ) {
-        if !self.reception.sequence().started() || newest < self.next() {
-            (self.waiting, self.presumed_lost) = (None, false);
-            return;
-        }
-        let since = self.waiting.get_or_insert(context.now).0;
-        let mut until = alive.map_or(0, |alive| {
-            alive.0.min(context.now.0.saturating_sub(UNDER_WAY))
-        });
-        if !self.presumed_lost && since.saturating_add(SILENCE) <= context.now.0 {
-            self.presumed_lost = true;
-            until = until.max(since.saturating_add(FIRST_MOMENTS));
-        }
-        let lost = left_by(Timestamp(until)).filter(|number| *number >= self.next());
-        if let Some(number) = lost.filter(|_| until >= since) {
-            self.exists(number, context);
-        }
-    }
-
-    /// Nothing more will come of what has left for here.
-    pub fn expect_no_more(&mut self, newest: u64, context: &mut DeliveryContext<'_>) {
-        if self.reception.sequence().started() && !self.presumed_lost {
-            self.exists(newest, context);
-        }
-    }
-
     /// Settles what has waited long enough.
     pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
         let (now, window) = (context.now, settle_window(self.is_reliable(context)));
@@ -474,15 +440,6 @@ impl Delivery {
         }
     }
 
-    /// What was written until its reader appeared is for no reader here: `next` and when it last rose
-    /// are those before the record that is taken in.
-    fn excuse_unheard(&mut self, (next, advanced): (u64, Timestamp)) {
-        let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < self.opened && sequence.next() > next {
-            sequence.excuse(next, sequence.next());
-        }
-    }
-
     fn whole(&mut self, whole: &Whole, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_history = whole.number < sequence.first() && !whole.unconfirmed;
@@ -511,8 +468,8 @@ impl Delivery {
         });
     }
 
-    /// A sample that comes after it was settled as lost: too late for the counters, unless its cause
-    /// was still awaited.
+    /// A sample that comes after it was settled as lost: too late for the counters, unless its
+    /// cause was still awaited.
     fn late(
         &mut self,
         sample: Sample<'_>,

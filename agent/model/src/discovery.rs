@@ -6,25 +6,29 @@
 //! stays, and a newcomer that is worth no more is refused until there is room.
 
 mod disposals;
+mod endpoints;
 mod entity;
 mod eviction;
 mod facts;
 mod memory;
+mod nodes;
 mod pending;
 mod priority;
 
-use std::cmp::Reverse;
 use std::collections::{BTreeSet, HashMap};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 
-use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, Role};
-use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::rtps::Locator;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
+use super::churn::{Churn, Event};
+use super::journal::{DiscoveryEvent, Journal};
+use super::size::Size;
+use super::topic::Naming;
+use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;
 use eviction::{FORSAKEN, Newcomer, Table, Victims};
@@ -33,12 +37,6 @@ pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Pa
 pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
-
-use super::churn::{Churn, Event};
-use super::journal::{DiscoveryEvent, Journal};
-use super::size::Size;
-use super::topic::Naming;
-use crate::watch::Watchlist;
 
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
@@ -132,8 +130,24 @@ pub struct Evictions {
     pub nodes: u64,
 }
 
+impl PendingNodes {
+    /// Bytes of the nodes.
+    fn held(&self) -> usize {
+        // A new list does not compile before it has a place here.
+        let Self {
+            at: _,
+            writer: _,
+            sequence_number: _,
+            nodes,
+            bytes: _,
+            priority: _,
+        } = self;
+        nodes.iter().map(Node::bytes).sum()
+    }
+}
+
 impl Discovery {
-    /// Nobody there.
+    /// Nothing discovered.
     #[must_use]
     pub fn new(caps: Caps) -> Self {
         Self {
@@ -163,7 +177,7 @@ impl Discovery {
         self.revision
     }
 
-    /// Everybody.
+    /// All participants.
     #[must_use]
     pub const fn participants(&self) -> &HashMap<GuidPrefix, Box<Participant>> {
         &self.participants
@@ -210,18 +224,7 @@ impl Discovery {
             node_victims,
             revision: _,
         } = self;
-        let held = |pending: &PendingNodes| {
-            let PendingNodes {
-                at: _,
-                writer: _,
-                sequence_number: _,
-                nodes,
-                bytes: _,
-                priority: _,
-            } = pending;
-            nodes.iter().map(Node::bytes).sum::<usize>()
-        };
-        let waiting = pending_nodes.values().map(held).sum();
+        let waiting = pending_nodes.values().map(|pending| pending.held()).sum();
         let (applicants, pending_endpoints) = (applicants.sizes(), pending_endpoints.sizes());
         let each = || participants.values().map(|each| each.lists());
         let nodes = each().map(|lists| lists.nodes).sum();
@@ -416,140 +419,6 @@ impl Discovery {
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
-    /// SEDP: an endpoint is there. `evidence` is what is known in its participant's favour. Returns
-    /// whether the participant finds room by that.
-    pub fn endpoint(
-        &mut self,
-        announcement: EndpointAnnouncement,
-        origin: &Origin,
-        evidence: Priority,
-        journal: &mut Journal,
-    ) -> bool {
-        let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
-        if names.iter().any(|name| name.len() > MAX_NAME_LEN) {
-            self.evictions.endpoints += 1;
-            return false;
-        }
-        if self.disposals.is_stale(announcement.guid, origin) {
-            return false;
-        }
-        let guid = announcement.guid;
-        let announces_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
-        let pending = PendingEndpoint {
-            at: origin.at,
-            announces_readers,
-            announcement: Box::new(announcement),
-        };
-        let is_known = self.participants.contains_key(&guid.prefix);
-        let pending = match is_known {
-            true => self.admit(pending, origin.at, journal),
-            false => Some(pending),
-        };
-        let Some(pending) = pending else {
-            self.pending_endpoints.remove(&guid);
-            return false;
-        };
-        let watched = is_named(&self.watchlist, None, &pending.announcement.topic);
-        let priority = Priority {
-            watched,
-            ..evidence
-        };
-        let is_crowded = self.pending_endpoints.put(guid, priority, pending);
-        self.evictions.endpoints += u64::from(is_known || is_crowded);
-        let is_more = !is_known && self.seen(guid.prefix, origin.at, priority);
-        is_more && self.learn(guid.prefix, priority, origin.at, journal)
-    }
-
-    /// SEDP: an endpoint says goodbye.
-    pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
-        self.disposals.add(guid, origin);
-        self.pending_endpoints.remove(&guid);
-        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
-            participant.endpoints.remove(&guid);
-        }
-        self.drop_endpoint(guid, Some(Event::Disposed), origin.at, journal);
-    }
-
-    /// `ros_discovery_info`: these are the participant's nodes now. `evidence` is what is known in its
-    /// favour.
-    pub fn entities(
-        &mut self,
-        entities: &ParticipantEntities,
-        writer: Guid,
-        origin: &Origin,
-        evidence: Priority,
-        journal: &mut Journal,
-    ) {
-        // A participant tells of its own nodes only.
-        let prefix = entities.participant.prefix;
-        if prefix != writer.prefix {
-            return;
-        }
-        let priority = self.participants.get(&prefix).map(|known| known.priority());
-        let guid = entities.participant;
-        let newcomer = priority.map(|priority| Newcomer { guid, priority });
-        let wanted = entities.nodes.iter();
-        let wanted = wanted.map(|node| node.writers.len() + node.readers.len());
-        let wanted = wanted.sum::<usize>().min(PER_PARTICIPANT);
-        let (eviction, mut names) = loop {
-            let (eviction, names) = self.node_quota(prefix);
-            let fits = entities.nodes.len() <= eviction && wanted <= names;
-            let newcomer = newcomer.filter(|_| !fits);
-            let is_more =
-                newcomer.is_some_and(|newcomer| self.evict_for(Table::Nodes, newcomer, origin.at));
-            if !is_more {
-                break (eviction, names.min(PER_PARTICIPANT));
-            }
-        };
-        let mut nodes: Vec<Node> = entities.nodes.iter().take(eviction).map(Node::of).collect();
-        self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
-        for node in &mut nodes {
-            self.evictions.nodes += u64::from(node.cut(&mut names));
-        }
-        if self.participants.contains_key(&prefix) {
-            self.set_nodes(
-                prefix,
-                writer,
-                origin.sequence_number,
-                nodes,
-                origin.at,
-                journal,
-            );
-            return;
-        }
-        let older = |pending: &PendingNodes| {
-            pending.writer == writer && pending.sequence_number >= origin.sequence_number
-        };
-        if self.pending_nodes.get(&prefix).is_some_and(older) {
-            return;
-        }
-        self.pending_nodes.remove(&prefix);
-        let bytes = nodes.iter().map(Node::bytes).sum();
-        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
-        let priority = waiting.fold(evidence, |priority, (_, other)| priority.or(other));
-        while self.pending_nodes.len() >= PENDING_NODES
-            || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
-        {
-            self.evictions.nodes += 1;
-            let pending = self.pending_nodes.iter();
-            let oldest = pending.min_by_key(|(_, pending)| (pending.priority, pending.at));
-            match oldest.map(|(prefix, pending)| (*prefix, pending.priority)) {
-                Some((oldest, least)) if least <= priority => self.pending_nodes.remove(&oldest),
-                _ => return,
-            };
-        }
-        let sequence_number = origin.sequence_number;
-        let pending = PendingNodes {
-            at: origin.at,
-            priority,
-            writer,
-            sequence_number,
-            nodes,
-            bytes,
-        };
-        self.pending_nodes.insert(prefix, pending);
-    }
-
     /// Ends leases that have run out at `now`.
     pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) {
         let mut expired: Vec<_> = self
@@ -579,24 +448,6 @@ impl Discovery {
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
     }
 
-    /// How many nodes this participant may have, and how many endpoints these may name.
-    fn node_quota(&self, prefix: GuidPrefix) -> (usize, usize) {
-        let known: &[Node] = match self.participants.get(&prefix) {
-            Some(known) => &known.nodes,
-            None => &[],
-        };
-        let eviction = self.caps.nodes.saturating_sub(self.node_count);
-        let names = self.caps.endpoints.saturating_sub(self.named);
-        (eviction + known.len(), names + named(known))
-    }
-
-    fn pending_node_bytes(&self) -> usize {
-        self.pending_nodes
-            .values()
-            .map(|pending| pending.bytes)
-            .sum()
-    }
-
     /// Takes in a participant that is new; whether there is room for it. Else it waits for that.
     fn enter(
         &mut self,
@@ -620,145 +471,6 @@ impl Discovery {
         self.note(&entity, Event::Appeared, at, journal);
         self.adopt_pending(prefix, at, journal);
         true
-    }
-
-    /// Puts an announced endpoint into its known participant; gives it back where it finds no room.
-    fn admit(
-        &mut self,
-        pending: PendingEndpoint,
-        at: Timestamp,
-        journal: &mut Journal,
-    ) -> Option<PendingEndpoint> {
-        let announcement = &pending.announcement;
-        let guid = announcement.guid;
-        let participant = self.participants.get_mut(&guid.prefix)?;
-        participant.all_readers_announced |= pending.announces_readers;
-        let domain_id = participant.domain_id;
-        if let Some(known) = self.endpoints.get_mut(&guid) {
-            if *known.topic == *announcement.topic.as_str() {
-                let before = (
-                    known.type_hash,
-                    known.qos.clone(),
-                    Arc::clone(&known.message_type),
-                );
-                known.qos = announcement.qos.clone();
-                known.type_hash = announcement.type_hash;
-                known.message_type = announcement.type_name.message().as_str().into();
-                let unchanged = before.0 == known.type_hash
-                    && before.1 == known.qos
-                    && before.2 == known.message_type;
-                if !unchanged {
-                    let entity = DiscoveredEntity::endpoint(guid, known);
-                    self.changes.push(Change::Changed(guid));
-                    self.note(&entity, Event::Changed, at, journal);
-                }
-                return None;
-            }
-            // The same GUID on another topic: its dispose was missed.
-            participant.endpoints.remove(&guid);
-            self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
-        }
-        let participant = self.participants.get(&guid.prefix)?;
-        let watched = is_named(&self.watchlist, Some(domain_id), &announcement.topic);
-        let priority = Priority {
-            watched,
-            ..participant.priority()
-        };
-        if participant.endpoints.len() >= PER_PARTICIPANT {
-            return Some(pending);
-        }
-        let is_full = self.endpoints.len() >= self.caps.endpoints;
-        if is_full && !self.evict_for(Table::Endpoints, Newcomer { guid, priority }, at) {
-            return Some(pending);
-        }
-        let announcement = pending.announcement;
-        let unicast = &announcement.unicast;
-        let shared_memory =
-            (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
-        let endpoint = Endpoint {
-            role: announcement.role,
-            domain_id,
-            topic: announcement.topic.as_str().into(),
-            message_type: announcement.type_name.message().as_str().into(),
-            type_hash: announcement.type_hash,
-            qos: announcement.qos,
-            first_seen: at,
-            shared_memory,
-            data_sharing: announcement.datasharing,
-            watched,
-        };
-        let entity = DiscoveredEntity::endpoint(guid, &endpoint);
-        self.endpoints.insert(guid, Box::new(endpoint));
-        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
-            participant.endpoints.insert(guid);
-            participant.watched += usize::from(watched);
-        }
-        self.changes.push(Change::Appeared(guid));
-        self.note(&entity, Event::Appeared, at, journal);
-        None
-    }
-
-    /// What waited for this participant, or for room, until there is none for what is worth most.
-    fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
-        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
-        let mut waiting: Vec<_> = waiting.collect();
-        waiting.sort_by_key(|(_, priority)| Reverse(*priority));
-        for (guid, priority) in waiting {
-            let Some((_, pending)) = self.pending_endpoints.remove(&guid) else {
-                continue;
-            };
-            if let Some(pending) = self.admit(pending, at, journal) {
-                self.pending_endpoints.put(guid, priority, pending);
-                break;
-            }
-        }
-        if let Some(pending) = self.pending_nodes.remove(&prefix) {
-            let PendingNodes {
-                writer,
-                sequence_number,
-                nodes,
-                ..
-            } = pending;
-            self.set_nodes(prefix, writer, sequence_number, nodes, at, journal);
-        }
-    }
-
-    fn set_nodes(
-        &mut self,
-        prefix: GuidPrefix,
-        writer: Guid,
-        sequence_number: u64,
-        nodes: Vec<Node>,
-        at: Timestamp,
-        journal: &mut Journal,
-    ) {
-        let Some(participant) = self.participants.get_mut(&prefix) else {
-            return;
-        };
-        let older = |(from, number): (Guid, u64)| from == writer && number >= sequence_number;
-        if participant.nodes_from.is_some_and(older) {
-            return;
-        }
-        participant.nodes_from = Some((writer, sequence_number));
-        let domain_id = participant.domain_id;
-        let before = std::mem::replace(&mut participant.nodes, nodes);
-        self.named = self.named.saturating_sub(named(&before)) + named(&participant.nodes);
-        let after: Vec<_> = participant
-            .nodes
-            .iter()
-            .map(|node| Arc::clone(&node.name))
-            .collect();
-        self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
-        let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
-        let guid = Guid::new(prefix, EntityId::PARTICIPANT);
-        for name in difference(&before, &after) {
-            let entity = DiscoveredEntity::node(domain_id, guid, &name);
-            self.note(&entity, Event::Disposed, at, journal);
-        }
-        for name in difference(&after, &before) {
-            let entity = DiscoveredEntity::node(domain_id, guid, &name);
-            self.note(&entity, Event::Appeared, at, journal);
-        }
     }
 
     /// Takes a participant out with all it has; `event` is `None` for a silent eviction.
@@ -796,31 +508,6 @@ impl Discovery {
                 self.note(&entity, event, at, journal);
             }
         }
-    }
-
-    fn drop_endpoint(
-        &mut self,
-        guid: Guid,
-        event: Option<Event>,
-        at: Timestamp,
-        journal: &mut Journal,
-    ) {
-        let Some(endpoint) = self.endpoints.remove(&guid) else {
-            return;
-        };
-        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
-            let watched = usize::from(endpoint.watched);
-            participant.watched = participant.watched.saturating_sub(watched);
-        }
-        if let Some(event) = event {
-            self.note(
-                &DiscoveredEntity::endpoint(guid, &endpoint),
-                event,
-                at,
-                journal,
-            );
-        }
-        self.changes.push(Change::Gone(guid, endpoint));
     }
 
     /// A participant's domain is told better than before: all it has moves along.
@@ -894,17 +581,4 @@ pub(super) const fn endpoints_of(prefix: GuidPrefix) -> RangeInclusive<Guid> {
 /// Whether the DDS topic is watched by its exact name, in this domain or, with `None`, in any.
 fn is_named(watchlist: &Watchlist, domain_id: Option<DomainId>, topic: &DdsTopic) -> bool {
     watchlist.has_names() && Naming::of(topic).is_named_by(domain_id, watchlist)
-}
-
-/// Names of `one` that are not in `other`, each as often as it is missing there.
-fn difference(one: &[Arc<str>], other: &[Arc<str>]) -> Vec<Arc<str>> {
-    let mut rest: Vec<_> = other.to_vec();
-    let mut missing = Vec::new();
-    for name in one {
-        match rest.iter().position(|each| each == name) {
-            Some(index) => drop(rest.swap_remove(index)),
-            None => missing.push(Arc::clone(name)),
-        }
-    }
-    missing
 }

@@ -231,8 +231,8 @@ impl Events {
         self.waiting.push(Event { at, kind });
     }
 
-    /// Entries and cap of every list. They are taken when `MANY` wait, and one datagram or tick adds
-    /// at most `MOST` of each class and second.
+    /// Entries and cap of every list. They are taken when `MANY` wait, and one datagram or tick
+    /// adds at most `MOST` of each class and second.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
         // A new list does not compile before it has a place here.

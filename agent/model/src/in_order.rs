@@ -16,8 +16,8 @@ use ros2probe_wire::time::SECOND;
 use super::payloads::{Dispatch, MAX_UNANNOUNCED, Sample};
 use super::size::Size;
 
-/// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three seconds
-/// at the latest.
+/// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three
+/// seconds at the latest.
 const PATIENCE: u64 = 4 * SECOND;
 /// Samples that wait at once.
 const WAITING: usize = 4096;
@@ -46,7 +46,7 @@ pub struct Progress {
 /// A sample and those who get it.
 #[derive(Debug)]
 pub struct Due {
-    /// Ids of the wishes.
+    /// Ids of the requests.
     pub to: Arc<[u64]>,
     /// The sample.
     pub sample: Sample,
@@ -208,7 +208,8 @@ impl InOrder {
     fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
         self.bytes -= due.cost();
         let came = due.sample.time;
-        // Its reader may have the lower one that was not seen in shared memory: then it did not wait.
+        // Its reader may have the lower one that was not seen in shared memory: then it did not
+        // wait.
         let now = if due.sample.sampled { came } else { now };
         // Players order by time: those that waited for the same repair are a nanosecond apart.
         let after = match came < now.max(self.last) {

@@ -142,7 +142,8 @@ impl Journal {
         self.discovery.push_back(event);
     }
 
-    /// Keeps samples that will not come for the subscriptions until the next [`Self::take_missing`].
+    /// Keeps samples that will not come for the subscriptions until the next
+    /// [`Self::take_missing`].
     pub fn leave_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)

@@ -1,9 +1,7 @@
 //! The core: a state machine without clock, thread or I/O. Time and bytes come in, facts go out.
 //!
 //! - [`observer::Observer`] takes one [`input::Input`] after the other, each with its time, and is
-//!   drained of its [`input::Output`].
 //! - [`snapshot::Snapshot`] is all that it knows at a moment: participants, endpoints, topics and
-//!   their figures. [`event`] tells what changed.
 //! - [`interest`] is the verdict for each writer that the kernel programs need.
 //! - [`watch`] and [`limits`] are what an operator wants measured, and how much it may take.
 //!

@@ -1,7 +1,7 @@
 //! The caps that an operator may set (`limits:`), once: key, default, range, what one entry costs,
-//! what happens when it is reached. The configuration's keys, its schema, the table of the documents
-//! and the metrics `ros2probe_limit*` come from here; caps that protect a parser or the kernel's memory are
-//! constants where they apply, and are listed in `docs/limits-*.md`.
+//! what happens when it is reached. The configuration's keys, its schema, the table of the
+//! documents and the metrics `ros2probe_limit*` come from here; caps that protect a parser or the
+//! kernel's memory are constants where they apply, and are listed in `docs/limits-*.md`.
 //!
 //! The defaults fit a Raspberry Pi 4 and `MemoryMax=` of the unit: all of them reached at once, a
 //! test adds up what their entries take.
@@ -50,8 +50,8 @@ pub struct Row {
     pub reached: &'static str,
     /// Which metrics tell more than `ros2probe_limit_reached_total` does.
     pub told_by: &'static str,
-    /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and two
-    /// pages of metrics that tell of it; 1 where bytes are counted.
+    /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and
+    /// two pages of metrics that tell of it; 1 where bytes are counted.
     pub bytes: usize,
 }
 
@@ -84,6 +84,126 @@ pub struct Limits {
     pub metrics_clients: usize,
 }
 
+const PARTICIPANTS: Row = Row {
+    key: "participants",
+    default: 1_000,
+    range: (1, 100_000),
+    what: "DDS participants",
+    reached: "one that is no longer heard makes room (for 5 s, if it was there for \
+        less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
+        worth more; otherwise the newcomer is left out",
+    told_by: "ros2probe_table_evictions_total",
+    bytes: 2 << 10,
+};
+const ENDPOINTS: Row = Row {
+    key: "endpoints",
+    default: 8_192,
+    range: (1, 1_000_000),
+    what: "Writers and readers",
+    reached: "a participant that is no longer heard makes room with all its entries, \
+        or the least worthy entry for a newcomer that is worth more; otherwise the \
+        newcomer waits until there is room",
+    told_by: "ros2probe_table_evictions_total",
+    bytes: 5_632,
+};
+const TOPICS: Row = Row {
+    key: "topics",
+    default: 1_000,
+    range: (1, 100_000),
+    what: "Measured topics with series of their own",
+    reached: "one that has vanished makes room, or the latest one that is not watched \
+        by its exact name for one that is; otherwise the newcomer is listed but not \
+        measured until an entry is free",
+    told_by: "ros2probe_topics_rejected_total",
+    bytes: 15 << 10,
+};
+const WATCHES: Row = Row {
+    key: "watches",
+    default: 1_000,
+    range: (1, 10_000),
+    what: "Watches of the configuration, the command line and clients together",
+    reached: "a client's is refused (409), and so is a configuration that lists more",
+    told_by: "",
+    bytes: 1 << 10,
+};
+const UNKNOWN_WRITERS: Row = Row {
+    key: "unknown_writers",
+    default: 256,
+    range: (1, 100_000),
+    what: "Writers whose announcement was missed",
+    reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
+              otherwise the newcomer is not followed",
+    told_by: "ros2probe_table_evictions_total",
+    bytes: 4 << 10,
+};
+const FLOWS: Row = Row {
+    key: "flows",
+    default: 4_096,
+    range: (1, 1_000_000),
+    what: "Pairs of a measured writer and one receiver, or one destination, of its \
+           messages",
+    reached: "those that were silent for 10 s make room; until then the newcomer is not \
+              followed, and its topic's own counts stay right",
+    told_by: "ros2probe_table_evictions_total",
+    bytes: 2 << 10,
+};
+const REASSEMBLY_BYTES: Row = Row {
+    key: "reassembly_bytes",
+    default: 4 << 20,
+    range: (65_536, 1 << 30),
+    what: "Bytes of captured datagrams of which fragments are missing",
+    reached: "the oldest datagram is dropped",
+    told_by: "ros2probe_incomplete_datagrams_total",
+    bytes: 1,
+};
+const SUBSCRIPTIONS: Row = Row {
+    key: "subscriptions",
+    default: 32,
+    range: (1, 1_000),
+    what: "Clients that get messages one by one, recordings and snapshots",
+    reached: "the next one is refused (503)",
+    told_by: "ros2probe_subscriptions_refused_total",
+    bytes: 8 << 10,
+};
+const PAYLOAD_BYTES: Row = Row {
+    key: "payload_bytes",
+    default: 40 << 20,
+    range: (1 << 20, 16 << 30),
+    what: "Bytes of messages that are put together for them (one half), or wait to be \
+           read (the other)",
+    reached: "the oldest message of the longest queue is dropped, or the least \
+        complete one, and reported to its readers",
+    told_by: "ros2probe_missed_messages_total",
+    bytes: 1,
+};
+const RECORDINGS: Row = Row {
+    key: "recordings",
+    default: 4,
+    range: (1, 100),
+    what: "Bags that the agent writes at once on request",
+    reached: "the next one is refused (409)",
+    told_by: "",
+    bytes: 6 << 20,
+};
+const API_CLIENTS: Row = Row {
+    key: "api_clients",
+    default: 64,
+    range: (1, 10_000),
+    what: "Connections to each listener of the control API",
+    reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed",
+    told_by: "",
+    bytes: 32 << 10,
+};
+const METRICS_CLIENTS: Row = Row {
+    key: "metrics_clients",
+    default: 32,
+    range: (1, 10_000),
+    what: "Connections to the metrics listener",
+    reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed; with TLS it is closed",
+    told_by: "",
+    bytes: 32 << 10,
+};
+
 impl Limit {
     /// All of them, in the order in which they are documented.
     pub const ALL: [Self; 12] = [
@@ -105,125 +225,18 @@ impl Limit {
     #[must_use]
     pub const fn row(self) -> Row {
         match self {
-            Self::Participants => Row {
-                key: "participants",
-                default: 1_000,
-                range: (1, 100_000),
-                what: "DDS participants",
-                reached: "one that is no longer heard makes room (for 5 s, if it was there for \
-                    less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
-                    worth more; otherwise the newcomer is left out",
-                told_by: "ros2probe_table_evictions_total",
-                bytes: 2 << 10,
-            },
-            Self::Endpoints => Row {
-                key: "endpoints",
-                default: 8_192,
-                range: (1, 1_000_000),
-                what: "Writers and readers",
-                reached: "a participant that is no longer heard makes room with all its entries, \
-                    or the least worthy entry for a newcomer that is worth more; otherwise the \
-                    newcomer waits until there is room",
-                told_by: "ros2probe_table_evictions_total",
-                bytes: 5_632,
-            },
-            Self::Topics => Row {
-                key: "topics",
-                default: 1_000,
-                range: (1, 100_000),
-                what: "Measured topics with series of their own",
-                reached: "one that has vanished makes room, or the latest one that is not watched \
-                    by its exact name for one that is; otherwise the newcomer is listed but not \
-                    measured until an entry is free",
-                told_by: "ros2probe_topics_rejected_total",
-                bytes: 15 << 10,
-            },
-            Self::Watches => Row {
-                key: "watches",
-                default: 1_000,
-                range: (1, 10_000),
-                what: "Watches of the configuration, the command line and clients together",
-                reached: "a client's is refused (409), and so is a configuration that lists more",
-                told_by: "",
-                bytes: 1 << 10,
-            },
-            Self::UnknownWriters => Row {
-                key: "unknown_writers",
-                default: 256,
-                range: (1, 100_000),
-                what: "Writers whose announcement was missed",
-                reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
-                          otherwise the newcomer is not followed",
-                told_by: "ros2probe_table_evictions_total",
-                bytes: 4 << 10,
-            },
-            Self::Flows => Row {
-                key: "flows",
-                default: 4_096,
-                range: (1, 1_000_000),
-                what: "Pairs of a measured writer and one receiver, or one destination, of its \
-                       messages",
-                reached: "those that were silent for 10 s make room; until then the newcomer is not \
-                          followed, and its topic's own counts stay right",
-                told_by: "ros2probe_table_evictions_total",
-                bytes: 2 << 10,
-            },
-            Self::ReassemblyBytes => Row {
-                key: "reassembly_bytes",
-                default: 4 << 20,
-                range: (65_536, 1 << 30),
-                what: "Bytes of captured datagrams of which fragments are missing",
-                reached: "the oldest datagram is dropped",
-                told_by: "ros2probe_incomplete_datagrams_total",
-                bytes: 1,
-            },
-            Self::Subscriptions => Row {
-                key: "subscriptions",
-                default: 32,
-                range: (1, 1_000),
-                what: "Clients that get messages one by one, recordings and snapshots",
-                reached: "the next one is refused (503)",
-                told_by: "ros2probe_subscriptions_refused_total",
-                bytes: 8 << 10,
-            },
-            Self::PayloadBytes => Row {
-                key: "payload_bytes",
-                default: 40 << 20,
-                range: (1 << 20, 16 << 30),
-                what: "Bytes of messages that are put together for them (one half), or wait to be \
-                       read (the other)",
-                reached: "the oldest message of the longest queue is dropped, or the least \
-                    complete one, and reported to its readers",
-                told_by: "ros2probe_missed_messages_total",
-                bytes: 1,
-            },
-            Self::Recordings => Row {
-                key: "recordings",
-                default: 4,
-                range: (1, 100),
-                what: "Bags that the agent writes at once on request",
-                reached: "the next one is refused (409)",
-                told_by: "",
-                bytes: 6 << 20,
-            },
-            Self::ApiClients => Row {
-                key: "api_clients",
-                default: 64,
-                range: (1, 10_000),
-                what: "Connections to each listener of the control API",
-                reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed",
-                told_by: "",
-                bytes: 32 << 10,
-            },
-            Self::MetricsClients => Row {
-                key: "metrics_clients",
-                default: 32,
-                range: (1, 10_000),
-                what: "Connections to the metrics listener",
-                reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed; with TLS it is closed",
-                told_by: "",
-                bytes: 32 << 10,
-            },
+            Self::Participants => PARTICIPANTS,
+            Self::Endpoints => ENDPOINTS,
+            Self::Topics => TOPICS,
+            Self::Watches => WATCHES,
+            Self::UnknownWriters => UNKNOWN_WRITERS,
+            Self::Flows => FLOWS,
+            Self::ReassemblyBytes => REASSEMBLY_BYTES,
+            Self::Subscriptions => SUBSCRIPTIONS,
+            Self::PayloadBytes => PAYLOAD_BYTES,
+            Self::Recordings => RECORDINGS,
+            Self::ApiClients => API_CLIENTS,
+            Self::MetricsClients => METRICS_CLIENTS,
         }
     }
 
@@ -292,8 +305,8 @@ impl Limits {
         }
     }
 
-    /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what is
-    /// kept of events, two views of all there is under way, and the history of measured topics.
+    /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what
+    /// is kept of events, two views of all there is under way, and the history of measured topics.
     pub const BESIDE: usize = 29 << 20;
 
     /// Bytes that all of them take when they are reached together.

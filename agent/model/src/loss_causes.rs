@@ -126,8 +126,8 @@ impl LossCauses {
             .map(|(first, run)| (first, run.last))
     }
 
-    /// Whether this one was pending; it is no more. One in the middle of a run stays where that would
-    /// make a run too many: its cause is decided with the others'.
+    /// Whether this one was pending; it is no more. One in the middle of a run stays where that
+    /// would make a run too many: its cause is decided with the others'.
     pub fn resolve(&mut self, number: u64) -> bool {
         let Some((first, run)) = self.pending.range(..=number).next_back() else {
             return false;

@@ -3,44 +3,43 @@
 //! Everything happens in the source's time, which the caller passes in: the same input gives the
 //! same facts, live or replayed at any speed. It reads no clock, sends nothing and keeps no packet.
 
+mod announcements;
+mod clock;
+mod lists;
+mod samples;
+mod settings;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use ros2probe_wire::discovery::{self, Role};
-use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::qos::{Durability, Reliability};
-use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
-use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::record::{Body, Handover, flag};
+use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
+use ros2probe_wire::walk::{self, Envelope, Outcome};
+use ros2probe_wire::{DomainId, Guid, Reason, Record, Timestamp};
 
-use super::diagnosis::{self, Examiner};
-use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Priority, endpoints_of};
+use super::diagnosis::Examiner;
+use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use super::discovery_fragments::DiscoveryFragments;
-use super::event::{EventKind, bounded, bounded_finding, bounded_shared};
-use super::expectation::Evidence;
-use super::header::begins_with_header;
+use super::event::bounded_shared;
 use super::input::{Input, Output};
 use super::interest::Interest;
 use super::journal::Journal;
-use super::payloads::{self, Offered, Payloads};
-use super::profiler::{Measured, Profiler, RecordOutcome, UNDELIVERED};
-use super::rate::Slot;
-use super::receivers::{GraphView, Receivers};
-use super::route::Destination;
+use super::payloads::Payloads;
+use super::profiler::{Profiler, RecordOutcome, UNDELIVERED};
+use super::receivers::Receivers;
 use super::selection::SampleRequest;
 use super::size::Size;
-use super::snapshot::{Measurement, Snapshot, WatchState};
-use super::topic::{Naming, Topic, TopicId, Topics, Watched};
-use super::topic_kind::TopicKind;
+use super::snapshot::{Measurement, Snapshot};
+use super::topic::{Naming, TopicId, Topics, Watched};
 use super::trace::{Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
-use super::writer::{Counted, Traits};
-use crate::limits::Limits;
-use crate::watch::{Watch, Watchlist};
+use crate::watch::Watchlist;
+use lists::traits;
+pub use settings::Settings;
 
 /// How often leases, windows and gaps are looked at.
 const TICK: u64 = SECOND / 10;
@@ -48,35 +47,6 @@ const TICK: u64 = SECOND / 10;
 const JUMP: u64 = 3600 * SECOND;
 /// Names matched against globs in one go: a few milliseconds.
 const MATCHES_AT_ONCE: usize = 20_000;
-
-/// Caps and times.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Settings {
-    /// Participants.
-    pub participants: usize,
-    /// Endpoints.
-    pub endpoints: usize,
-    /// Nodes.
-    pub nodes: usize,
-    /// Topics that are measured.
-    pub topics: usize,
-    /// Writers that send without a known announcement.
-    pub unknown_writers: usize,
-    /// Receivers and destinations of all measured writers; likewise sockets.
-    pub deliveries: usize,
-    /// Entries of the kernel's interest map.
-    pub interest: usize,
-    /// Bytes for the bitmaps of fragmented samples.
-    pub sample_bytes: usize,
-    /// Bytes of samples that are put together for those who want them whole.
-    pub payload_bytes: usize,
-    /// Nanoseconds for which a topic without endpoints is still reported.
-    pub topic_grace: u64,
-    /// Nanoseconds after which the bytes of samples come at the latest once they are wanted.
-    pub payload_delay: u64,
-    /// Records say who sent: not so those of a capture file.
-    pub directed: bool,
-}
 
 /// What is wanted of messages in shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,46 +61,10 @@ pub enum Wanted {
     EverySample,
 }
 
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            participants: 1024,
-            endpoints: 16_384,
-            nodes: 4096,
-            topics: 1000,
-            unknown_writers: 256,
-            deliveries: 4096,
-            interest: 16_384,
-            sample_bytes: 1 << 20,
-            payload_bytes: 20 << 20,
-            topic_grace: 600 * SECOND,
-            payload_delay: payloads::PAYLOAD_DELAY,
-            directed: true,
-        }
-    }
-}
-
-impl Settings {
-    /// With the caps of the configuration.
-    #[must_use]
-    pub fn with_limits(self, limits: &Limits) -> Self {
-        Self {
-            participants: limits.participants,
-            endpoints: limits.endpoints,
-            topics: limits.topics,
-            unknown_writers: limits.unknown_writers,
-            deliveries: limits.flows,
-            // The other half is for what waits to be read.
-            payload_bytes: limits.payload_bytes / 2,
-            ..self
-        }
-    }
-}
-
 /// What deliveries are seen against. Borrows these fields alone, which a method could not.
 macro_rules! graph {
     ($observer:expr) => {
-        GraphView {
+        $crate::receivers::GraphView {
             receivers: &$observer.receivers,
             discovery: &$observer.discovery,
             topics: &$observer.topics,
@@ -138,6 +72,7 @@ macro_rules! graph {
         }
     };
 }
+pub(super) use graph;
 
 /// The core.
 #[derive(Debug)]
@@ -262,47 +197,6 @@ impl Observer {
         output
     }
 
-    /// Watches these from now on, once [`Self::apply_more_lists`] has come to all topics. What was counted of
-    /// a topic that is no more watched stays, and so does how a topic stands with an entry that is in
-    /// the new list as it was.
-    fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
-        let before = std::mem::replace(&mut self.watchlist, watchlist);
-        let moved = |watch: &Arc<Watch>| {
-            let place = self.watchlist.position(&watch.pattern, watch.domain_id)?;
-            let after = self.watchlist.watches().get(place)?;
-            (after.expectations == watch.expectations).then_some(place)
-        };
-        let moved: Vec<_> = before.watches().iter().map(moved).collect();
-        self.topics.renumber(&moved);
-        self.discovery.watch(Arc::clone(&self.watchlist));
-        let watches = self.watchlist.watches();
-        self.tracer
-            .restart(watches.iter().any(|watch| watch.trace > 0.0));
-        self.apply_lists_to_all();
-    }
-
-    /// Gives the samples that these wish for, and no others, once [`Self::apply_more_lists`] has come to all
-    /// topics. Their topics are measured
-    /// meanwhile, whether they are watched or not; what was counted stays.
-    fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
-        self.sample_requests = sample_requests;
-        if self.sample_requests.is_empty() {
-            self.payloads.retain_unknown_writers(|_| false);
-        }
-        self.apply_lists_to_all();
-    }
-
-    /// The time up to which all samples were given, or told as missing, that have come by `now`.
-    #[must_use]
-    pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
-        let writers = self.payloads.wanted();
-        let writers = writers.filter_map(|writer| self.profiler.get(*writer));
-        let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
-        unseen.fold(now, |until, since| {
-            until.min(self.wall_clock.wall_time(since))
-        })
-    }
-
     /// Whether somebody wants samples whole.
     #[must_use]
     pub const fn wants_payloads(&self) -> bool {
@@ -393,31 +287,6 @@ impl Observer {
         let mut padded = payload.to_vec();
         padded.resize(payload.len().max(length), 0);
         walk::datagram(&padded, envelope, None, |found| self.count(&found.record));
-    }
-
-    /// Says what time it is: ends leases, settles gaps, judges expectations.
-    fn advance(&mut self, now: Timestamp) {
-        let now = self.wall_clock.model_time(now);
-        if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
-            self.clock = Timestamp(now.0 - now.0 % TICK);
-            self.tick(self.clock);
-        }
-        while now.0.saturating_sub(self.clock.0) >= TICK {
-            self.clock = Timestamp(self.clock.0 + TICK);
-            self.tick(self.clock);
-        }
-    }
-
-    /// Nothing more will come: decides what is still open, without letting time pass.
-    fn settle(&mut self) {
-        let graph = graph!(self);
-        self.profiler.settle(self.clock, &mut self.journal, graph);
-        self.report_missing();
-        for writer in self.payloads.unsettled() {
-            self.payloads.give_all(writer, self.clock);
-        }
-        self.report_losses();
-        self.examine(self.clock);
     }
 
     /// Takes over what was known before the start, until one lease from `now` on at most.
@@ -532,84 +401,6 @@ impl Observer {
         }
     }
 
-    /// Gives a sample, when it is its turn, or remembers that it was of a stranger.
-    fn counted(&mut self, writer: Guid, counted: &Counted) {
-        if self.sample_requests.is_empty() {
-            return;
-        }
-        if !self.payloads.wants(writer) {
-            let known = self.profiler.get(writer);
-            if known.is_some_and(|known| known.topic.is_none()) {
-                let sample_requests = self.sample_requests.iter().map(|request| request.id);
-                let number = counted.number;
-                // Those that the profiler gave up since the last second make room.
-                if self.payloads.unknown_writers() >= self.settings.unknown_writers {
-                    let profiler = &self.profiler;
-                    self.payloads.retain_unknown_writers(|writer| {
-                        let known = profiler.get(writer);
-                        known.is_some_and(|known| known.topic.is_none())
-                    });
-                }
-                self.payloads
-                    .counted_of_unknown_writer(writer, number, sample_requests);
-            }
-            return;
-        }
-        let progress = self.profiler.progress(writer, counted.at, graph!(self));
-        if let Some(progress) = progress {
-            let skip = self.payloads.counted(writer, counted, &progress);
-            self.skip(writer, skip);
-        }
-    }
-
-    /// Gives a sample that was counted while its writer was a stranger, now that it comes again.
-    fn came_again(&mut self, writer: Guid, record: &Record) {
-        let Some(sample) = record.sample() else {
-            return;
-        };
-        let (number, at) = (sample.sequence_number(), Timestamp(record.time));
-        let stamp = match sample {
-            Sample::Data(_) => sample.header_stamp(),
-            Sample::DataFrag(_) => None,
-        };
-        if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
-            return;
-        }
-        let has_header = |known: &Measured| known.writer.traits().has_header;
-        let counted = Counted {
-            number,
-            bytes: sample.size().into(),
-            source: record.source_timestamp(),
-            stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
-            at,
-            began: at,
-            sampled: false,
-            unconfirmed: false,
-        };
-        let progress = self.profiler.progress(writer, at, graph!(self));
-        if let Some(progress) =
-            progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
-        {
-            let skip = self.payloads.came_again(writer, &counted, &progress);
-            self.skip(writer, skip);
-        }
-    }
-
-    /// Gives the samples of this writer whose turn it is.
-    fn turn(&mut self, writer: Guid, now: Timestamp) {
-        let progress = self.profiler.progress(writer, now, graph!(self));
-        if let Some(progress) = progress {
-            let skip = self.payloads.turn(writer, &progress, now);
-            self.skip(writer, skip);
-        }
-    }
-
-    fn skip(&mut self, writer: Guid, number: Option<u64>) {
-        if let Some(number) = number {
-            self.profiler.skip(writer, number);
-        }
-    }
-
     fn trace(&mut self, record: &Record) {
         let Self {
             tracer,
@@ -655,199 +446,6 @@ impl Observer {
         });
         if outcome == Outcome::Malformed {
             self.decode_error("rtps", Reason::BadLength);
-        }
-    }
-
-    fn announced(&mut self, found: &Found<'_>, vendor: Option<VendorId>, envelope: &Envelope) {
-        let record = &found.record;
-        if let Some(sample) = record.sample() {
-            let prefix = record.writer().prefix;
-            let [first, second, ..] = prefix.0;
-            let vendor = vendor.unwrap_or(VendorId([first, second]));
-            let origin = Origin {
-                at: self.wall_clock.model_time(Timestamp(envelope.time)),
-                sender: prefix,
-                sequence_number: sample.sequence_number(),
-                destination: envelope.destination,
-                port: envelope.destination_port,
-            };
-            self.read(found, sample, vendor, &origin);
-            self.follow_up(origin.at);
-            self.keep(found);
-        }
-    }
-
-    /// Keeps the bytes of a sample that somebody wants and that was not counted yet.
-    fn keep(&mut self, found: &Found<'_>) {
-        let writer = found.record.writer();
-        if self.payloads.wants_bytes(writer) {
-            let moved = self.wall_clock.model_record(&found.record);
-            let record = moved.as_ref().unwrap_or(&found.record);
-            let known = self.profiler.get(writer);
-            let Some(sample) = record.sample() else {
-                return;
-            };
-            let lacks = self.payloads.lacks(writer, sample.sequence_number());
-            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
-                self.payloads.keep(sample, found.payload);
-            }
-        }
-    }
-
-    /// Tells the subscriptions which samples will not come.
-    fn report_missing(&mut self) {
-        for missing in self.journal.take_missing() {
-            self.payloads.missing(&missing);
-        }
-    }
-
-    /// Reads what is of use to discovery.
-    fn read(&mut self, found: &Found<'_>, sample: Sample<'_>, vendor: VendorId, origin: &Origin) {
-        let writer = found.record.writer();
-        let stage = match writer.entity {
-            EntityId::SPDP_WRITER | EntityId::SPDP_SECURE_WRITER => "spdp",
-            EntityId::SEDP_PUBLICATIONS_WRITER
-            | EntityId::SEDP_SUBSCRIPTIONS_WRITER
-            | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER
-            | EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER => "sedp",
-            entity if !entity.is_builtin() && self.may_be_entities(found, sample) => "entities",
-            _ => return,
-        };
-        let whole;
-        let (payload, inline_qos) = if let Sample::DataFrag(fragments) = sample {
-            let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
-                return;
-            };
-            whole = bytes;
-            let status_info = sample.status_info();
-            (
-                Payload::Data(&whole),
-                Ok(InlineQos {
-                    status_info,
-                    ..InlineQos::default()
-                }),
-            )
-        } else {
-            (found.payload(), found.inline_qos(vendor))
-        };
-        let told = inline_qos.and_then(|inline_qos| match stage {
-            "spdp" => self.participant(vendor, payload, &inline_qos, origin),
-            "sedp" => self.endpoint(writer.entity, vendor, payload, &inline_qos, origin),
-            _ => self.entities(writer, payload, origin),
-        });
-        if let Err(error) = told {
-            self.decode_error(stage, error.reason);
-        }
-    }
-
-    /// Announced on `ros_discovery_info`, or not announced yet and of its form: the sample is sent
-    /// once, perhaps before the announcement is understood.
-    fn may_be_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
-        let writer = found.record.writer();
-        if sample.status_info() != StatusInfo::ALIVE {
-            return false;
-        }
-        if let Some(endpoint) = self.discovery.endpoints().get(&writer) {
-            return &*endpoint.topic == "ros_discovery_info";
-        }
-        let own = Guid::new(writer.prefix, EntityId::PARTICIPANT).to_bytes();
-        let begins = found.payload.get(4..20).is_some_and(|gid| *gid == own);
-        match sample {
-            Sample::Data(_) => begins,
-            Sample::DataFrag(fragments) => {
-                sample.is_start() && begins || self.discovery_fragments.holds(fragments)
-            }
-        }
-    }
-
-    fn participant(
-        &mut self,
-        vendor: VendorId,
-        payload: Payload<'_>,
-        inline_qos: &InlineQos,
-        origin: &Origin,
-    ) -> Result<(), WireError> {
-        match discovery::participant(vendor, payload, inline_qos)? {
-            discovery::Discovery::Alive(announcement) => {
-                let prefix = announcement.guid.prefix;
-                let evidence = self.evidence(prefix);
-                let journal = &mut self.journal;
-                self.discovery
-                    .participant(&announcement, origin, evidence, journal);
-                self.announce(prefix);
-            }
-            discovery::Discovery::Gone { guid, .. } => {
-                self.discovery
-                    .participant_gone(guid, origin, &mut self.journal);
-            }
-        }
-        Ok(())
-    }
-
-    fn endpoint(
-        &mut self,
-        entity: EntityId,
-        vendor: VendorId,
-        payload: Payload<'_>,
-        inline_qos: &InlineQos,
-        origin: &Origin,
-    ) -> Result<(), WireError> {
-        let role = match entity {
-            EntityId::SEDP_PUBLICATIONS_WRITER | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER => {
-                Role::Writer
-            }
-            _ => Role::Reader,
-        };
-        match discovery::endpoint(role, vendor, payload, inline_qos)? {
-            discovery::Discovery::Alive(announcement) => {
-                let prefix = announcement.guid.prefix;
-                let evidence = self.evidence(prefix);
-                let journal = &mut self.journal;
-                if self
-                    .discovery
-                    .endpoint(announcement, origin, evidence, journal)
-                {
-                    self.announce(prefix);
-                }
-            }
-            discovery::Discovery::Gone { guid, .. } => {
-                self.discovery
-                    .endpoint_gone(guid, origin, &mut self.journal);
-            }
-        }
-        Ok(())
-    }
-
-    fn entities(
-        &mut self,
-        writer: Guid,
-        payload: Payload<'_>,
-        origin: &Origin,
-    ) -> Result<(), WireError> {
-        let entities = ParticipantEntities::parse(payload.bytes())?;
-        let evidence = self.evidence(writer.prefix);
-        let journal = &mut self.journal;
-        self.discovery
-            .entities(&entities, writer, origin, evidence, journal);
-        Ok(())
-    }
-
-    /// What is known in favour of a participant of which something is announced.
-    fn evidence(&self, prefix: GuidPrefix) -> Priority {
-        Priority {
-            watched: false,
-            local: self.receivers.is_local(&prefix),
-            sends: self.profiler.has_unknown_writer(endpoints_of(prefix)),
-        }
-    }
-
-    /// A participant that is known is reached where it announces.
-    fn announce(&mut self, prefix: GuidPrefix) {
-        if let Some(participant) = self.discovery.participants().get(&prefix) {
-            let addresses = &participant.addresses;
-            let addresses = addresses.default.iter().chain(&addresses.metatraffic);
-            self.receivers
-                .announce(prefix, addresses.copied().map(Destination::from));
         }
     }
 
@@ -914,315 +512,10 @@ impl Observer {
             self.topics.leave(id, guid, now);
         }
     }
-
-    /// Tells the losses of the last second.
-    fn report_losses(&mut self) {
-        let discovery = &self.discovery;
-        self.journal.events.end_bursts(|burst| {
-            if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
-                burst.topic = Some((endpoint.domain_id, bounded_shared(&endpoint.topic)));
-            }
-            let participant = discovery.participants().get(&burst.writer.prefix);
-            let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
-            let node = nodes.find(|node| node.writers.contains(&burst.writer));
-            burst.node = node.map(|node| bounded_shared(&node.name));
-        });
-    }
-
-    /// Asks about every topic.
-    fn apply_lists_to_all(&mut self) {
-        let is_watched = |id: &TopicId| {
-            let topic = self.topics.get(*id);
-            topic.is_some_and(|topic| topic.watched == Watched::Yes)
-        };
-        let (watched, others): (Vec<_>, Vec<_>) =
-            self.topics.ids().into_iter().partition(is_watched);
-        // First give places back, then hand them out.
-        self.pending_topics = others.into_iter().rev().collect();
-        self.pending_topics.extend(watched.into_iter().rev());
-        self.apply_more_lists();
-    }
-
-    /// Asks the watchlist and the wishes about further topics, as many as take some milliseconds.
-    /// Until a topic's turn comes, what was decided by the lists before holds. Returns whether all
-    /// topics had their turn.
-    pub fn apply_more_lists(&mut self) -> bool {
-        if self.has_applied_lists() {
-            return true;
-        }
-        let requested = |request: &SampleRequest| {
-            request.selection.globs().count() + request.selection.regexes()
-        };
-        let patterns =
-            self.watchlist.globs() + self.sample_requests.iter().map(requested).sum::<usize>();
-        for _ in 0..(MATCHES_AT_ONCE / patterns.max(1)).max(1) {
-            let Some(id) = self.pending_topics.pop() else {
-                break;
-            };
-            self.apply_lists(id, self.clock);
-        }
-        self.has_applied_lists()
-    }
-
-    /// Whether the lists were asked about all topics since they last changed.
-    #[must_use]
-    pub const fn has_applied_lists(&self) -> bool {
-        self.pending_topics.is_empty()
-    }
-
-    /// Asks the watchlist and the wishes about a topic and lets its endpoints follow.
-    fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
-        let displaced = self.topics.apply_lists(
-            id,
-            &self.watchlist,
-            &self.sample_requests,
-            self.settings.topics,
-            now,
-        );
-        if let Some(id) = displaced {
-            self.apply_all(id, now);
-            self.topics.forget_measurement(id);
-        }
-        self.apply_all(id, now);
-    }
-
-    /// Lets the endpoints of a topic follow it.
-    fn apply_all(&mut self, id: TopicId, now: Timestamp) {
-        let Some(topic) = self.topics.get(id) else {
-            return;
-        };
-        let lists = [&topic.writers, &topic.readers, &topic.buffer_endpoints];
-        let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
-        for guid in guids {
-            self.apply(id, guid, now);
-        }
-    }
-
-    /// Decides about one endpoint of a topic.
-    fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
-        let Some(topic) = self.topics.get(id) else {
-            return;
-        };
-        let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
-            return;
-        };
-        let is_watched = topic.watched == Watched::Yes;
-        match endpoint.role {
-            Role::Reader if is_watched => self.interest.set(guid, Verdict::Meter),
-            Role::Reader => self.interest.remove(guid),
-            Role::Writer => {
-                let counts = naming(endpoint).is_some_and(|naming| naming.counts);
-                let measured = is_watched && counts;
-                let verdict = match topic.naming.kind {
-                    TopicKind::Discovery => Verdict::Capture,
-                    _ if measured && wants_bytes(topic) => Verdict::Capture,
-                    _ if measured => Verdict::Meter,
-                    _ => Verdict::Ignore,
-                };
-                self.interest.set(guid, verdict);
-                match &topic.requested {
-                    Some(requested) if measured => {
-                        let topic = payloads::Topic {
-                            domain_id: topic.domain_id,
-                            name: Arc::clone(&topic.naming.name),
-                            dds_name: Arc::clone(&topic.naming.dds_name),
-                            message_type: Arc::clone(&endpoint.message_type),
-                            offered: Some(Arc::new(Offered {
-                                type_hash: endpoint.type_hash,
-                                qos: endpoint.qos.clone(),
-                            })),
-                        };
-                        let known = self.profiler.get(guid);
-                        let next = known.map_or(0, |known| known.writer.next());
-                        self.payloads.want(guid, topic, requested, (next, now));
-                    }
-                    _ => self.payloads.release(guid, now),
-                }
-                if measured {
-                    let (traits, opened) = (traits(endpoint), topic.reader_appeared);
-                    self.profiler.measure(guid, id, traits, opened, now);
-                } else {
-                    self.retire(guid, now);
-                }
-            }
-        }
-    }
-
-    /// Measures this writer no more; its topic keeps what it had counted.
-    fn retire(&mut self, guid: Guid, now: Timestamp) {
-        let graph = graph!(self);
-        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
-            return;
-        };
-        self.report_missing();
-        if let Some(topic) = self.topics.get_mut(retired.topic) {
-            topic.retire(&retired.measurement, retired.totals.as_ref());
-        }
-    }
-
-    fn tick(&mut self, now: Timestamp) {
-        self.discovery.advance(now, &mut self.journal);
-        self.follow_up(now);
-        let graph = graph!(self);
-        let unknown_writers = self.profiler.advance(now, &mut self.journal, graph);
-        for guid in unknown_writers.metered {
-            self.interest.set(guid, Verdict::Meter);
-        }
-        for guid in unknown_writers.forgotten {
-            self.interest.remove(guid);
-        }
-        self.report_missing();
-        for writer in self.payloads.unsettled() {
-            self.turn(writer, now);
-        }
-        if now.0.is_multiple_of(SECOND) {
-            self.payloads.expire(now);
-            let profiler = &self.profiler;
-            self.payloads.retain_unknown_writers(|writer| {
-                let known = profiler.get(writer);
-                known.is_some_and(|known| known.topic.is_none())
-            });
-            self.topics.expire(now, self.settings.topic_grace);
-            self.receivers.tidy(&self.discovery);
-            self.discovery
-                .locate(|prefix| self.receivers.is_local(prefix));
-            self.promote();
-            self.judge(now);
-            self.report_losses();
-            self.examine(now);
-            self.tracer.advance(now);
-        }
-    }
-
-    fn examine(&mut self, now: Timestamp) {
-        let before = Arc::clone(self.examiner.current());
-        self.examiner.examine(&self.discovery, &self.topics, now);
-        let after = self.examiner.current();
-        if Arc::ptr_eq(&before, after) {
-            return;
-        }
-        for change in diagnosis::changes(&before.list, &after.list) {
-            let (resolved, finding) = match change {
-                diagnosis::Change::Appeared(finding) | diagnosis::Change::Changed(finding) => {
-                    (false, finding)
-                }
-                diagnosis::Change::Resolved(finding) => (true, finding),
-            };
-            let finding = bounded_finding(finding);
-            let kind = EventKind::Diagnosis { resolved, finding };
-            self.journal.events.push(now, kind);
-        }
-    }
-
-    /// Gives free measuring places, and those of vanished topics, to topics that were kept out.
-    fn promote(&mut self) {
-        if !self.topics.has_place(self.settings.topics) {
-            return;
-        }
-        let rejected = self
-            .topics
-            .iter()
-            .filter(|(_, topic)| topic.watched == Watched::Rejected && !topic.is_vanished());
-        let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
-        for id in rejected {
-            if !self.topics.has_place(self.settings.topics) {
-                return;
-            }
-            self.apply_lists(id, self.clock);
-        }
-    }
-
-    /// Judges every watched topic under every entry that covers it.
-    fn judge(&mut self, now: Timestamp) {
-        for id in self.topics.ids() {
-            let Some(topic) = self.topics.get(id) else {
-                continue;
-            };
-            if topic.judgements.is_empty() {
-                continue;
-            }
-            let writers: Vec<_> = topic
-                .writers
-                .iter()
-                .chain(&topic.buffer_endpoints)
-                .filter_map(|guid| self.profiler.get(*guid))
-                .collect();
-            let last_message = writers
-                .iter()
-                .filter_map(|each| each.writer.last_message())
-                .max();
-            let retired = topic
-                .retired
-                .as_ref()
-                .and_then(|retired| retired.last_message);
-            let recent = |seconds: u64| {
-                writers
-                    .iter()
-                    .fold((Slot::default(), 0), |(mut sum, longest), each| {
-                        let (slot, seconds) = each.writer.recent(now, seconds);
-                        sum.add(&slot);
-                        (sum, seconds.max(longest))
-                    })
-            };
-            let evidence = Evidence {
-                now,
-                publishers: topic.writers.len(),
-                subscriptions: topic.readers.len(),
-                last_message: last_message.max(retired),
-                since: topic.published,
-                recent: &recent,
-            };
-            let mut judgements = topic.judgements.clone();
-            for (index, judgement) in &mut judgements {
-                let Some(watch) = self.watchlist.watches().get(*index) else {
-                    continue;
-                };
-                let changed = judgement.judge(&watch.expectations, &evidence);
-                let Some(from) = changed else { continue };
-                let to = judgement.state();
-                let (domain_id, name) = (topic.domain_id, &topic.naming.name);
-                let kind = EventKind::Expectation {
-                    domain_id,
-                    topic: bounded_shared(name),
-                    watch: bounded(&watch.pattern).into(),
-                    from,
-                    to,
-                    violations: judgement.violations(),
-                };
-                self.journal.events.push(now, kind);
-                if to == WatchState::Silent {
-                    let kind = EventKind::Silence {
-                        domain_id,
-                        topic: bounded_shared(name),
-                        watch: bounded(&watch.pattern).into(),
-                        last_message: evidence.last_message,
-                    };
-                    self.journal.events.push(now, kind);
-                }
-            }
-            if let Some(topic) = self.topics.get_mut(id) {
-                topic.judgements = judgements;
-            }
-        }
-    }
-}
-
-/// Whether somebody wants its samples whole.
-fn wants_bytes(topic: &Topic) -> bool {
-    let requested = topic.requested.as_ref();
-    requested.is_some_and(|requested| !requested.payloads.is_empty())
 }
 
 pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {
     DdsTopic::parse(&endpoint.topic)
         .ok()
         .map(|topic| Naming::of(&topic))
-}
-
-fn traits(endpoint: &Endpoint) -> Traits {
-    Traits {
-        reliable: endpoint.qos.reliability == Reliability::RELIABLE,
-        keeps_history: endpoint.qos.durability != Durability::VOLATILE,
-        has_header: begins_with_header(&endpoint.message_type),
-    }
 }

@@ -1,18 +1,17 @@
-//! Samples for those who want them one by one: each once for its writer and sequence number, as soon
-//! as the profiler counts it, those of a reliable writer in the order of their numbers
+//! Samples for those who want them one by one: each once for its writer and sequence number, as
+//! soon as the profiler counts it, those of a reliable writer in the order of their numbers
 //! ([`super::in_order`]).
 //!
 //! What waits to be taken is bounded; what finds no room is counted and told. It measures nothing:
 //! whether somebody wants samples changes no number.
 
+mod sample;
+
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use bytes::Bytes;
-use ros2probe_wire::discovery::TypeHash;
-use ros2probe_wire::qos::Qos;
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{DomainId, Guid, Timestamp, record};
+use ros2probe_wire::{Guid, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
@@ -20,6 +19,13 @@ use super::journal::Missing;
 use super::size::{Size, largest};
 use super::topic::RequestIds;
 use super::writer::Counted;
+pub use sample::Dispatch;
+pub use sample::Missed;
+pub use sample::MissedReason;
+pub use sample::Offered;
+pub use sample::Sample;
+pub use sample::SampleOutcome;
+pub use sample::Topic;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
@@ -29,110 +35,11 @@ pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// not told of.
 pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
 
-/// The topic of a sample.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Topic {
-    /// Domain.
-    pub domain_id: DomainId,
-    /// ROS name, or the DDS name where it follows no ROS convention.
-    pub name: Arc<str>,
-    /// DDS name.
-    pub dds_name: Arc<str>,
-    /// ROS name of the type, as in `sensor_msgs/msg/PointCloud2`.
-    pub message_type: Arc<str>,
-    /// What the writer announced.
-    pub offered: Option<Arc<Offered>>,
-}
-
-/// What a writer announced with its topic.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Offered {
-    /// RIHS01 hash of its type; not before Iron.
-    pub type_hash: Option<TypeHash>,
-    /// Quality of service.
-    pub qos: Qos,
-}
-
-/// One message. Immutable, shared by all who want it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Sample {
-    /// Its topic.
-    pub topic: Arc<Topic>,
-    /// Of the datagram that completed it, or, where it waited for a lower number, of the moment in
-    /// which that came or was given up. Never goes back for one writer.
-    pub time: Timestamp,
-    /// Who wrote it.
-    pub writer: Guid,
-    /// Its number among those of this writer.
-    pub sequence_number: u64,
-    /// INFO_TS: when it was written, by the writer's clock.
-    pub source_timestamp: Option<Timestamp>,
-    /// Seconds and nanoseconds of its header, where the type begins with one.
-    pub header_stamp: Option<(i32, u32)>,
-    /// Bytes of the serialized payload, encapsulation and padding included.
-    pub size: u32,
-    /// Seen in shared memory, where not every message is seen: the numbers before it that were not
-    /// given may have been sent all the same.
-    pub sampled: bool,
-    /// Those bytes, encapsulation included; `None` where only arrivals were asked for.
-    pub payload: Option<Bytes>,
-}
-
-/// Samples that were sent and are not given.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Missed {
-    /// Their topic.
-    pub topic: Arc<Topic>,
-    /// Who wrote them.
-    pub writer: Guid,
-    /// Number of the first.
-    pub first: u64,
-    /// Number of the last.
-    pub last: u64,
-    /// How many those are.
-    pub samples: u64,
-    /// Why.
-    pub reason: MissedReason,
-}
-
-/// Why a sample is not given.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum MissedReason {
-    /// Some of its fragments were never seen.
-    Incomplete,
-    /// Nothing of it was seen, and it is lost.
-    Lost,
-    /// It came before its writer was announced, and not again.
-    Unannounced,
-    /// It was counted, but its bytes were lost on the way to the agent or found no room.
-    NotCaptured,
-    /// Its reader was too slow.
-    QueueFull,
-}
-
-/// What is to be given, and to which subscriptions.
-#[derive(Clone, Debug)]
-pub struct Dispatch {
-    /// Ids of the wishes.
-    pub to: Arc<[u64]>,
-    /// What.
-    pub outcome: SampleOutcome,
-}
-
-/// A sample, or that there is none.
-#[derive(Clone, Debug)]
-pub enum SampleOutcome {
-    /// It was counted.
-    Sample(Arc<Sample>),
-    /// It will not come.
-    Missed(Missed),
-}
-
 /// What somebody wants of one writer.
 #[derive(Debug)]
 struct WantedWriter {
     topic: Arc<Topic>,
-    /// Ids of the wishes, and of those for bytes, and of the others.
+    /// Ids of the requests, and of those for bytes, and of the others.
     to: Arc<[u64]>,
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
@@ -149,7 +56,7 @@ struct WantedWriter {
 #[derive(Debug, Default)]
 struct UnannouncedSamples {
     numbers: BTreeSet<u64>,
-    /// Ids of the wishes, and the first number that was counted while each was there.
+    /// Ids of the requests, and the first number that was counted while each was there.
     begins: Vec<(u64, u64)>,
     /// Lower ones that are not remembered: the first, the last, and how many.
     before: Option<(u64, u64, u64)>,
@@ -163,7 +70,7 @@ pub struct Payloads {
     /// How many of them are wanted with bytes.
     deep: usize,
     assembly: Assembly,
-    /// Of writers that nobody announced yet, what was counted while samples were wished for.
+    /// Of writers that nobody announced yet, what was counted while samples were requested.
     unknown_writers: HashMap<Guid, UnannouncedSamples>,
     dispatches: Vec<Dispatch>,
     dispatch_bytes: usize,
@@ -172,32 +79,9 @@ pub struct Payloads {
     refused: u64,
 }
 
-impl MissedReason {
-    /// All of them.
-    pub const ALL: [Self; 5] = [
-        Self::Incomplete,
-        Self::Lost,
-        Self::Unannounced,
-        Self::NotCaptured,
-        Self::QueueFull,
-    ];
-
-    /// Label value.
-    #[must_use]
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Incomplete => "incomplete",
-            Self::Lost => "lost",
-            Self::Unannounced => "unannounced",
-            Self::NotCaptured => "not_captured",
-            Self::QueueFull => "queue_full",
-        }
-    }
-}
-
 impl Payloads {
-    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest `payload_delay`
-    /// nanoseconds after they are wanted.
+    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest
+    /// `payload_delay` nanoseconds after they are wanted.
     #[must_use]
     pub fn new(limit: usize, payload_delay: u64) -> Self {
         Self {
@@ -213,8 +97,8 @@ impl Payloads {
         }
     }
 
-    /// Entries, or bytes, and cap of every table: so many writers may be wished for, so many be
-    /// strangers, and there are so many wishes.
+    /// Entries, or bytes, and cap of every table: so many writers may be requested, so many be
+    /// unknown writers, and there are so many sample requests.
     #[must_use]
     pub fn sizes(
         &self,
@@ -455,7 +339,7 @@ impl Payloads {
         interested.is_some_and(|interested| interested.order.lacks(number))
     }
 
-    /// A sample of a writer that nobody announced yet was counted, while there were these wishes.
+    /// A sample of a writer that nobody announced yet was counted, while there were these requests.
     pub fn counted_of_unknown_writer(
         &mut self,
         writer: Guid,
@@ -479,7 +363,7 @@ impl Payloads {
         }
     }
 
-    /// Strangers remembered.
+    /// Unknown writers remembered.
     #[must_use]
     pub fn unknown_writers(&self) -> usize {
         self.unknown_writers.len()
@@ -576,7 +460,7 @@ impl Payloads {
         self.dispatches.len() >= WAITING / 2 || self.dispatch_bytes > limit / 4
     }
 
-    /// What was counted of this writer while it was a stranger is to be given if it comes again.
+    /// What was counted of this writer before it was announced is to be given if it comes again.
     fn announced(&mut self, writer: Guid, now: Timestamp) {
         let Some(earlier) = self.unknown_writers.remove(&writer) else {
             return;

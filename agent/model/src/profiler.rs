@@ -1,11 +1,12 @@
-//! The writers that are measured: those of watched topics, and strangers that send without a known
+//! The measured writers: those of watched topics, and unknown writers, which send without a known
 //! announcement.
 //!
-//! Strangers are few: beyond the cap a new one is refused until one has been silent for a while.
-//! What was there before a flood of invented GUIDs keeps its place.
+//! Unknown writers are few: beyond the cap a new one is refused until one has been silent for a
+//! while. What was there before a flood of invented GUIDs keeps its place.
+
+mod unknown_writers;
 
 use std::collections::{BTreeSet, HashMap};
-use std::ops::RangeInclusive;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
@@ -23,18 +24,20 @@ use super::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContex
 use super::topic::TopicId;
 use super::wall_clock::WallClock;
 use super::writer::{Counted, MeasurementContext, Traits, Writer};
+pub use unknown_writers::UnknownWriters;
 
-/// A stranger is shown and metered after this long: announcements come within a second or so.
+/// An unknown writer is shown and metered after this long: announcements come within a second or
+/// so.
 const UNKNOWN_AFTER: u64 = 3 * SECOND;
-/// A stranger that is silent this long is forgotten; one that sent little makes room sooner.
+/// An unknown writer that is silent this long is forgotten; one that sent little makes room sooner.
 const FORGET: u64 = 30 * SECOND;
 const EVICTABLE_AFTER: u64 = 3 * SECOND;
-/// Messages after which a stranger is somebody.
+/// Messages after which an unknown writer is not evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
 /// How long the kernel may take to be told of a writer: a round of the capture thread on a busy
-/// machine. Until then it hands over as much as of a stranger, which a point cloud exceeds.
+/// machine. Until then it hands over as much as of an unknown writer, which a point cloud exceeds.
 const KERNEL_UPDATE_TIME: u64 = SECOND / 5;
-/// Strangers may use this part of the memory for fragmented samples.
+/// Unknown writers may use this part of the memory for fragmented samples.
 const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that make room for new ones: silent for so long, so many at once.
 const SILENT: u64 = 10 * SECOND;
@@ -49,15 +52,15 @@ pub struct Measured {
     pub writer: Box<Writer>,
     /// Who gets its samples; only of a writer of a topic.
     pub subscribers: Option<Box<Subscribers>>,
-    /// Its topic; `None` for a stranger.
+    /// Its topic; `None` for an unknown writer.
     pub topic: Option<TopicId>,
     /// First record or announcement.
     pub first_seen: Timestamp,
     /// Last record.
     pub last_seen: Timestamp,
-    /// A stranger that has been one for long enough.
+    /// An unknown writer that has been one for long enough.
     pub metered: bool,
-    /// Of a stranger, the cookie of the socket it sends by; 0 = unknown.
+    /// Of an unknown writer, the cookie of the socket it sends by; 0 = unknown.
     pub sent_from: u64,
     opened: Timestamp,
     /// A hole was waited for, and no ACKNACK came.
@@ -116,15 +119,6 @@ pub enum RecordOutcome {
     Counted(Counted),
 }
 
-/// What became of the strangers.
-#[derive(Debug, Default)]
-pub struct UnknownWriters {
-    /// To be metered from now on.
-    pub metered: Vec<Guid>,
-    /// Forgotten.
-    pub forgotten: Vec<Guid>,
-}
-
 impl Measured {
     fn sizes(&self) -> impl Iterator<Item = Size> {
         // A new list does not compile before it has a place here.
@@ -146,7 +140,7 @@ impl Measured {
 }
 
 impl Profiler {
-    /// Nobody measured.
+    /// Nothing measured.
     #[must_use]
     pub fn new(unknown_writer_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
@@ -244,7 +238,7 @@ impl Profiler {
         }
     }
 
-    /// Writers of topics, strangers, the strangers' cap, and strangers refused or forgotten for it.
+    /// Writers of topics, unknown writers, their cap, and those refused or forgotten for it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
         let known = self.writers.len() - self.unknown_writers.len();
@@ -256,7 +250,7 @@ impl Profiler {
         )
     }
 
-    /// Memory for fragmented samples: of writers of topics, of strangers, and of deliveries.
+    /// Memory for fragmented samples: of writers of topics, of unknown writers, and of deliveries.
     #[must_use]
     pub const fn budgets(&self) -> [&Budget; 3] {
         [
@@ -286,7 +280,8 @@ impl Profiler {
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
-            // The kernel filter's budget for strangers may leave samples out: no gap is a loss.
+            // The kernel filter's budget for unknown writers may leave samples out: no gap is a
+            // loss.
             measured.opened = now;
         }
         const LEFT: u16 = flag::HOST | flag::OUTGOING;
@@ -349,39 +344,8 @@ impl Profiler {
         }
     }
 
-    /// Whether one of these writers sends without being announced.
-    #[must_use]
-    pub fn has_unknown_writer(&self, writers: RangeInclusive<Guid>) -> bool {
-        self.unknown_writers.range(writers).next().is_some()
-    }
-
-    /// Takes in a record of a writer nobody announced.
-    pub fn unknown_writer(
-        &mut self,
-        guid: Guid,
-        record: &Record,
-        journal: &mut Journal,
-        graph: GraphView<'_>,
-    ) -> RecordOutcome {
-        if !record.is_sample() || record.flags & UNDELIVERED != 0 {
-            return RecordOutcome::Unmeasured;
-        }
-        let now = Timestamp(record.time);
-        if self.unknown_writers.len() >= self.unknown_writer_limit
-            && !self.evict_unknown_writer(now, graph)
-        {
-            self.unknown_writer_evictions += 1;
-            return RecordOutcome::Unmeasured;
-        }
-        self.unknown_writers.insert(guid);
-        self.writers.insert(
-            guid,
-            Measured::new(Writer::new(guid, Traits::default()), None, now),
-        );
-        self.record(guid, record, journal, graph)
-    }
-
-    /// Measures this writer of a topic from now on; what it was measured as a stranger comes along.
+    /// Measures this writer of a topic from now on; what was measured before its announcement comes
+    /// along.
     pub fn measure(
         &mut self,
         guid: Guid,
@@ -518,7 +482,7 @@ impl Profiler {
                 subscribers
                     .settle(&mut self.shared.writer_context(writer_ref, now, journal, graph));
             }
-            // Who sent twice and was not announced until the end is a stranger.
+            // Who sent twice and was not announced until the end is an unknown writer.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
         }
     }
@@ -543,26 +507,6 @@ impl Profiler {
                 subscribers.give_up(at, 1, &mut context);
             }
         }
-    }
-
-    /// Forgets the stranger that has been silent longest, if it never was anybody.
-    fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
-        if now < self.search_after {
-            return false;
-        }
-        let evictable = self.writers.iter().filter(|(_, measured)| {
-            measured.topic.is_none()
-                && measured.writer.messages() < ESTABLISHED_MESSAGES
-                && measured.last_seen.0.saturating_add(EVICTABLE_AFTER) <= now.0
-        });
-        let oldest = evictable.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
-        let Some(guid) = oldest.map(|(guid, _)| *guid) else {
-            self.search_after = Timestamp(now.0.saturating_add(SECOND / 10));
-            return false;
-        };
-        self.unknown_writer_evictions += 1;
-        self.stop(guid, now, &mut Journal::default(), graph);
-        true
     }
 }
 

@@ -389,8 +389,8 @@ pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> 
         })
 }
 
-/// The only participant that announces to live in this process, by its own number. Fast DDS says no more than the low
-/// 16 bits.
+/// The only participant that announces to live in this process, by its own number. Fast DDS says no
+/// more than the low 16 bits.
 fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     let mut announced = discovery.participants().iter().filter(|(_, participant)| {
         participant

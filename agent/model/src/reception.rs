@@ -122,8 +122,8 @@ impl Reception {
         self.samples.transfer(from, to);
     }
 
-    /// Samples in fragments that begin before this are no loss when they stay incomplete: the kernel
-    /// did not know the writer yet, and what it hands over of strangers is limited.
+    /// Samples in fragments that begin before this are no loss when they stay incomplete: the
+    /// kernel did not know the writer yet, and what it hands over of unknown writers is limited.
     pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.samples.allow_incomplete(until);
     }

@@ -1,4 +1,4 @@
-//! By which way a record came: leaving this host or arriving, at which socket, for which address.
+//! By which route a record came: leaving this host or arriving, at which socket, for which address.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
@@ -58,7 +58,7 @@ impl From<SocketAddr> for Destination {
     }
 }
 
-/// One way of a writer's samples.
+/// One route of a writer's samples.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Route {
     /// Leaving or arriving.

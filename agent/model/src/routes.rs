@@ -1,7 +1,7 @@
-//! The ways of one writer's samples, and to whom each leads.
+//! The routes of one writer's samples, and to whom each leads.
 //!
-//! What was found out of a way is kept until something changes that it depends on. Bounded: the way
-//! that has been silent longest makes room.
+//! What was found out of a route is kept until something changes that it depends on. Bounded: the
+//! route that has been silent longest makes room.
 
 use std::collections::VecDeque;
 
@@ -14,22 +14,22 @@ use super::size::Size;
 use super::snapshot::Direction;
 use super::topic::Topic;
 
-/// Ways of one writer.
+/// Routes of one writer.
 const LIMIT: usize = 512;
 /// Moments at which it is known what had left, one a second.
 const MOMENTS: usize = 24;
 
-/// All ways of one writer, sorted.
+/// All routes of one writer, sorted.
 #[derive(Debug, Default)]
 pub struct Routes {
     routes: Vec<KnownRoute>,
     /// The one that was used last.
     last: usize,
-    /// Ways given up because of the cap.
+    /// Routes given up because of the cap.
     evictions: u64,
 }
 
-/// One way.
+/// One route.
 #[derive(Debug)]
 pub struct KnownRoute {
     /// Which.
@@ -44,11 +44,11 @@ pub struct KnownRoute {
     pub delivery: Option<usize>,
     /// Last record.
     pub last_seen: Timestamp,
-    /// New samples that came this way.
+    /// New samples that came by this route.
     pub brought: u64,
     /// It is seen at a socket, not on a wire.
     pub at_socket: bool,
-    /// Samples have come this way.
+    /// Samples have come by this route.
     pub has_data: bool,
     /// What had left by when.
     left: VecDeque<(Timestamp, u64)>,
@@ -107,13 +107,13 @@ impl Routes {
         self.routes.get_mut(index)
     }
 
-    /// Ways given up because of the cap.
+    /// Routes given up because of the cap.
     #[must_use]
     pub const fn evictions(&self) -> u64 {
         self.evictions
     }
 
-    /// Where this way stands.
+    /// Where this route stands.
     #[must_use]
     pub fn find(&self, route: &Route) -> Option<usize> {
         if self
@@ -128,7 +128,7 @@ impl Routes {
             .ok()
     }
 
-    /// Where this way stands, known from now on.
+    /// Where this route stands, known from now on.
     pub fn find_or_insert(
         &mut self,
         route: Route,
@@ -174,7 +174,7 @@ impl Routes {
         routes.any(|known| known.at_socket && known.route.destination == destination)
     }
 
-    /// Forgets ways.
+    /// Forgets routes.
     pub fn retain(&mut self, keep: impl FnMut(&KnownRoute) -> bool) {
         self.routes.retain(keep);
     }

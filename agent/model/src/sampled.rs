@@ -1,10 +1,10 @@
 //! What a sampled view tells of one writer: how many samples there were, and how many of them were
 //! seen.
 //!
-//! Shared memory is looked at now and then; what was overwritten meanwhile is not seen. The sequence
-//! numbers still tell how many samples there were, so messages are counted by their span, and no
-//! number that was not seen is a loss. While a writer is seen this way, what comes of it by the
-//! network counts here too: it adds to what was seen.
+//! Shared memory is looked at now and then; what was overwritten meanwhile is not seen. The
+//! sequence numbers still tell how many samples there were, so messages are counted by their span,
+//! and no number that was not seen is a loss. While a writer is seen this way, what comes of it by
+//! the network counts here too: it adds to what was seen.
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
@@ -229,7 +229,8 @@ impl Sampled {
         }
     }
 
-    /// Whether nothing more is waited for of this sample, where `next` is the number after the newest.
+    /// Whether nothing more is waited for of this sample, where `next` is the number after the
+    /// newest.
     #[must_use]
     pub fn has(&self, number: u64, next: u64) -> bool {
         number < next
@@ -302,7 +303,8 @@ impl Sampled {
         update
     }
 
-    /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known of.
+    /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known
+    /// of.
     pub fn exist(&mut self, last: u64, reach: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let end = last.saturating_add(1);
         if !sequence.started() {
@@ -379,8 +381,8 @@ impl Sampled {
         }
     }
 
-    /// Marks the samples of a run that is believed as seen. Returns how many of `samples` new numbers
-    /// were not counted while it was doubted.
+    /// Marks the samples of a run that is believed as seen. Returns how many of `samples` new
+    /// numbers were not counted while it was unconfirmed.
     fn confirm(&mut self, run: &Run, samples: u64) -> u64 {
         for &(number, is_whole) in &run.numbers {
             let bit = self.bit(number, self.next).unwrap_or(0);
@@ -474,267 +476,4 @@ impl Sampled {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::sequence::{FAR, REACH, Settled};
-    use super::*;
-    use ros2probe_wire::time::SECOND;
-
-    struct View {
-        sampled: Sampled,
-        sequence: Sequence,
-        now: u64,
-    }
-
-    impl View {
-        fn new() -> Self {
-            Self {
-                sampled: Sampled::new(Timestamp(SECOND)),
-                sequence: Sequence::default(),
-                now: SECOND,
-            }
-        }
-
-        fn see(&mut self, number: u64) -> SampledUpdate {
-            self.part(number, Seen::Whole)
-        }
-
-        fn part(&mut self, number: u64, seen: Seen) -> SampledUpdate {
-            self.now += SECOND / 100;
-            let now = Timestamp(self.now);
-            self.sampled
-                .sample((number, seen, Some(now)), FAR, now, &mut self.sequence)
-        }
-
-        fn counts(&self) -> (u64, u64) {
-            let SampledFacts { seen, span, .. } = self.sampled.facts();
-            (seen, span)
-        }
-
-        fn losses(&mut self) -> Vec<Settled> {
-            let mut losses = Vec::new();
-            self.sequence
-                .settle_all(&mut |settled| losses.push(settled));
-            losses
-        }
-    }
-
-    #[test]
-    fn what_was_not_seen_was_sent_and_is_no_loss() {
-        let mut view = View::new();
-        for number in [1, 2, 5, 6, 100] {
-            view.see(number);
-        }
-        assert_eq!(view.counts(), (5, 100));
-        assert_eq!(view.losses(), []);
-    }
-
-    #[test]
-    fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
-        let mut view = View::new();
-        let parts = [Seen::Part, Seen::Part, Seen::Whole, Seen::Whole];
-        let update = parts.map(|seen| view.part(1, seen));
-        assert_eq!(update.map(|update| update.samples), [1, 0, 0, 0]);
-        assert_eq!(
-            update.map(|update| update.arrived),
-            [false, false, true, false]
-        );
-        assert_eq!(
-            update.map(|update| update.finished),
-            [false, false, true, false]
-        );
-        view.see(3);
-        // Late, but seen after all.
-        let late = SampledUpdate {
-            finished: true,
-            ..SampledUpdate::default()
-        };
-        assert_eq!(view.see(2), late);
-        assert_eq!(view.see(2), SampledUpdate::default());
-        assert_eq!(view.counts(), (3, 3));
-    }
-
-    #[test]
-    fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
-        let mut view = View::new();
-        view.see(1);
-        let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
-        view.part(2, Seen::Part);
-        assert_eq!(
-            [1, 2, 3].map(|number| has(&view, number)),
-            [true, false, false]
-        );
-        // The next one begins before it is whole.
-        view.part(3, Seen::Part);
-        view.part(2, Seen::Whole);
-        assert_eq!([2, 3].map(|number| has(&view, number)), [true, false]);
-        view.part(3, Seen::Tail);
-        view.see(500);
-        // Too long ago to be waited for; what a GAP passes over is not waited for either.
-        assert!(has(&view, 300) && !has(&view, 499));
-        let now = Timestamp(view.now);
-        view.sampled.skip((501, 503), FAR, now, &mut view.sequence);
-        assert!(has(&view, 502) && !has(&view, 499));
-    }
-
-    #[test]
-    fn an_interval_is_that_between_neighbours_that_both_were_seen() {
-        let mut view = View::new();
-        assert_eq!(view.see(1).interval, None);
-        assert_eq!(view.see(2).interval, Some(10_000_000));
-        assert_eq!(view.see(4).interval, None);
-        assert_eq!(view.see(5).interval, Some(10_000_000));
-    }
-
-    #[test]
-    fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
-        let mut view = View::new();
-        let now = Timestamp(view.now);
-        assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 0);
-        view.see(5);
-        assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 2);
-        assert_eq!(view.sampled.exist(6, FAR, now, &mut view.sequence), 0);
-        assert_eq!(view.counts(), (1, 3));
-        // 8 was sent, 9 to 11 were not.
-        assert_eq!(view.sampled.skip((9, 12), FAR, now, &mut view.sequence), 1);
-        assert_eq!(view.counts(), (1, 4));
-        let update = view.see(12);
-        // With 6 and 7 and 8, whose size is not known either.
-        assert_eq!((update.samples, update.alike), (1, 4));
-        view.see(7);
-        assert_eq!(view.counts(), (3, 5));
-        let forged = view.sampled.exist(1 << 40, FAR, now, &mut view.sequence);
-        assert_eq!((forged, view.counts()), (0, (3, 5)));
-        assert_eq!(view.losses(), []);
-    }
-
-    #[test]
-    fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
-        let mut view = View::new();
-        view.see(1);
-        view.see(1000);
-        view.now += 60 * SECOND;
-        assert_eq!(view.see(1).samples, 1);
-        assert_eq!(view.see(2).samples, 1);
-        assert_eq!(view.counts(), (4, 1002));
-    }
-
-    #[test]
-    fn a_sample_that_was_told_of_and_seen_late_is_no_new_beginning() {
-        let mut view = View::new();
-        view.see(1);
-        let now = Timestamp(view.now);
-        assert_eq!(view.sampled.exist(5, FAR, now, &mut view.sequence), 4);
-        view.now += SECOND;
-        for seen in [Seen::Part, Seen::Part, Seen::Whole] {
-            assert_eq!(view.part(4, seen).samples, 0);
-        }
-        assert_eq!(view.counts(), (2, 5));
-    }
-
-    #[test]
-    fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
-        let mut view = View::new();
-        let settle = |view: &mut View| {
-            view.now += PATIENCE;
-            view.sampled.tick(Timestamp(view.now));
-            view.sampled.take_unseen()
-        };
-        view.see(1);
-        assert_eq!(settle(&mut view), []);
-        view.see(5);
-        assert!(view.sampled.unseen_since().is_some());
-        // It may still come until the next look.
-        assert_eq!(settle(&mut view), []);
-        assert!(view.see(3).finished);
-        assert_eq!(settle(&mut view), [(2, 2), (4, 4)]);
-        assert_eq!(view.sampled.unseen_since(), None);
-        assert!(!view.see(4).finished, "given after it was left out");
-        // A part is nothing, and neither is what a HEARTBEAT says was sent.
-        view.part(6, Seen::Part);
-        let now = Timestamp(view.now);
-        view.sampled.exist(8, FAR, now, &mut view.sequence);
-        // What a GAP says was never sent is not missing.
-        view.sampled.skip((9, 200), FAR, now, &mut view.sequence);
-        assert_eq!(settle(&mut view), [(6, 8)]);
-        assert_eq!(settle(&mut view), []);
-        assert_eq!(
-            (view.see(200).finished, view.see(1000).finished),
-            (true, true)
-        );
-        view.sampled.settle_all();
-        assert_eq!(view.sampled.take_unseen(), [(201, 999)]);
-    }
-
-    #[test]
-    fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
-        let mut view = View::new();
-        view.see(1);
-        view.see(3);
-        view.sampled.end();
-        // It may still come, and is left out when the view begins again.
-        assert_eq!(view.sampled.take_unseen(), []);
-        assert!(view.sampled.awaits(2) && !view.sampled.awaits(3));
-        let now = Timestamp(view.now);
-        for number in 4..500 {
-            view.sequence.exists(number, now, &mut |_| {});
-        }
-        view.see(500);
-        view.see(502);
-        view.sampled.settle_all();
-        assert_eq!(view.sampled.take_unseen(), [(2, 2), (501, 501)]);
-    }
-
-    #[test]
-    fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
-        let mut view = View::new();
-        for number in 1..=6 {
-            view.see(number);
-        }
-        // Each counts alone until the jump is believed; then all that it passed over count, too.
-        let samples: Vec<_> = (1..=6).map(|n| view.see(1_000_000 + n).samples).collect();
-        assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
-        assert_eq!(view.losses(), []);
-        view.see(u64::MAX);
-        view.see(0);
-        assert_eq!(view.counts(), (12, 1_000_006));
-        assert!((1..=6).all(|n| view.sampled.has(1_000_000 + n, view.sequence.next())));
-    }
-
-    #[test]
-    fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
-        let mut view = View::new();
-        for number in 1..=5 {
-            view.see(number);
-        }
-        view.part(6, Seen::Part);
-        let forged = view.part(1 << 40, Seen::Part);
-        assert_eq!((forged.samples, forged.finished), (1, false));
-        assert!(view.part(1 << 40, Seen::Whole).finished);
-        assert!(!view.part(1 << 40, Seen::Whole).finished);
-        assert!(view.part(6, Seen::Whole).finished);
-        assert_eq!(view.see(7).samples, 1);
-        let now = Timestamp(view.now);
-        let messages = view.sampled.exist(3000, REACH, now, &mut view.sequence);
-        let passed = view
-            .sampled
-            .skip((2000, 3000), REACH, now, &mut view.sequence);
-        assert_eq!((messages, passed, view.counts()), (0, 0, (8, 8)));
-    }
-
-    #[test]
-    fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
-        let mut sampled = Sampled::new(Timestamp(SECOND));
-        assert!(sampled.is_current(Timestamp(10 * SECOND)));
-        assert!(!sampled.is_current(Timestamp(11 * SECOND)));
-        sampled.touch(Timestamp(5 * SECOND));
-        assert!(sampled.is_current(Timestamp(11 * SECOND)));
-    }
-
-    #[test]
-    fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
-        let mut sampled = Sampled::new(Timestamp(SECOND));
-        assert_eq!(sampled.stamp(1, Some((5, 6))), Some((5, 6)));
-        assert_eq!(sampled.stamp(1, None), Some((5, 6)));
-        assert_eq!(sampled.stamp(2, None), None);
-    }
-}
+mod tests;

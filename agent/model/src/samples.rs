@@ -208,8 +208,8 @@ impl Samples {
         number <= self.last_uncertain && self.is_partial(number)
     }
 
-    /// The oldest sample from `first` on that still gets fragments: it and what follows is not decided
-    /// yet.
+    /// The oldest sample from `first` on that still gets fragments: it and what follows is not
+    /// decided yet.
     #[must_use]
     pub fn growing(&self, now: Timestamp, window: u64, first: u64) -> Option<u64> {
         let growing = self

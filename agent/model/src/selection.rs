@@ -13,7 +13,8 @@ use super::topic::Naming;
 use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
-/// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
+/// Largest compiled form of one regular expression, in bytes, and as much again while it is
+/// matched.
 const REGEX_BYTES: usize = 256 << 10;
 
 /// How much of each sample.
@@ -126,8 +127,8 @@ impl Choice {
     }
 }
 
-/// Compiles a regular expression over topic names, whose characters are ASCII: the classes `\w`, `\d`
-/// and `\s` are.
+/// Compiles a regular expression over topic names, whose characters are ASCII: the classes `\w`,
+/// `\d` and `\s` are.
 ///
 /// # Errors
 /// It is none, or too large.

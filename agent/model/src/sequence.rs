@@ -7,6 +7,9 @@
 //! with the number of undecided sequence numbers, up to [`MAX_WINDOW`]. It knows no payloads and no
 //! time but the one it is given.
 
+mod bitmap;
+mod runs;
+mod submessages;
 mod unconfirmed;
 
 use std::collections::VecDeque;
@@ -15,6 +18,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::MILLISECOND;
 
 use super::size::Size;
+use bitmap::Bitmap;
 pub use unconfirmed::Run;
 use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
 
@@ -26,7 +30,8 @@ pub const MAX_WINDOW: u64 = 32_768;
 const MAX_JUMP: u64 = 1 << 20;
 /// HEARTBEAT and GAP may run ahead of the data by at most this, also when two agree.
 pub const FAR: u64 = 4096;
-/// A number that is further ahead is doubted, and so is what a single HEARTBEAT or GAP says of it.
+/// A number that is further ahead is unconfirmed, and so is what a single HEARTBEAT or GAP says of
+/// it.
 pub const REACH: u64 = 64;
 /// A gap that fills this soon, unasked, was reordering. Retransmissions that no ACKNACK was seen
 /// for take longer: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before they answer a
@@ -80,7 +85,7 @@ pub struct Sequence {
     /// Samples that continued this incarnation, up to a handful.
     followed: u8,
     unconfirmed: Option<Box<UnconfirmedRun>>,
-    /// Runs, HEARTBEATs, GAPs and ACKNACKs that were doubted.
+    /// Runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     jumps: u64,
 }
 
@@ -246,94 +251,7 @@ impl Sequence {
         }
     }
 
-    /// Looks at number and source time of a sample before anything else does: a writer that jumps,
-    /// or begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not
-    /// doubted.
-    pub fn recognise(
-        &mut self,
-        number: u64,
-        source: Option<Timestamp>,
-        reach: u64,
-        now: Timestamp,
-    ) -> RunMembership {
-        if !is_number(number) {
-            return RunMembership::Live;
-        }
-        if self.is_unconfirmed(number, source, reach) {
-            let unconfirmed = self.unconfirmed.get_or_insert_default();
-            let (opens, new) = unconfirmed.note(number, now);
-            self.jumps += u64::from(opens);
-            if !unconfirmed.is_confirmed() {
-                return RunMembership::Unconfirmed { new };
-            }
-            let mut run = self.confirm();
-            run.numbers.retain(|(known, _)| *known != number);
-            if let Some(source) = source {
-                self.sourced(number, source);
-            }
-            return RunMembership::Confirmed(run);
-        }
-        if self.stale >= STALE && number < self.floor() {
-            self.restart(number);
-        }
-        if number >= self.next && self.started() {
-            self.followed = self.followed.saturating_add(1);
-            self.contradict();
-        }
-        if let Some(source) = source {
-            self.sourced(number, source);
-        }
-        RunMembership::Live
-    }
-
-    /// Whether a sample of this number and source time does not belong to the live run.
-    #[must_use]
-    pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
-        if !self.started() || !is_number(number) {
-            return false;
-        }
-        if number >= self.next {
-            return number - self.next > reach;
-        }
-        let newer = source.is_some_and(|source| {
-            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
-        });
-        // A writer that begins anew fills no gaps of the run before.
-        let unconfirmed = self.unconfirmed.as_ref();
-        let continues =
-            || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
-        // What came first may have been forged just as well; what lies less far below it is
-        // history.
-        let is_young = self.followed < CONFIRMATIONS;
-        newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
-    }
-
-    /// Marks a doubted sample as whole. Returns whether that is new.
-    pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
-        let unconfirmed = self.unconfirmed.as_mut();
-        unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
-    }
-
-    /// Whether a doubted sample came whole.
-    #[must_use]
-    pub fn has_unconfirmed(&self, number: u64) -> bool {
-        let unconfirmed = self.unconfirmed.as_ref();
-        unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
-    }
-
-    /// Takes in the samples of a run that is believed.
-    pub fn accept(&mut self, run: &Run, now: Timestamp, settled: &mut impl FnMut(Settled)) {
-        for &(number, is_whole) in &run.numbers {
-            self.exists(number, now, settled);
-            if is_whole {
-                self.received.set(number);
-            }
-        }
-        let (start, end) = run.gap;
-        self.excuse(start, end);
-    }
-
-    /// How often something was doubted.
+    /// How often something was unconfirmed.
     #[must_use]
     pub const fn jumps(&self) -> u64 {
         self.jumps
@@ -409,76 +327,6 @@ impl Sequence {
         self.first
     }
 
-    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up
-    /// to `last` exist.
-    pub fn heartbeat(
-        &mut self,
-        first: u64,
-        last: u64,
-        now: Timestamp,
-        settled: &mut impl FnMut(Settled),
-    ) {
-        if !self.started() || first == 0 || first > last.saturating_add(1) {
-            return;
-        }
-        let next = last.saturating_add(1);
-        let (is_confirmed, run) = self.claim(next, REACH, now);
-        if let Some(run) = run {
-            self.accept(&run, now, settled);
-        }
-        if !is_confirmed {
-            return;
-        }
-        if next > self.next {
-            self.note_gap(self.next, next, now);
-            self.extend(next - 1, next, now, settled);
-        }
-        let available = first.min(self.next);
-        if available > self.available {
-            self.available = available;
-            self.withdrawn.get_or_insert((now, available));
-        }
-    }
-
-    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the doubted
-    /// run that it confirms.
-    pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
-        let live = self.next;
-        let unconfirmed = self.unconfirmed.as_mut();
-        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
-            return (true, Some(self.confirm()));
-        }
-        let ahead = next.saturating_sub(live);
-        if ahead <= reach {
-            if next >= live {
-                self.contradict();
-            }
-            return (true, None);
-        }
-        let unconfirmed = self.unconfirmed.get_or_insert_default();
-        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
-            return (true, None);
-        }
-        self.jumps += 1;
-        (false, None)
-    }
-
-    /// Whether an ACKNACK acknowledges numbers that are not known to exist.
-    pub const fn refuses(&mut self, base: u64) -> bool {
-        let refuses = self.started() && base.saturating_sub(self.next) > FAR;
-        self.jumps += refuses as u64;
-        refuses
-    }
-
-    /// ACKNACK: the readers have all below `base`, also what was not seen here, except samples that
-    /// the writer had withdrawn before.
-    pub fn acknowledged(&mut self, base: u64) {
-        if self.started() {
-            self.excuse(self.available, base);
-            self.acknowledged = self.acknowledged.max(base);
-        }
-    }
-
     /// All below came, or no reader waits for them: the writer left them out or has them no longer,
     /// readers acknowledged them, or they are settled.
     pub fn complete(&mut self) -> u64 {
@@ -507,63 +355,6 @@ impl Sequence {
     #[must_use]
     pub const fn incarnation(&self) -> u32 {
         self.incarnation
-    }
-
-    /// GAP: `start..base` and some numbers from there on will never come.
-    pub fn gap(
-        &mut self,
-        start: u64,
-        base: u64,
-        set: impl Iterator<Item = u64>,
-        now: Timestamp,
-        settled: &mut impl FnMut(Settled),
-    ) {
-        if !self.started() || start == 0 || base < start {
-            return;
-        }
-        let ahead = base.saturating_sub(self.next);
-        if ahead > REACH {
-            self.jumps += 1;
-            if ahead <= MAX_JUMP {
-                self.unconfirmed
-                    .get_or_insert_default()
-                    .pass_over(start, base);
-            }
-            return;
-        }
-        let mut one = |sequence: &mut Self, start: u64, end: u64| {
-            if end > sequence.next {
-                if end - sequence.next > REACH {
-                    return;
-                }
-                sequence.extend(end - 1, end, now, settled);
-            }
-            sequence.excuse(start.max(sequence.settled), end);
-        };
-        one(self, start, base);
-        for number in set {
-            one(self, number, number.saturating_add(1));
-        }
-    }
-
-    /// ACKNACK: a reader asks for these again.
-    pub fn requested(&mut self, mut set: impl Iterator<Item = u64>) {
-        if self.gaps.is_empty() {
-            return;
-        }
-        let (Some(low), high) = (set.next(), set.last()) else {
-            return;
-        };
-        let high = high.unwrap_or(low);
-        for gap in &mut self.gaps {
-            gap.requested |= gap.start <= high && low < gap.end;
-        }
-    }
-
-    /// Nothing in `start..end` is a loss.
-    pub fn excuse(&mut self, start: u64, end: u64) {
-        let start = start.max(self.floor()).max(self.settled);
-        self.excused.set_all(start, end.min(self.next));
     }
 
     /// Decides what has been open for `window`, and what the writer withdrew `grace` ago, but
@@ -617,32 +408,6 @@ impl Sequence {
     /// Numbers below this are not remembered.
     fn floor(&self) -> u64 {
         self.next.saturating_sub(self.received.len())
-    }
-
-    /// The doubted run is the writer's: the numbers jump there, or begin anew.
-    fn confirm(&mut self) -> Run {
-        let unconfirmed = self.unconfirmed.take();
-        let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
-        let Some((first, _)) = run.numbers.first() else {
-            return run;
-        };
-        let jump = first.checked_sub(self.next);
-        // What was hardly seen before lost nothing that is far from it.
-        let most = match self.followed < CONFIRMATIONS {
-            true => FAR,
-            false => MAX_JUMP,
-        };
-        if jump.is_none_or(|jump| jump > most) {
-            self.restart(*first);
-        }
-        run
-    }
-
-    /// The live run went on.
-    fn contradict(&mut self) {
-        if let Some(unconfirmed) = &mut self.unconfirmed {
-            unconfirmed.contradict();
-        }
     }
 
     fn restart(&mut self, number: u64) {
@@ -732,77 +497,6 @@ impl Sequence {
 /// Whether it can be a sequence number: those are signed (RTPS 2.5, 9.3.2).
 const fn is_number(number: u64) -> bool {
     number > 0 && number <= u64::MAX >> 1
-}
-
-/// A ring of bits, a power of two of them, addressed by sequence number.
-#[derive(Debug, Default)]
-struct Bitmap {
-    words: Vec<u64>,
-}
-
-impl Bitmap {
-    fn with_len(bits: u64) -> Self {
-        Self {
-            words: vec![0; usize::try_from(bits / 64).unwrap_or(0)],
-        }
-    }
-
-    fn len(&self) -> u64 {
-        self.words.len() as u64 * 64
-    }
-
-    fn place(&self, number: u64) -> (usize, u64) {
-        let bit = number & self.len().wrapping_sub(1);
-        (
-            usize::try_from(bit / 64).unwrap_or(usize::MAX),
-            1 << (bit % 64),
-        )
-    }
-
-    fn get(&self, number: u64) -> bool {
-        let (word, mask) = self.place(number);
-        self.words.get(word).is_some_and(|word| word & mask != 0)
-    }
-
-    fn set(&mut self, number: u64) {
-        let (word, mask) = self.place(number);
-        if let Some(word) = self.words.get_mut(word) {
-            *word |= mask;
-        }
-    }
-
-    fn set_all(&mut self, start: u64, end: u64) {
-        self.each_word(start, end, |word, mask| *word |= mask);
-    }
-
-    fn clear(&mut self, start: u64, end: u64) {
-        self.each_word(start, end, |word, mask| *word &= !mask);
-    }
-
-    /// Word by word, for a HEARTBEAT may excuse thousands of numbers, and so may the next one.
-    fn each_word(&mut self, start: u64, end: u64, change: impl Fn(&mut u64, u64)) {
-        let end = end.min(start.saturating_add(self.len()));
-        let mut number = start;
-        while number < end {
-            let (word, _) = self.place(number);
-            let (first, left) = (number % 64, end - number);
-            let bits = left.min(64 - first);
-            if let Some(word) = self.words.get_mut(word) {
-                change(word, (u64::MAX >> (64 - bits)) << first);
-            }
-            number += bits;
-        }
-    }
-
-    fn grow(&mut self, bits: u64, start: u64, end: u64) {
-        let mut wider = Self::with_len(bits);
-        for number in start..end {
-            if self.get(number) {
-                wider.set(number);
-            }
-        }
-        *self = wider;
-    }
 }
 
 #[cfg(test)]

@@ -87,8 +87,8 @@ pub struct ParticipantFacts {
 pub struct ProcessFacts {
     /// Host name when announced.
     pub host: Option<String>,
-    /// Process id: of the socket's holder, else as announced, perhaps in a container's count, or its
-    /// low 16 bits where the GUID holds those.
+    /// Process id: of the socket's holder, else as announced, perhaps in a container's count, or
+    /// its low 16 bits where the GUID holds those.
     pub id: Option<u32>,
     /// Process name: as announced, else that of the socket's holder.
     pub name: Option<String>,
@@ -261,8 +261,8 @@ pub struct Measurement {
     pub duplicates: u64,
     /// Samples whose fragments never became complete (also counted in `lost` once settled).
     pub incomplete: u64,
-    /// Samples excused by GAP, by the ACKNACKs of readers that have them, or because the kernel did not
-    /// know their writer yet.
+    /// Samples excused by GAP, by the ACKNACKs of readers that have them, or because the kernel did
+    /// not know their writer yet.
     pub irrelevant: u64,
     /// Time of the last new sample.
     pub last_message: Option<Timestamp>,
@@ -278,13 +278,14 @@ pub struct Measurement {
     pub header_latency: Histogram,
     /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
     pub negative_latency: u64,
-    /// Samples whose INFO_TS lies more than an hour before or after their capture time (a clock that
-    /// was never set, or a forgery); not in the histograms.
+    /// Samples whose INFO_TS lies more than an hour before or after their capture time (a clock
+    /// that was never set, or a forgery); not in the histograms.
     pub implausible_latency: u64,
     /// How often the writer's numbers left their run, and one record did not suffice to believe it.
     pub sequence_jumps: u64,
     /// Present when some of this was read from shared memory, which is a sampled view: messages are
-    /// then counted by the span of their numbers, and times are those of the samples that were seen.
+    /// then counted by the span of their numbers, and times are those of the samples that were
+    /// seen.
     pub sampled: Option<SampledFacts>,
 }
 

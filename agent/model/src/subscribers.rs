@@ -1,13 +1,14 @@
-//! Who gets one writer's samples, and by which ways.
+//! Who gets one writer's samples, and by which routes.
 //!
 //! **A delivery is a participant's.** A multicast sample and its repair by unicast come to two
-//! sockets of one participant, so losses can only be told where both are put together: all ways that
-//! are known to lead to a participant feed one delivery. A way that leads to nobody known is a
-//! delivery of its own, until more is known.
+//! sockets of one participant, so losses can only be told where both are put together: all routes
+//! that are known to lead to a participant feed one delivery. A route that leads to nobody known is
+//! a delivery of its own, until more is known.
 //!
-//! Of such ways a multicast one may belong to any receiver (on a wire it belongs to all). There the
-//! rule is not to invent losses: what comes by unicast fills its gaps, what it brought is not missing
-//! at a unicast delivery, and what it knows already opens no delivery when it comes again by unicast.
+//! Of such routes a multicast one may belong to any receiver (on a wire it belongs to all). There
+//! the rule is not to invent losses: what comes by unicast fills its gaps, what it brought is not
+//! missing at a unicast delivery, and what it knows already opens no delivery when it comes again
+//! by unicast.
 //!
 //! What is directed (INFO_DST) at a participant is for nobody else at the same socket. Where the
 //! participant is known and reads nothing of the topic, samples are unmatched and nothing is kept.
@@ -44,14 +45,14 @@ const ONE_FRAME: u16 = 1472;
 pub struct Subscribers {
     routes: Routes,
     deliveries: Vec<Delivery>,
-    /// Deliveries of multicast ways that lead to nobody known.
+    /// Deliveries of multicast routes that lead to nobody known.
     open: usize,
     totals: Totals,
     departures: Departures,
     acknowledgements: Acknowledgements,
     /// Its datagrams may need IP reassembly on this host.
     reassembled: bool,
-    /// Some ways are seen at sockets.
+    /// Some routes are seen at sockets.
     at_socket: bool,
     /// Of the answers in `routes`.
     generation: u64,
@@ -136,7 +137,7 @@ impl Subscribers {
         }
     }
 
-    /// Every delivery with the ways that lead to it.
+    /// Every delivery with the routes that lead to it.
     pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&KnownRoute>)> {
         self.deliveries.iter().map(|delivery| {
             let leads_there = |known: &&KnownRoute| match delivery.receiver() {
@@ -155,7 +156,7 @@ impl Subscribers {
         &self.totals
     }
 
-    /// Ways and readers for which there was no room.
+    /// Routes and readers for which there was no room.
     #[must_use]
     pub const fn refused(&self) -> u64 {
         self.routes.evictions() + self.acknowledgements.refused
@@ -308,7 +309,7 @@ impl Subscribers {
         false
     }
 
-    /// Who gets what came this way, and whether it reads the topic.
+    /// Who gets what came by this route, and whether it reads the topic.
     fn receiver(
         &mut self,
         index: usize,
@@ -396,7 +397,7 @@ impl Subscribers {
         again
     }
 
-    /// A sample came whole this way.
+    /// A sample came whole this route.
     fn came(&mut self, index: usize, place: usize, whole: &Whole, now: Timestamp) {
         self.transfer(whole, now);
         let Some(known) = self.routes.get_mut(index).filter(|_| !whole.recovered) else {
@@ -439,8 +440,8 @@ impl Subscribers {
         is_known
     }
 
-    /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come to
-    /// a socket of this host as multicast: a repair for another host that got the multicast too.
+    /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come
+    /// to a socket of this host as multicast: a repair for another host that got the multicast too.
     fn is_repair_elsewhere(&self, route: Route, receiver: Receiver, sample: Sample<'_>) -> bool {
         let is_at_socket = |route: Route| route.is_open() && route.socket != 0;
         route.socket == 0

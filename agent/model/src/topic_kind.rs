@@ -90,8 +90,8 @@ impl TopicKind {
         matches!(self, Self::ServiceRequest | Self::ServiceReply)
     }
 
-    /// Whether `ros2 topic` knows it by its ROS name: a topic, or one of an action or of a service's
-    /// introspection.
+    /// Whether `ros2 topic` knows it by its ROS name: a topic, or one of an action or of a
+    /// service's introspection.
     #[must_use]
     pub const fn is_ros_topic(self) -> bool {
         matches!(

@@ -2,7 +2,8 @@
 //! of its own, by hand, by waking from suspend.
 //!
 //! The model's time goes on evenly all the while: leases, windows and gaps know nothing of it. Only
-//! what is held against the clocks of others, and what is shown, is calendar time. It reads no clock.
+//! what is held against the clocks of others, and what is shown, is calendar time. It reads no
+//! clock.
 
 use std::sync::Arc;
 

@@ -4,18 +4,20 @@
 //! it. An idle writer takes under 2 KiB; what grows with traffic (bitmaps) is bounded in
 //! [`super::sequence`] and [`super::samples`].
 
+mod latency;
+mod sampled_view;
+
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
-use super::header::{PLAUSIBLE, stamp_time};
 use super::histogram::Histogram;
 use super::in_order::Progress;
 use super::journal::{Journal, Loss, Missing};
 use super::payloads::MissedReason;
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception};
-use super::sampled::{Sampled, SampledUpdate, Seen};
+use super::sampled::Sampled;
 use super::samples::Budget;
 use super::sequence::{FAR, REACH};
 use super::size::Size;
@@ -235,7 +237,8 @@ impl Writer {
     }
 
     /// Takes in a record of this writer; gives the message that it completed. `opened` is when last
-    /// a way for its samples was opened that this host sees: what is missing before it went elsewhere.
+    /// a way for its samples was opened that this host sees: what is missing before it went
+    /// elsewhere.
     pub fn record(
         &mut self,
         record: &Record,
@@ -467,27 +470,6 @@ impl Writer {
         None
     }
 
-    /// Leaves samples for the journal that were sent and not seen.
-    fn leave_unseen(&mut self, journal: &mut Journal) {
-        let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
-        for (first, last) in unseen.into_iter().flatten() {
-            journal.leave_missing(Missing {
-                writer: self.guid,
-                first,
-                last,
-                reason: MissedReason::NotCaptured,
-            });
-        }
-    }
-
-    /// Whether it is of a sample that was under way when the sampled view ended.
-    fn is_under_way(&self, sample: Sample<'_>) -> bool {
-        let (number, at) = (sample.sequence_number(), record_time(sample.record()));
-        self.sampled
-            .as_ref()
-            .is_some_and(|sampled| !sampled.is_current(at) && sampled.awaits(number))
-    }
-
     /// Whether the number of this DATA or DATA_FRAG is away from those that the writer uses.
     fn is_unconfirmed(&self, sample: Sample<'_>) -> bool {
         let source = sample.source_timestamp().timestamp();
@@ -498,152 +480,6 @@ impl Writer {
     fn is_exact(&self, now: Timestamp) -> bool {
         let last = self.exact;
         last.is_some_and(|last| last.0.saturating_add(EXACT_FOR) > now.0)
-    }
-
-    fn is_sampled(&self, now: Timestamp) -> bool {
-        let sampled = self.sampled.as_ref();
-        sampled.is_some_and(|sampled| sampled.is_current(now))
-    }
-
-    /// Takes in a record of a view in which what is missing may have been sent all the same.
-    fn sampled_record(
-        &mut self,
-        record: &Record,
-        is_sampled: bool,
-        context: &mut MeasurementContext<'_>,
-    ) -> Option<Counted> {
-        let now = record_time(record);
-        let abandoned = match self.is_sampled(now) {
-            true => Vec::new(),
-            false => self.reception.abandon(),
-        };
-        self.tally.messages += abandoned.len() as u64;
-        let sampled = self
-            .sampled
-            .get_or_insert_with(|| Box::new(Sampled::new(now)));
-        sampled.take_over(&abandoned, self.reception.sequence().next(), now);
-        if is_sampled {
-            sampled.touch(now);
-        }
-        let reach = reach(record);
-        let sequence = self.reception.sequence_mut();
-        let told = match record.body() {
-            Body::Sample(sample) => {
-                let update = self.sampled_update(sample, reach, context.budget)?;
-                return self.sampled_sample(
-                    sample,
-                    &update,
-                    (now, context.wall_clock.wall_time(now)),
-                );
-            }
-            Body::Heartbeat(heartbeat) => {
-                self.traits.reliable = true;
-                sampled.exist(heartbeat.last(), reach, now, sequence)
-            }
-            Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
-            // The reader has all below.
-            Body::AckNack(acknack) => {
-                sampled.exist(acknack.base().saturating_sub(1), reach, now, sequence)
-            }
-            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
-        };
-        self.tally.messages += told;
-        self.tally.window.current(now).messages += told;
-        None
-    }
-
-    /// What a sample, or a part of one, changes in the sampled view.
-    fn sampled_update(
-        &mut self,
-        sample: Sample<'_>,
-        reach: u64,
-        budget: &mut Budget,
-    ) -> Option<SampledUpdate> {
-        let sampled = self.sampled.as_mut()?;
-        let (number, now) = (sample.sequence_number(), record_time(sample.record()));
-        let source = sample.source_timestamp().timestamp();
-        let sequence = self.reception.sequence();
-        let unconfirmed = sequence.is_unconfirmed(number, source, reach);
-        let has = !unconfirmed && sampled.has(number, sequence.next());
-        let is_whole = match sample {
-            Sample::DataFrag(fragments) => {
-                !has && self.reception.assemble(fragments, unconfirmed, budget)
-            }
-            Sample::Data(_) => true,
-        };
-        let is_exact = sample.record().flags & flag::EXACT != 0;
-        let seen = match is_whole {
-            true => Seen::Whole,
-            // What is read in shared memory may come after what is seen in the process.
-            false if sample.is_end() && !is_exact => Seen::Tail,
-            false => Seen::Part,
-        };
-        let sequence = self.reception.sequence_mut();
-        Some(sampled.sample((number, seen, source), reach, now, sequence))
-    }
-
-    /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
-    /// it comes.
-    fn catch_up(
-        &mut self,
-        sample: Sample<'_>,
-        context: &mut MeasurementContext<'_>,
-    ) -> Option<Counted> {
-        let is_whole = match sample {
-            Sample::Data(_) => true,
-            Sample::DataFrag(fragments) => {
-                self.reception.assemble(fragments, false, context.budget)
-            }
-        };
-        let seen = if is_whole { Seen::Whole } else { Seen::Part };
-        let number = sample.sequence_number();
-        let update = self.sampled.as_mut()?.catch_up(number, seen);
-        let now = record_time(sample.record());
-        self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
-    }
-
-    fn sampled_sample(
-        &mut self,
-        sample: Sample<'_>,
-        update: &SampledUpdate,
-        (now, wall_clock): (Timestamp, Timestamp),
-    ) -> Option<Counted> {
-        let (number, is_message) = (sample.sequence_number(), sample.is_message());
-        // Those that were not seen are taken for as large as the next one that was.
-        let disposals = u64::from(!is_message && update.samples > 0);
-        let messages = update.samples - disposals;
-        let bytes = u64::from(sample.size());
-        let told = (update.alike - disposals).saturating_mul(bytes);
-        self.tally.messages += messages;
-        self.tally.bytes = self.tally.bytes.saturating_add(told);
-        let slot = self.tally.window.current(now);
-        slot.messages += messages;
-        slot.bytes = slot.bytes.saturating_add(told);
-        if messages > 0 {
-            self.last_message = self.last_message.max(Some(now));
-        }
-        let sampled = self.sampled.as_mut()?;
-        let stamp = sampled.stamp(number, sample.header_stamp());
-        if let Some(interval) = update.interval {
-            self.interarrival.observe(seconds(interval));
-        }
-        let source = sample.source_timestamp();
-        if update.arrived && is_message {
-            self.delays(number, true, (source, stamp), (now, wall_clock));
-        }
-        if update.finished && is_message {
-            return Some(Counted {
-                number,
-                bytes,
-                source,
-                stamp: stamp.filter(|_| self.traits.has_header),
-                at: now,
-                began: now,
-                sampled: true,
-                unconfirmed: update.unconfirmed,
-            });
-        }
-        None
     }
 
     fn count(&mut self, now: Timestamp, bytes: u64, recovered: bool) {
@@ -658,47 +494,6 @@ impl Writer {
                 .observe(seconds(now.nanoseconds_since(previous).max(0)));
         }
         self.last_message = self.last_message.max(Some(now));
-    }
-
-    fn delays(
-        &mut self,
-        number: u64,
-        newest: bool,
-        (source, stamp): (RtpsTime, Option<(i32, u32)>),
-        (now, wall_clock): (Timestamp, Timestamp),
-    ) {
-        let source = source.timestamp();
-        if self.traits.keeps_history {
-            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < wall_clock.0);
-            let first = self.reception.sequence().first();
-            if !newest || number < first || number == first && old {
-                return;
-            }
-        }
-        let stamp = stamp
-            .filter(|_| self.traits.has_header)
-            .and_then(|stamp| stamp_time(stamp, wall_clock));
-        let mut negative = false;
-        if let Some(source) = source {
-            let delay = wall_clock.nanoseconds_since(source);
-            let is_plausible = source.0.abs_diff(wall_clock.0) <= PLAUSIBLE;
-            self.implausible_latency += u64::from(!is_plausible);
-            negative |= delay < 0;
-            if delay >= 0 && is_plausible {
-                self.source_latency.observe(seconds(delay));
-                let slot = self.tally.window.current(now);
-                slot.delayed += 1;
-                slot.delay += seconds(delay);
-            }
-        }
-        if let Some(stamp) = stamp {
-            let delay = wall_clock.nanoseconds_since(stamp);
-            negative |= delay < 0;
-            if delay >= 0 {
-                self.header_latency.observe(seconds(delay));
-            }
-        }
-        self.negative_latency += u64::from(negative);
     }
 }
 
@@ -753,7 +548,8 @@ impl Settling<'_> {
     }
 }
 
-/// How far ahead of those that came the numbers of a record may be: looks at shared memory miss more.
+/// How far ahead of those that came the numbers of a record may be: looks at shared memory miss
+/// more.
 const fn reach(record: &Record) -> u64 {
     if is_polled(record) { FAR } else { REACH }
 }

@@ -2,7 +2,8 @@
 //!
 //! An entry is doubtful that is heard no more: after 5 s where it was there for less than 2 s, else
 //! after 90 s; one with a socket on this host never is. Doubtful ones go first. Any other goes only
-//! for a newcomer that is worth more, and the least worth of them that has been silent longest goes.
+//! for a newcomer that is worth more, and the least worth of them that has been silent longest
+//! goes.
 //!
 //! Names and user data can be forged, too. So newcomers without a socket on this host displace what
 //! is worth something, or was there for 2 s, only until their like fill half of the table.

@@ -1,4 +1,5 @@
-//! What is kept of participants, endpoints and nodes, and where a participant's domain is read from.
+//! What is kept of participants, endpoints and nodes, and where a participant's domain is read
+//! from.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;

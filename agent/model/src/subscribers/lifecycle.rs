@@ -1,4 +1,5 @@
-//! What time and discovery do to deliveries: gaps settle, sockets get owners, receivers come and go.
+//! What time and discovery do to deliveries: gaps settle, sockets get owners, receivers come and
+//! go.
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
@@ -9,7 +10,7 @@ use crate::delivery::{Delivery, Receiver, Totals};
 use crate::receivers::{Matched, readers};
 use crate::route::Route;
 
-/// A way by which nothing came for so long is forgotten, unless a reader is known at its end.
+/// A route by which nothing came for so long is forgotten, unless a reader is known at its end.
 const FORGET: u64 = 60 * SECOND;
 
 impl Subscribers {
@@ -129,7 +130,7 @@ impl Subscribers {
         }
     }
 
-    /// What came this way so far was seen on a wire; from now on it is seen at a socket.
+    /// What came by this route so far was seen on a wire; from now on it is seen at a socket.
     pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
         self.at_socket = true;
         let destination = route.destination;
@@ -183,7 +184,7 @@ impl Subscribers {
             .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
     }
 
-    /// Puts ways together that turned out to lead to one participant.
+    /// Puts routes together that turned out to lead to one participant.
     fn identify(&mut self, context: &mut WriterContext<'_>) {
         let mut index = 0;
         while let Some(delivery) = self.deliveries.get(index) {
@@ -225,7 +226,7 @@ impl Subscribers {
         self.count_open();
     }
 
-    /// Gives up deliveries to which no way leads any more.
+    /// Gives up deliveries to which no route leads any more.
     fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
         let led_to: Vec<_> = self
             .deliveries()

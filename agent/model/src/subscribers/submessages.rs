@@ -1,4 +1,4 @@
-//! What is said of samples without bringing any: HEARTBEAT, GAP, ACKNACK, and what the kernel gave up.
+//! HEARTBEAT, GAP and ACKNACK handling, and datagrams that the kernel did not reassemble.
 
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
@@ -10,7 +10,7 @@ use crate::route::Destination;
 use crate::routes::KnownRoute;
 
 impl Subscribers {
-    /// A HEARTBEAT came this way.
+    /// A HEARTBEAT came by this route.
     pub(super) fn heartbeat(
         &mut self,
         index: usize,
@@ -39,7 +39,7 @@ impl Subscribers {
         }
     }
 
-    /// A GAP came this way.
+    /// A GAP came by this route.
     pub(super) fn gap(
         &mut self,
         index: usize,
@@ -73,8 +73,8 @@ impl Subscribers {
         }
     }
 
-    /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all of
-    /// its readers have came there, whether it was seen or not.
+    /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all
+    /// of its readers have came there, whether it was seen or not.
     pub(super) fn acknowledged(&mut self, acknack: AckNack<'_>) {
         let prefix = acknack.record().reader().prefix;
         let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);

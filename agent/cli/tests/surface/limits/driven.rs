@@ -82,7 +82,7 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "nodes",
-        "agent/model/src/observer.rs",
+        "agent/model/src/observer/settings.rs",
         "agent/cli/tests/surface/caps.rs",
         "nodes_beyond_the_cap_are_left_out",
     ],
@@ -130,7 +130,7 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "sample_bytes",
-        "agent/model/src/observer.rs",
+        "agent/model/src/observer/settings.rs",
         "agent/model/src/samples.rs",
         "a_storm_of_unfinished_samples_stays_in_the_budget",
     ],
@@ -167,7 +167,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_OPEN",
         "agent/model/src/trace.rs",
-        "agent/model/src/trace.rs",
+        "agent/model/src/trace/tests.rs",
         "what_never_completes_or_is_never_acknowledged_takes_bounded_room",
     ],
     [

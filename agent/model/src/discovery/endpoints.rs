@@ -1,0 +1,206 @@
+//! SEDP: writers and readers, and those that wait for their participant (RTPS 2.5, 8.5.4).
+
+use std::cmp::Reverse;
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
+use ros2probe_wire::rtps::Locator;
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+
+use super::entity::DiscoveredEntity;
+use super::eviction::{Newcomer, Table};
+use super::facts::{Endpoint, Origin};
+use super::priority::Priority;
+use super::{
+    Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT, PendingEndpoint, PendingNodes, endpoints_of,
+    is_named,
+};
+use crate::churn::Event;
+use crate::journal::Journal;
+
+impl Discovery {
+    /// SEDP: an endpoint is there. `evidence` is what is known in its participant's favour. Returns
+    /// whether the participant finds room by that.
+    pub fn endpoint(
+        &mut self,
+        announcement: EndpointAnnouncement,
+        origin: &Origin,
+        evidence: Priority,
+        journal: &mut Journal,
+    ) -> bool {
+        let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
+        if names.iter().any(|name| name.len() > MAX_NAME_LEN) {
+            self.evictions.endpoints += 1;
+            return false;
+        }
+        if self.disposals.is_stale(announcement.guid, origin) {
+            return false;
+        }
+        let guid = announcement.guid;
+        let announces_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
+        let pending = PendingEndpoint {
+            at: origin.at,
+            announces_readers,
+            announcement: Box::new(announcement),
+        };
+        let is_known = self.participants.contains_key(&guid.prefix);
+        let pending = match is_known {
+            true => self.admit(pending, origin.at, journal),
+            false => Some(pending),
+        };
+        let Some(pending) = pending else {
+            self.pending_endpoints.remove(&guid);
+            return false;
+        };
+        let watched = is_named(&self.watchlist, None, &pending.announcement.topic);
+        let priority = Priority {
+            watched,
+            ..evidence
+        };
+        let is_crowded = self.pending_endpoints.put(guid, priority, pending);
+        self.evictions.endpoints += u64::from(is_known || is_crowded);
+        let is_more = !is_known && self.seen(guid.prefix, origin.at, priority);
+        is_more && self.learn(guid.prefix, priority, origin.at, journal)
+    }
+
+    /// SEDP: an endpoint says goodbye.
+    pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
+        self.disposals.add(guid, origin);
+        self.pending_endpoints.remove(&guid);
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.endpoints.remove(&guid);
+        }
+        self.drop_endpoint(guid, Some(Event::Disposed), origin.at, journal);
+    }
+
+    /// Puts an announced endpoint into its known participant; gives it back where it finds no room.
+    fn admit(
+        &mut self,
+        pending: PendingEndpoint,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) -> Option<PendingEndpoint> {
+        let announcement = &pending.announcement;
+        let guid = announcement.guid;
+        let participant = self.participants.get_mut(&guid.prefix)?;
+        participant.all_readers_announced |= pending.announces_readers;
+        let domain_id = participant.domain_id;
+        if let Some(known) = self.endpoints.get_mut(&guid) {
+            if *known.topic == *announcement.topic.as_str() {
+                let before = (
+                    known.type_hash,
+                    known.qos.clone(),
+                    Arc::clone(&known.message_type),
+                );
+                known.qos = announcement.qos.clone();
+                known.type_hash = announcement.type_hash;
+                known.message_type = announcement.type_name.message().as_str().into();
+                let unchanged = before.0 == known.type_hash
+                    && before.1 == known.qos
+                    && before.2 == known.message_type;
+                if !unchanged {
+                    let entity = DiscoveredEntity::endpoint(guid, known);
+                    self.changes.push(Change::Changed(guid));
+                    self.note(&entity, Event::Changed, at, journal);
+                }
+                return None;
+            }
+            // The same GUID on another topic: its dispose was missed.
+            participant.endpoints.remove(&guid);
+            self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
+        }
+        let participant = self.participants.get(&guid.prefix)?;
+        let watched = is_named(&self.watchlist, Some(domain_id), &announcement.topic);
+        let priority = Priority {
+            watched,
+            ..participant.priority()
+        };
+        if participant.endpoints.len() >= PER_PARTICIPANT {
+            return Some(pending);
+        }
+        let is_full = self.endpoints.len() >= self.caps.endpoints;
+        if is_full && !self.evict_for(Table::Endpoints, Newcomer { guid, priority }, at) {
+            return Some(pending);
+        }
+        let announcement = pending.announcement;
+        let unicast = &announcement.unicast;
+        let shared_memory =
+            (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
+        let endpoint = Endpoint {
+            role: announcement.role,
+            domain_id,
+            topic: announcement.topic.as_str().into(),
+            message_type: announcement.type_name.message().as_str().into(),
+            type_hash: announcement.type_hash,
+            qos: announcement.qos,
+            first_seen: at,
+            shared_memory,
+            data_sharing: announcement.datasharing,
+            watched,
+        };
+        let entity = DiscoveredEntity::endpoint(guid, &endpoint);
+        self.endpoints.insert(guid, Box::new(endpoint));
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            participant.endpoints.insert(guid);
+            participant.watched += usize::from(watched);
+        }
+        self.changes.push(Change::Appeared(guid));
+        self.note(&entity, Event::Appeared, at, journal);
+        None
+    }
+
+    /// What waited for this participant, or for room, until there is none for what is worth most.
+    pub(super) fn adopt_pending(
+        &mut self,
+        prefix: GuidPrefix,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        let mut waiting: Vec<_> = waiting.collect();
+        waiting.sort_by_key(|(_, priority)| Reverse(*priority));
+        for (guid, priority) in waiting {
+            let Some((_, pending)) = self.pending_endpoints.remove(&guid) else {
+                continue;
+            };
+            if let Some(pending) = self.admit(pending, at, journal) {
+                self.pending_endpoints.put(guid, priority, pending);
+                break;
+            }
+        }
+        if let Some(pending) = self.pending_nodes.remove(&prefix) {
+            let PendingNodes {
+                writer,
+                sequence_number,
+                nodes,
+                ..
+            } = pending;
+            self.set_nodes(prefix, writer, sequence_number, nodes, at, journal);
+        }
+    }
+
+    pub(super) fn drop_endpoint(
+        &mut self,
+        guid: Guid,
+        event: Option<Event>,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        let Some(endpoint) = self.endpoints.remove(&guid) else {
+            return;
+        };
+        if let Some(participant) = self.participants.get_mut(&guid.prefix) {
+            let watched = usize::from(endpoint.watched);
+            participant.watched = participant.watched.saturating_sub(watched);
+        }
+        if let Some(event) = event {
+            self.note(
+                &DiscoveredEntity::endpoint(guid, &endpoint),
+                event,
+                at,
+                journal,
+            );
+        }
+        self.changes.push(Change::Gone(guid, endpoint));
+    }
+}

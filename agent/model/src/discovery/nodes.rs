@@ -1,0 +1,167 @@
+//! Nodes, as `ros_discovery_info` announces them.
+
+use std::sync::Arc;
+
+use ros2probe_wire::entities::ParticipantEntities;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+use super::entity::DiscoveredEntity;
+use super::eviction::{Newcomer, Table};
+use super::facts::{Node, Origin, named};
+use super::priority::Priority;
+use super::{
+    Discovery, PENDING_NODE_BYTES, PENDING_NODES, PER_PARTICIPANT, PendingNodes, endpoints_of,
+};
+use crate::churn::Event;
+use crate::journal::Journal;
+
+/// Names of `one` that are not in `other`, each as often as it is missing there.
+pub(super) fn difference(one: &[Arc<str>], other: &[Arc<str>]) -> Vec<Arc<str>> {
+    let mut rest: Vec<_> = other.to_vec();
+    let mut missing = Vec::new();
+    for name in one {
+        match rest.iter().position(|each| each == name) {
+            Some(index) => drop(rest.swap_remove(index)),
+            None => missing.push(Arc::clone(name)),
+        }
+    }
+    missing
+}
+
+impl Discovery {
+    /// `ros_discovery_info`: these are the participant's nodes now. `evidence` is what is known in its
+    /// favour.
+    pub fn entities(
+        &mut self,
+        entities: &ParticipantEntities,
+        writer: Guid,
+        origin: &Origin,
+        evidence: Priority,
+        journal: &mut Journal,
+    ) {
+        // A participant tells of its own nodes only.
+        let prefix = entities.participant.prefix;
+        if prefix != writer.prefix {
+            return;
+        }
+        let priority = self.participants.get(&prefix).map(|known| known.priority());
+        let guid = entities.participant;
+        let newcomer = priority.map(|priority| Newcomer { guid, priority });
+        let wanted = entities.nodes.iter();
+        let wanted = wanted.map(|node| node.writers.len() + node.readers.len());
+        let wanted = wanted.sum::<usize>().min(PER_PARTICIPANT);
+        let (eviction, mut names) = loop {
+            let (eviction, names) = self.node_quota(prefix);
+            let fits = entities.nodes.len() <= eviction && wanted <= names;
+            let newcomer = newcomer.filter(|_| !fits);
+            let is_more =
+                newcomer.is_some_and(|newcomer| self.evict_for(Table::Nodes, newcomer, origin.at));
+            if !is_more {
+                break (eviction, names.min(PER_PARTICIPANT));
+            }
+        };
+        let mut nodes: Vec<Node> = entities.nodes.iter().take(eviction).map(Node::of).collect();
+        self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
+        for node in &mut nodes {
+            self.evictions.nodes += u64::from(node.cut(&mut names));
+        }
+        if self.participants.contains_key(&prefix) {
+            self.set_nodes(
+                prefix,
+                writer,
+                origin.sequence_number,
+                nodes,
+                origin.at,
+                journal,
+            );
+            return;
+        }
+        let older = |pending: &PendingNodes| {
+            pending.writer == writer && pending.sequence_number >= origin.sequence_number
+        };
+        if self.pending_nodes.get(&prefix).is_some_and(older) {
+            return;
+        }
+        self.pending_nodes.remove(&prefix);
+        let bytes = nodes.iter().map(Node::bytes).sum();
+        let waiting = self.pending_endpoints.range(endpoints_of(prefix));
+        let priority = waiting.fold(evidence, |priority, (_, other)| priority.or(other));
+        while self.pending_nodes.len() >= PENDING_NODES
+            || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
+        {
+            self.evictions.nodes += 1;
+            let pending = self.pending_nodes.iter();
+            let oldest = pending.min_by_key(|(_, pending)| (pending.priority, pending.at));
+            match oldest.map(|(prefix, pending)| (*prefix, pending.priority)) {
+                Some((oldest, least)) if least <= priority => self.pending_nodes.remove(&oldest),
+                _ => return,
+            };
+        }
+        let sequence_number = origin.sequence_number;
+        let pending = PendingNodes {
+            at: origin.at,
+            priority,
+            writer,
+            sequence_number,
+            nodes,
+            bytes,
+        };
+        self.pending_nodes.insert(prefix, pending);
+    }
+
+    /// How many nodes this participant may have, and how many endpoints these may name.
+    fn node_quota(&self, prefix: GuidPrefix) -> (usize, usize) {
+        let known: &[Node] = match self.participants.get(&prefix) {
+            Some(known) => &known.nodes,
+            None => &[],
+        };
+        let eviction = self.caps.nodes.saturating_sub(self.node_count);
+        let names = self.caps.endpoints.saturating_sub(self.named);
+        (eviction + known.len(), names + named(known))
+    }
+
+    fn pending_node_bytes(&self) -> usize {
+        self.pending_nodes
+            .values()
+            .map(|pending| pending.bytes)
+            .sum()
+    }
+
+    pub(super) fn set_nodes(
+        &mut self,
+        prefix: GuidPrefix,
+        writer: Guid,
+        sequence_number: u64,
+        nodes: Vec<Node>,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
+        let Some(participant) = self.participants.get_mut(&prefix) else {
+            return;
+        };
+        let older = |(from, number): (Guid, u64)| from == writer && number >= sequence_number;
+        if participant.nodes_from.is_some_and(older) {
+            return;
+        }
+        participant.nodes_from = Some((writer, sequence_number));
+        let domain_id = participant.domain_id;
+        let before = std::mem::replace(&mut participant.nodes, nodes);
+        self.named = self.named.saturating_sub(named(&before)) + named(&participant.nodes);
+        let after: Vec<_> = participant
+            .nodes
+            .iter()
+            .map(|node| Arc::clone(&node.name))
+            .collect();
+        self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
+        let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
+        let guid = Guid::new(prefix, EntityId::PARTICIPANT);
+        for name in difference(&before, &after) {
+            let entity = DiscoveredEntity::node(domain_id, guid, &name);
+            self.note(&entity, Event::Disposed, at, journal);
+        }
+        for name in difference(&after, &before) {
+            let entity = DiscoveredEntity::node(domain_id, guid, &name);
+            self.note(&entity, Event::Appeared, at, journal);
+        }
+    }
+}

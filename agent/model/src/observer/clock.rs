@@ -1,0 +1,183 @@
+//! What time decides: leases, windows, gaps, expectations and diagnosis.
+
+use std::sync::Arc;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::SECOND;
+
+use super::{JUMP, Observer, TICK, graph};
+use crate::diagnosis;
+use crate::event::{EventKind, bounded, bounded_finding, bounded_shared};
+use crate::expectation::Evidence;
+use crate::rate::Slot;
+use crate::snapshot::WatchState;
+
+impl Observer {
+    /// Says what time it is: ends leases, settles gaps, judges expectations.
+    pub(super) fn advance(&mut self, now: Timestamp) {
+        let now = self.wall_clock.model_time(now);
+        if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
+            self.clock = Timestamp(now.0 - now.0 % TICK);
+            self.tick(self.clock);
+        }
+        while now.0.saturating_sub(self.clock.0) >= TICK {
+            self.clock = Timestamp(self.clock.0 + TICK);
+            self.tick(self.clock);
+        }
+    }
+
+    /// Nothing more will come: decides what is still open, without letting time pass.
+    pub(super) fn settle(&mut self) {
+        let graph = graph!(self);
+        self.profiler.settle(self.clock, &mut self.journal, graph);
+        self.report_missing();
+        for writer in self.payloads.unsettled() {
+            self.payloads.give_all(writer, self.clock);
+        }
+        self.report_losses();
+        self.examine(self.clock);
+    }
+
+    /// Tells the losses of the last second.
+    fn report_losses(&mut self) {
+        let discovery = &self.discovery;
+        self.journal.events.end_bursts(|burst| {
+            if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
+                burst.topic = Some((endpoint.domain_id, bounded_shared(&endpoint.topic)));
+            }
+            let participant = discovery.participants().get(&burst.writer.prefix);
+            let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
+            let node = nodes.find(|node| node.writers.contains(&burst.writer));
+            burst.node = node.map(|node| bounded_shared(&node.name));
+        });
+    }
+
+    pub(super) fn tick(&mut self, now: Timestamp) {
+        self.discovery.advance(now, &mut self.journal);
+        self.follow_up(now);
+        let graph = graph!(self);
+        let unknown_writers = self.profiler.advance(now, &mut self.journal, graph);
+        for guid in unknown_writers.metered {
+            self.interest.set(guid, Verdict::Meter);
+        }
+        for guid in unknown_writers.forgotten {
+            self.interest.remove(guid);
+        }
+        self.report_missing();
+        for writer in self.payloads.unsettled() {
+            self.turn(writer, now);
+        }
+        if now.0.is_multiple_of(SECOND) {
+            self.payloads.expire(now);
+            let profiler = &self.profiler;
+            self.payloads.retain_unknown_writers(|writer| {
+                let known = profiler.get(writer);
+                known.is_some_and(|known| known.topic.is_none())
+            });
+            self.topics.expire(now, self.settings.topic_grace);
+            self.receivers.tidy(&self.discovery);
+            self.discovery
+                .locate(|prefix| self.receivers.is_local(prefix));
+            self.promote();
+            self.judge(now);
+            self.report_losses();
+            self.examine(now);
+            self.tracer.advance(now);
+        }
+    }
+
+    pub(super) fn examine(&mut self, now: Timestamp) {
+        let before = Arc::clone(self.examiner.current());
+        self.examiner.examine(&self.discovery, &self.topics, now);
+        let after = self.examiner.current();
+        if Arc::ptr_eq(&before, after) {
+            return;
+        }
+        for change in diagnosis::changes(&before.list, &after.list) {
+            let (resolved, finding) = match change {
+                diagnosis::Change::Appeared(finding) | diagnosis::Change::Changed(finding) => {
+                    (false, finding)
+                }
+                diagnosis::Change::Resolved(finding) => (true, finding),
+            };
+            let finding = bounded_finding(finding);
+            let kind = EventKind::Diagnosis { resolved, finding };
+            self.journal.events.push(now, kind);
+        }
+    }
+
+    /// Judges every watched topic under every entry that covers it.
+    pub(super) fn judge(&mut self, now: Timestamp) {
+        for id in self.topics.ids() {
+            let Some(topic) = self.topics.get(id) else {
+                continue;
+            };
+            if topic.judgements.is_empty() {
+                continue;
+            }
+            let writers: Vec<_> = topic
+                .writers
+                .iter()
+                .chain(&topic.buffer_endpoints)
+                .filter_map(|guid| self.profiler.get(*guid))
+                .collect();
+            let last_message = writers
+                .iter()
+                .filter_map(|each| each.writer.last_message())
+                .max();
+            let retired = topic
+                .retired
+                .as_ref()
+                .and_then(|retired| retired.last_message);
+            let recent = |seconds: u64| {
+                writers
+                    .iter()
+                    .fold((Slot::default(), 0), |(mut sum, longest), each| {
+                        let (slot, seconds) = each.writer.recent(now, seconds);
+                        sum.add(&slot);
+                        (sum, seconds.max(longest))
+                    })
+            };
+            let evidence = Evidence {
+                now,
+                publishers: topic.writers.len(),
+                subscriptions: topic.readers.len(),
+                last_message: last_message.max(retired),
+                since: topic.published,
+                recent: &recent,
+            };
+            let mut judgements = topic.judgements.clone();
+            for (index, judgement) in &mut judgements {
+                let Some(watch) = self.watchlist.watches().get(*index) else {
+                    continue;
+                };
+                let changed = judgement.judge(&watch.expectations, &evidence);
+                let Some(from) = changed else { continue };
+                let to = judgement.state();
+                let (domain_id, name) = (topic.domain_id, &topic.naming.name);
+                let kind = EventKind::Expectation {
+                    domain_id,
+                    topic: bounded_shared(name),
+                    watch: bounded(&watch.pattern).into(),
+                    from,
+                    to,
+                    violations: judgement.violations(),
+                };
+                self.journal.events.push(now, kind);
+                if to == WatchState::Silent {
+                    let kind = EventKind::Silence {
+                        domain_id,
+                        topic: bounded_shared(name),
+                        watch: bounded(&watch.pattern).into(),
+                        last_message: evidence.last_message,
+                    };
+                    self.journal.events.push(now, kind);
+                }
+            }
+            if let Some(topic) = self.topics.get_mut(id) {
+                topic.judgements = judgements;
+            }
+        }
+    }
+}

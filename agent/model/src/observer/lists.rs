@@ -1,0 +1,202 @@
+//! What the watchlist and the sample requests select is measured.
+
+use std::sync::Arc;
+
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::qos::{Durability, Reliability};
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::{MATCHES_AT_ONCE, Observer, graph, naming};
+use crate::discovery::Endpoint;
+use crate::header::begins_with_header;
+use crate::payloads::{self, Offered};
+use crate::selection::SampleRequest;
+use crate::topic::{Topic, TopicId, Watched};
+use crate::topic_kind::TopicKind;
+use crate::watch::{Watch, Watchlist};
+use crate::writer::Traits;
+
+impl Observer {
+    /// Watches these from now on, once [`Self::apply_more_lists`] has come to all topics. What was
+    /// counted of a topic that is no more watched stays, and so does how a topic stands with an
+    /// entry that is in the new list as it was.
+    pub(super) fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
+        let before = std::mem::replace(&mut self.watchlist, watchlist);
+        let moved = |watch: &Arc<Watch>| {
+            let place = self.watchlist.position(&watch.pattern, watch.domain_id)?;
+            let after = self.watchlist.watches().get(place)?;
+            (after.expectations == watch.expectations).then_some(place)
+        };
+        let moved: Vec<_> = before.watches().iter().map(moved).collect();
+        self.topics.renumber(&moved);
+        self.discovery.watch(Arc::clone(&self.watchlist));
+        let watches = self.watchlist.watches();
+        self.tracer
+            .restart(watches.iter().any(|watch| watch.trace > 0.0));
+        self.apply_lists_to_all();
+    }
+
+    /// Asks about every topic.
+    pub(super) fn apply_lists_to_all(&mut self) {
+        let is_watched = |id: &TopicId| {
+            let topic = self.topics.get(*id);
+            topic.is_some_and(|topic| topic.watched == Watched::Yes)
+        };
+        let (watched, others): (Vec<_>, Vec<_>) =
+            self.topics.ids().into_iter().partition(is_watched);
+        // First give places back, then hand them out.
+        self.pending_topics = others.into_iter().rev().collect();
+        self.pending_topics.extend(watched.into_iter().rev());
+        self.apply_more_lists();
+    }
+
+    /// Asks the watchlist and the sample requests about further topics, as many as take some
+    /// milliseconds. Until a topic's turn comes, what was decided by the lists before holds.
+    /// Returns whether all topics had their turn.
+    pub fn apply_more_lists(&mut self) -> bool {
+        if self.has_applied_lists() {
+            return true;
+        }
+        let requested = |request: &SampleRequest| {
+            request.selection.globs().count() + request.selection.regexes()
+        };
+        let patterns =
+            self.watchlist.globs() + self.sample_requests.iter().map(requested).sum::<usize>();
+        for _ in 0..(MATCHES_AT_ONCE / patterns.max(1)).max(1) {
+            let Some(id) = self.pending_topics.pop() else {
+                break;
+            };
+            self.apply_lists(id, self.clock);
+        }
+        self.has_applied_lists()
+    }
+
+    /// Whether the lists were asked about all topics since they last changed.
+    #[must_use]
+    pub const fn has_applied_lists(&self) -> bool {
+        self.pending_topics.is_empty()
+    }
+
+    /// Asks the watchlist and the sample requests about a topic and lets its endpoints follow.
+    pub(super) fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
+        let displaced = self.topics.apply_lists(
+            id,
+            &self.watchlist,
+            &self.sample_requests,
+            self.settings.topics,
+            now,
+        );
+        if let Some(id) = displaced {
+            self.apply_all(id, now);
+            self.topics.forget_measurement(id);
+        }
+        self.apply_all(id, now);
+    }
+
+    /// Lets the endpoints of a topic follow it.
+    fn apply_all(&mut self, id: TopicId, now: Timestamp) {
+        let Some(topic) = self.topics.get(id) else {
+            return;
+        };
+        let lists = [&topic.writers, &topic.readers, &topic.buffer_endpoints];
+        let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
+        for guid in guids {
+            self.apply(id, guid, now);
+        }
+    }
+
+    /// Decides about one endpoint of a topic.
+    pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
+        let Some(topic) = self.topics.get(id) else {
+            return;
+        };
+        let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
+            return;
+        };
+        let is_watched = topic.watched == Watched::Yes;
+        match endpoint.role {
+            Role::Reader if is_watched => self.interest.set(guid, Verdict::Meter),
+            Role::Reader => self.interest.remove(guid),
+            Role::Writer => {
+                let counts = naming(endpoint).is_some_and(|naming| naming.counts);
+                let measured = is_watched && counts;
+                let verdict = match topic.naming.kind {
+                    TopicKind::Discovery => Verdict::Capture,
+                    _ if measured && wants_bytes(topic) => Verdict::Capture,
+                    _ if measured => Verdict::Meter,
+                    _ => Verdict::Ignore,
+                };
+                self.interest.set(guid, verdict);
+                match &topic.requested {
+                    Some(requested) if measured => {
+                        let topic = payloads::Topic {
+                            domain_id: topic.domain_id,
+                            name: Arc::clone(&topic.naming.name),
+                            dds_name: Arc::clone(&topic.naming.dds_name),
+                            message_type: Arc::clone(&endpoint.message_type),
+                            offered: Some(Arc::new(Offered {
+                                type_hash: endpoint.type_hash,
+                                qos: endpoint.qos.clone(),
+                            })),
+                        };
+                        let known = self.profiler.get(guid);
+                        let next = known.map_or(0, |known| known.writer.next());
+                        self.payloads.want(guid, topic, requested, (next, now));
+                    }
+                    _ => self.payloads.release(guid, now),
+                }
+                if measured {
+                    let (traits, opened) = (traits(endpoint), topic.reader_appeared);
+                    self.profiler.measure(guid, id, traits, opened, now);
+                } else {
+                    self.retire(guid, now);
+                }
+            }
+        }
+    }
+
+    /// Measures this writer no more; its topic keeps what it had counted.
+    pub(super) fn retire(&mut self, guid: Guid, now: Timestamp) {
+        let graph = graph!(self);
+        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
+            return;
+        };
+        self.report_missing();
+        if let Some(topic) = self.topics.get_mut(retired.topic) {
+            topic.retire(&retired.measurement, retired.totals.as_ref());
+        }
+    }
+
+    /// Gives free measuring places, and those of vanished topics, to topics that were kept out.
+    pub(super) fn promote(&mut self) {
+        if !self.topics.has_place(self.settings.topics) {
+            return;
+        }
+        let rejected = self
+            .topics
+            .iter()
+            .filter(|(_, topic)| topic.watched == Watched::Rejected && !topic.is_vanished());
+        let rejected: Vec<_> = rejected.map(|(id, _)| id).collect();
+        for id in rejected {
+            if !self.topics.has_place(self.settings.topics) {
+                return;
+            }
+            self.apply_lists(id, self.clock);
+        }
+    }
+}
+
+/// Whether somebody wants its samples whole.
+pub(super) fn wants_bytes(topic: &Topic) -> bool {
+    let requested = topic.requested.as_ref();
+    requested.is_some_and(|requested| !requested.payloads.is_empty())
+}
+
+pub(super) fn traits(endpoint: &Endpoint) -> Traits {
+    Traits {
+        reliable: endpoint.qos.reliability == Reliability::RELIABLE,
+        keeps_history: endpoint.qos.durability != Durability::VOLATILE,
+        has_header: begins_with_header(&endpoint.message_type),
+    }
+}

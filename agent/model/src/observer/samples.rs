@@ -1,0 +1,138 @@
+//! Samples for subscriptions: in order, once, or reported as missing.
+
+use std::sync::Arc;
+
+use ros2probe_wire::record::Sample;
+use ros2probe_wire::walk::Found;
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::{Observer, graph};
+use crate::profiler::{Measured, UNDELIVERED};
+use crate::selection::SampleRequest;
+use crate::writer::Counted;
+
+impl Observer {
+    /// Gives the samples of these requests, and no others, once [`Self::apply_more_lists`] has come
+    /// to all topics. Their topics are measured meanwhile, whether they are watched or not; what
+    /// was counted stays.
+    pub(super) fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
+        self.sample_requests = sample_requests;
+        if self.sample_requests.is_empty() {
+            self.payloads.retain_unknown_writers(|_| false);
+        }
+        self.apply_lists_to_all();
+    }
+
+    /// The time up to which all samples were given, or told as missing, that have come by `now`.
+    #[must_use]
+    pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
+        let writers = self.payloads.wanted();
+        let writers = writers.filter_map(|writer| self.profiler.get(*writer));
+        let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
+        unseen.fold(now, |until, since| {
+            until.min(self.wall_clock.wall_time(since))
+        })
+    }
+
+    /// Gives a sample, when it is its turn, or remembers that it was of an unknown writer.
+    pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
+        if self.sample_requests.is_empty() {
+            return;
+        }
+        if !self.payloads.wants(writer) {
+            let known = self.profiler.get(writer);
+            if known.is_some_and(|known| known.topic.is_none()) {
+                let sample_requests = self.sample_requests.iter().map(|request| request.id);
+                let number = counted.number;
+                // Those that the profiler gave up since the last second make room.
+                if self.payloads.unknown_writers() >= self.settings.unknown_writers {
+                    let profiler = &self.profiler;
+                    self.payloads.retain_unknown_writers(|writer| {
+                        let known = profiler.get(writer);
+                        known.is_some_and(|known| known.topic.is_none())
+                    });
+                }
+                self.payloads
+                    .counted_of_unknown_writer(writer, number, sample_requests);
+            }
+            return;
+        }
+        let progress = self.profiler.progress(writer, counted.at, graph!(self));
+        if let Some(progress) = progress {
+            let skip = self.payloads.counted(writer, counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Gives a sample that was counted before its writer was announced, now that it comes again.
+    pub(super) fn came_again(&mut self, writer: Guid, record: &Record) {
+        let Some(sample) = record.sample() else {
+            return;
+        };
+        let (number, at) = (sample.sequence_number(), Timestamp(record.time));
+        let stamp = match sample {
+            Sample::Data(_) => sample.header_stamp(),
+            Sample::DataFrag(_) => None,
+        };
+        if record.flags & UNDELIVERED != 0 || !self.payloads.lacks(writer, number) {
+            return;
+        }
+        let has_header = |known: &Measured| known.writer.traits().has_header;
+        let counted = Counted {
+            number,
+            bytes: sample.size().into(),
+            source: record.source_timestamp(),
+            stamp: stamp.filter(|_| self.profiler.get(writer).is_some_and(has_header)),
+            at,
+            began: at,
+            sampled: false,
+            unconfirmed: false,
+        };
+        let progress = self.profiler.progress(writer, at, graph!(self));
+        if let Some(progress) =
+            progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
+        {
+            let skip = self.payloads.came_again(writer, &counted, &progress);
+            self.skip(writer, skip);
+        }
+    }
+
+    /// Gives the samples of this writer whose turn it is.
+    pub(super) fn turn(&mut self, writer: Guid, now: Timestamp) {
+        let progress = self.profiler.progress(writer, now, graph!(self));
+        if let Some(progress) = progress {
+            let skip = self.payloads.turn(writer, &progress, now);
+            self.skip(writer, skip);
+        }
+    }
+
+    pub(super) fn skip(&mut self, writer: Guid, number: Option<u64>) {
+        if let Some(number) = number {
+            self.profiler.skip(writer, number);
+        }
+    }
+
+    /// Keeps the bytes of a sample that somebody wants and that was not counted yet.
+    pub(super) fn keep(&mut self, found: &Found<'_>) {
+        let writer = found.record.writer();
+        if self.payloads.wants_bytes(writer) {
+            let moved = self.wall_clock.model_record(&found.record);
+            let record = moved.as_ref().unwrap_or(&found.record);
+            let known = self.profiler.get(writer);
+            let Some(sample) = record.sample() else {
+                return;
+            };
+            let lacks = self.payloads.lacks(writer, sample.sequence_number());
+            if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
+                self.payloads.keep(sample, found.payload);
+            }
+        }
+    }
+
+    /// Tells the subscriptions which samples will not come.
+    pub(super) fn report_missing(&mut self) {
+        for missing in self.journal.take_missing() {
+            self.payloads.missing(&missing);
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! Writers that send without a known announcement: their cap and eviction.
+
+use std::ops::RangeInclusive;
+
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{Guid, Record, Timestamp};
+
+use super::{
+    ESTABLISHED_MESSAGES, EVICTABLE_AFTER, Measured, Profiler, RecordOutcome, UNDELIVERED,
+};
+use crate::journal::Journal;
+use crate::receivers::GraphView;
+use crate::writer::{Traits, Writer};
+
+/// What became of the unknown writers.
+#[derive(Debug, Default)]
+pub struct UnknownWriters {
+    /// To be metered from now on.
+    pub metered: Vec<Guid>,
+    /// Forgotten.
+    pub forgotten: Vec<Guid>,
+}
+
+impl Profiler {
+    /// Whether one of these writers sends without being announced.
+    #[must_use]
+    pub fn has_unknown_writer(&self, writers: RangeInclusive<Guid>) -> bool {
+        self.unknown_writers.range(writers).next().is_some()
+    }
+
+    /// Takes in a record of a writer nobody announced.
+    pub fn unknown_writer(
+        &mut self,
+        guid: Guid,
+        record: &Record,
+        journal: &mut Journal,
+        graph: GraphView<'_>,
+    ) -> RecordOutcome {
+        if !record.is_sample() || record.flags & UNDELIVERED != 0 {
+            return RecordOutcome::Unmeasured;
+        }
+        let now = Timestamp(record.time);
+        if self.unknown_writers.len() >= self.unknown_writer_limit
+            && !self.evict_unknown_writer(now, graph)
+        {
+            self.unknown_writer_evictions += 1;
+            return RecordOutcome::Unmeasured;
+        }
+        self.unknown_writers.insert(guid);
+        self.writers.insert(
+            guid,
+            Measured::new(Writer::new(guid, Traits::default()), None, now),
+        );
+        self.record(guid, record, journal, graph)
+    }
+
+    /// Forgets the unknown writer that has been silent longest, if it never was anybody.
+    fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
+        if now < self.search_after {
+            return false;
+        }
+        let evictable = self.writers.iter().filter(|(_, measured)| {
+            measured.topic.is_none()
+                && measured.writer.messages() < ESTABLISHED_MESSAGES
+                && measured.last_seen.0.saturating_add(EVICTABLE_AFTER) <= now.0
+        });
+        let oldest = evictable.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
+        let Some(guid) = oldest.map(|(guid, _)| *guid) else {
+            self.search_after = Timestamp(now.0.saturating_add(SECOND / 10));
+            return false;
+        };
+        self.unknown_writer_evictions += 1;
+        self.stop(guid, now, &mut Journal::default(), graph);
+        true
+    }
+}

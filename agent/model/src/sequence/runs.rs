@@ -1,0 +1,121 @@
+//! Which run of numbers is the writer's: the live one, or one that further datagrams confirm.
+
+use ros2probe_wire::Timestamp;
+
+use super::unconfirmed::{CONFIRMATIONS, Run};
+use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled, is_number};
+
+impl Sequence {
+    /// Looks at number and source time of a sample before anything else does: a writer that jumps,
+    /// or begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not
+    /// unconfirmed.
+    pub fn recognise(
+        &mut self,
+        number: u64,
+        source: Option<Timestamp>,
+        reach: u64,
+        now: Timestamp,
+    ) -> RunMembership {
+        if !is_number(number) {
+            return RunMembership::Live;
+        }
+        if self.is_unconfirmed(number, source, reach) {
+            let unconfirmed = self.unconfirmed.get_or_insert_default();
+            let (opens, new) = unconfirmed.note(number, now);
+            self.jumps += u64::from(opens);
+            if !unconfirmed.is_confirmed() {
+                return RunMembership::Unconfirmed { new };
+            }
+            let mut run = self.confirm();
+            run.numbers.retain(|(known, _)| *known != number);
+            if let Some(source) = source {
+                self.sourced(number, source);
+            }
+            return RunMembership::Confirmed(run);
+        }
+        if self.stale >= STALE && number < self.floor() {
+            self.restart(number);
+        }
+        if number >= self.next && self.started() {
+            self.followed = self.followed.saturating_add(1);
+            self.contradict();
+        }
+        if let Some(source) = source {
+            self.sourced(number, source);
+        }
+        RunMembership::Live
+    }
+
+    /// Whether a sample of this number and source time does not belong to the live run.
+    #[must_use]
+    pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
+        if !self.started() || !is_number(number) {
+            return false;
+        }
+        if number >= self.next {
+            return number - self.next > reach;
+        }
+        let newer = source.is_some_and(|source| {
+            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
+        });
+        // A writer that begins anew fills no gaps of the run before.
+        let unconfirmed = self.unconfirmed.as_ref();
+        let continues =
+            || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
+        // What came first may have been forged just as well; what lies less far below it is
+        // history.
+        let is_young = self.followed < CONFIRMATIONS;
+        newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
+    }
+
+    /// Marks a unconfirmed sample as whole. Returns whether that is new.
+    pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
+        let unconfirmed = self.unconfirmed.as_mut();
+        unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
+    }
+
+    /// Whether a unconfirmed sample came whole.
+    #[must_use]
+    pub fn has_unconfirmed(&self, number: u64) -> bool {
+        let unconfirmed = self.unconfirmed.as_ref();
+        unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
+    }
+
+    /// Takes in the samples of a run that is believed.
+    pub fn accept(&mut self, run: &Run, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+        for &(number, is_whole) in &run.numbers {
+            self.exists(number, now, settled);
+            if is_whole {
+                self.received.set(number);
+            }
+        }
+        let (start, end) = run.gap;
+        self.excuse(start, end);
+    }
+
+    /// The unconfirmed run is the writer's: the numbers jump there, or begin anew.
+    pub(super) fn confirm(&mut self) -> Run {
+        let unconfirmed = self.unconfirmed.take();
+        let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
+        let Some((first, _)) = run.numbers.first() else {
+            return run;
+        };
+        let jump = first.checked_sub(self.next);
+        // What was hardly seen before lost nothing that is far from it.
+        let most = match self.followed < CONFIRMATIONS {
+            true => FAR,
+            false => MAX_JUMP,
+        };
+        if jump.is_none_or(|jump| jump > most) {
+            self.restart(*first);
+        }
+        run
+    }
+
+    /// The live run went on.
+    pub(super) fn contradict(&mut self) {
+        if let Some(unconfirmed) = &mut self.unconfirmed {
+            unconfirmed.contradict();
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! HEARTBEAT, GAP and ACKNACK: which numbers exist, and which readers miss (RTPS 2.5, 8.3.8).
+
+use ros2probe_wire::Timestamp;
+
+use super::unconfirmed::Run;
+use super::{FAR, MAX_JUMP, REACH, Sequence, Settled};
+
+impl Sequence {
+    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up
+    /// to `last` exist.
+    pub fn heartbeat(
+        &mut self,
+        first: u64,
+        last: u64,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || first == 0 || first > last.saturating_add(1) {
+            return;
+        }
+        let next = last.saturating_add(1);
+        let (is_confirmed, run) = self.claim(next, REACH, now);
+        if let Some(run) = run {
+            self.accept(&run, now, settled);
+        }
+        if !is_confirmed {
+            return;
+        }
+        if next > self.next {
+            self.note_gap(self.next, next, now);
+            self.extend(next - 1, next, now, settled);
+        }
+        let available = first.min(self.next);
+        if available > self.available {
+            self.available = available;
+            self.withdrawn.get_or_insert((now, available));
+        }
+    }
+
+    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the
+    /// unconfirmed run that it confirms.
+    pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
+        let live = self.next;
+        let unconfirmed = self.unconfirmed.as_mut();
+        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
+            return (true, Some(self.confirm()));
+        }
+        let ahead = next.saturating_sub(live);
+        if ahead <= reach {
+            if next >= live {
+                self.contradict();
+            }
+            return (true, None);
+        }
+        let unconfirmed = self.unconfirmed.get_or_insert_default();
+        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
+            return (true, None);
+        }
+        self.jumps += 1;
+        (false, None)
+    }
+
+    /// Whether an ACKNACK acknowledges numbers that are not known to exist.
+    pub const fn refuses(&mut self, base: u64) -> bool {
+        let refuses = self.started() && base.saturating_sub(self.next) > FAR;
+        self.jumps += refuses as u64;
+        refuses
+    }
+
+    /// ACKNACK: the readers have all below `base`, also what was not seen here, except samples that
+    /// the writer had withdrawn before.
+    pub fn acknowledged(&mut self, base: u64) {
+        if self.started() {
+            self.excuse(self.available, base);
+            self.acknowledged = self.acknowledged.max(base);
+        }
+    }
+
+    /// GAP: `start..base` and some numbers from there on will never come.
+    pub fn gap(
+        &mut self,
+        start: u64,
+        base: u64,
+        set: impl Iterator<Item = u64>,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
+        if !self.started() || start == 0 || base < start {
+            return;
+        }
+        let ahead = base.saturating_sub(self.next);
+        if ahead > REACH {
+            self.jumps += 1;
+            if ahead <= MAX_JUMP {
+                self.unconfirmed
+                    .get_or_insert_default()
+                    .pass_over(start, base);
+            }
+            return;
+        }
+        let mut one = |sequence: &mut Self, start: u64, end: u64| {
+            if end > sequence.next {
+                if end - sequence.next > REACH {
+                    return;
+                }
+                sequence.extend(end - 1, end, now, settled);
+            }
+            sequence.excuse(start.max(sequence.settled), end);
+        };
+        one(self, start, base);
+        for number in set {
+            one(self, number, number.saturating_add(1));
+        }
+    }
+
+    /// ACKNACK: a reader asks for these again.
+    pub fn requested(&mut self, mut set: impl Iterator<Item = u64>) {
+        if self.gaps.is_empty() {
+            return;
+        }
+        let (Some(low), high) = (set.next(), set.last()) else {
+            return;
+        };
+        let high = high.unwrap_or(low);
+        for gap in &mut self.gaps {
+            gap.requested |= gap.start <= high && low < gap.end;
+        }
+    }
+
+    /// Nothing in `start..end` is a loss.
+    pub fn excuse(&mut self, start: u64, end: u64) {
+        let start = start.max(self.floor()).max(self.settled);
+        self.excused.set_all(start, end.min(self.next));
+    }
+}

@@ -1,0 +1,226 @@
+use ros2probe_wire::record::{guid_words, kind};
+use ros2probe_wire::{EntityId, GuidPrefix};
+
+use super::*;
+use ros2probe_wire::time::SECOND;
+
+const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
+
+fn reader(number: u8) -> Guid {
+    Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 4]))
+}
+
+fn data(number: u64, time: u64, flags: u16) -> Record {
+    Record {
+        kind: kind::DATA,
+        writer: guid_words(WRITER),
+        sequence_number: number,
+        time,
+        flags,
+        payload_len: 100,
+        interface: 2,
+        ..Record::default()
+    }
+}
+
+/// `count` of ten fragments.
+fn fragments(number: u64, start: u32, count: u32, time: u64, elapsed: u32) -> Record {
+    Record {
+        kind: kind::DATA_FRAG,
+        fragment_start: start,
+        fragments: count << 16 | 1000,
+        sample_size: 10_000,
+        elapsed,
+        source_timestamp: if start == 1 { 99 } else { 0 },
+        ..data(number, time, flag::OUTGOING)
+    }
+}
+
+fn acknack(reader: Guid, base: u64, time: u64) -> Record {
+    Record {
+        kind: kind::ACKNACK,
+        reader: guid_words(reader),
+        ..data(base, time, 0)
+    }
+}
+
+fn tracer() -> Tracer {
+    let mut tracer = Tracer::new(true);
+    tracer.restart(true);
+    tracer
+}
+
+fn description() -> WriterDescription {
+    WriterDescription {
+        domain_id: DomainId(0),
+        topic: "/points".into(),
+        message_type: "sensor_msgs/msg/PointCloud2".into(),
+        reliable: true,
+    }
+}
+
+fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
+    for record in records {
+        tracer.record(record, || Some((description(), ratio)));
+    }
+    tracer.take().spans
+}
+
+/// The same, and what time brings.
+fn take_all(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
+    let mut spans = take(tracer, records, ratio);
+    tracer.advance(Timestamp(SECOND));
+    spans.extend(tracer.take().spans);
+    spans
+}
+
+fn times(spans: &[Span]) -> Vec<(SpanStage, u64, u64)> {
+    let times = |span: &Span| (span.stage, span.begin.0, span.end.0);
+    spans.iter().map(times).collect()
+}
+
+#[test]
+fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_reader() {
+    let mut tracer = tracer();
+    let spans = take(
+        &mut tracer,
+        &[
+            fragments(5, 1, 4, 1_300, 300),
+            fragments(5, 9, 2, 1_800, 50),
+            fragments(5, 5, 4, 1_900, 40),
+            // Again, to another destination, and a copy that arrives on this host.
+            fragments(5, 1, 4, 2_000, 10),
+            data(5, 2_100, 0),
+            acknack(reader(1), 5, 2_200),
+            acknack(reader(1), 6, 2_300),
+            acknack(reader(1), 6, 2_400),
+            acknack(reader(2), 9, 2_500),
+        ],
+        1.0,
+    );
+    assert_eq!(
+        times(&spans),
+        [
+            (SpanStage::Send, 1_000, 1_900),
+            (SpanStage::Settle(reader(1)), 1_900, 2_300),
+            (SpanStage::Settle(reader(2)), 1_900, 2_500),
+        ]
+    );
+    let [sent, settled, ..] = spans.as_slice() else {
+        panic!()
+    };
+    assert_eq!(sent.message, settled.message);
+    assert_eq!(sent.message.trace_id, Message::identity(WRITER, 5));
+    assert_eq!((sent.message.size, sent.message.fragments), (10_000, 10));
+    assert_eq!(sent.message.source, RtpsTime(99));
+    assert_eq!(tracer.size().0, 1);
+    tracer.advance(Timestamp(1_900 + PATIENCE + 1));
+    assert_eq!(tracer.size(), (0, MAX_OPEN, 0));
+    assert_eq!(take(&mut tracer, &[acknack(reader(3), 9, 9_000)], 1.0), []);
+}
+
+#[test]
+fn where_it_only_arrives_it_is_received_in_the_same_trace() {
+    let arrives = [data(5, 10, flag::HOST), data(5, 11, flag::HOST)];
+    let received = take_all(&mut tracer(), &arrives, 1.0);
+    assert_eq!(times(&received), [(SpanStage::Receive, 10, 10)]);
+    let sent = take(&mut tracer(), &[data(5, 3, flag::OUTGOING)], 1.0);
+    let trace = |spans: &[Span]| spans.first().map(|span| span.message.trace_id);
+    assert_eq!(trace(&sent), trace(&received));
+    assert_eq!(take(&mut tracer(), &[acknack(reader(1), 9, 20)], 1.0), []);
+
+    let mut undirected = Tracer::new(false);
+    undirected.restart(true);
+    let spans = take(&mut undirected, &[data(5, 10, 0)], 1.0);
+    assert_eq!(times(&spans), [(SpanStage::Send, 10, 10)]);
+    let loopback = Record {
+        interface: LOOPBACK,
+        ..data(6, 10, 0)
+    };
+    assert_eq!(
+        times(&take(&mut tracer(), &[loopback], 1.0)),
+        [(SpanStage::Send, 10, 10)]
+    );
+}
+
+#[test]
+fn a_multicast_whose_local_copies_are_seen_first_is_sent() {
+    let mut tracer = tracer();
+    let records = [
+        data(5, 10, flag::HOST),
+        data(5, 11, flag::HOST | flag::OUTGOING),
+        data(6, 20, flag::HOST),
+        data(6, 21, flag::HOST | flag::OUTGOING),
+    ];
+    let spans = take_all(&mut tracer, &records, 1.0);
+    assert_eq!(
+        times(&spans),
+        [(SpanStage::Send, 11, 11), (SpanStage::Send, 21, 21)]
+    );
+    assert_eq!(tracer.size(), (2, MAX_OPEN, 0));
+}
+
+#[test]
+fn every_agent_samples_the_same_messages_and_as_many_as_asked() {
+    let records: Vec<Record> = (1..=20_000).map(|n| data(n, n, flag::OUTGOING)).collect();
+    let sampled = |ratio: f64| {
+        let mut tracer = tracer();
+        let mut numbers = Vec::new();
+        for part in records.chunks(1_000) {
+            let spans = take(&mut tracer, part, ratio);
+            numbers.extend(spans.iter().map(|span| span.message.sequence_number));
+        }
+        numbers
+    };
+    let tenth = sampled(0.1);
+    assert!((1_850..2_150).contains(&tenth.len()), "{}", tenth.len());
+    assert_eq!(tenth, sampled(0.1));
+    let fifth = sampled(0.2);
+    assert!(tenth.iter().all(|number| fifth.contains(number)));
+    assert_eq!(sampled(1.0).len(), records.len());
+    assert_eq!(sampled(0.0).len() + sampled(f64::NAN).len(), 0);
+}
+
+#[test]
+fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
+    let mut tracer = tracer();
+    for number in 1..=1_000 {
+        take(&mut tracer, &[fragments(number, 1, 1, number, 0)], 1.0);
+    }
+    assert!(tracer.size().0 <= MAX_UNDER_WAY && tracer.size().2 >= 900);
+    for number in 1_001..=3_000 {
+        take(&mut tracer, &[data(number, number, flag::OUTGOING)], 1.0);
+    }
+    assert!(tracer.size().0 <= MAX_UNDER_WAY + MAX_OPEN_OF_WRITER);
+    for number in 1..=20_u64 {
+        let other = Guid::new(GuidPrefix([number as u8; 12]), EntityId([0, 0, 9, 3]));
+        for sample in 1..=1_000 {
+            let record = Record {
+                writer: guid_words(other),
+                ..data(sample, SECOND, flag::OUTGOING)
+            };
+            tracer.record(&record, || Some((description(), 1.0)));
+        }
+    }
+    assert!(tracer.size().0 <= MAX_OPEN, "{:?}", tracer.size());
+    let taken = tracer.take();
+    assert_eq!(taken.spans.len(), MAX_FINISHED);
+    assert!(taken.lost > 10_000);
+    tracer.forget(WRITER);
+    tracer.advance(Timestamp(SECOND + PATIENCE + 1));
+    assert_eq!(tracer.size().0, 0);
+}
+
+#[test]
+fn nobody_is_asked_about_a_writer_twice() {
+    let mut tracer = tracer();
+    let mut asked = 0;
+    for number in 1..=3 {
+        tracer.record(&data(number, number, 0), || {
+            asked += 1;
+            // At first discovery does not know it.
+            (asked > 1).then(|| (description(), 0.0))
+        });
+    }
+    assert_eq!(asked, 2);
+}

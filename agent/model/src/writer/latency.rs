@@ -1,0 +1,49 @@
+//! Latencies of a writer's samples: since they were written, and since their header's stamp.
+
+use ros2probe_wire::{RtpsTime, Timestamp};
+
+use super::{HISTORY, Writer, seconds};
+use crate::header::{PLAUSIBLE, stamp_time};
+
+impl Writer {
+    pub(super) fn delays(
+        &mut self,
+        number: u64,
+        newest: bool,
+        (source, stamp): (RtpsTime, Option<(i32, u32)>),
+        (now, wall_clock): (Timestamp, Timestamp),
+    ) {
+        let source = source.timestamp();
+        if self.traits.keeps_history {
+            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < wall_clock.0);
+            let first = self.reception.sequence().first();
+            if !newest || number < first || number == first && old {
+                return;
+            }
+        }
+        let stamp = stamp
+            .filter(|_| self.traits.has_header)
+            .and_then(|stamp| stamp_time(stamp, wall_clock));
+        let mut negative = false;
+        if let Some(source) = source {
+            let delay = wall_clock.nanoseconds_since(source);
+            let is_plausible = source.0.abs_diff(wall_clock.0) <= PLAUSIBLE;
+            self.implausible_latency += u64::from(!is_plausible);
+            negative |= delay < 0;
+            if delay >= 0 && is_plausible {
+                self.source_latency.observe(seconds(delay));
+                let slot = self.tally.window.current(now);
+                slot.delayed += 1;
+                slot.delay += seconds(delay);
+            }
+        }
+        if let Some(stamp) = stamp {
+            let delay = wall_clock.nanoseconds_since(stamp);
+            negative |= delay < 0;
+            if delay >= 0 {
+                self.header_latency.observe(seconds(delay));
+            }
+        }
+        self.negative_latency += u64::from(negative);
+    }
+}

@@ -1,0 +1,179 @@
+//! A writer seen in shared memory, where polls miss messages.
+
+use ros2probe_wire::record::{Body, Sample, flag};
+use ros2probe_wire::{Record, Timestamp};
+
+use super::{Counted, MeasurementContext, Writer, reach, record_time, seconds};
+use crate::journal::{Journal, Missing};
+use crate::payloads::MissedReason;
+use crate::sampled::{Sampled, SampledUpdate, Seen};
+use crate::samples::Budget;
+
+impl Writer {
+    /// Leaves samples for the journal that were sent and not seen.
+    pub(super) fn leave_unseen(&mut self, journal: &mut Journal) {
+        let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
+        for (first, last) in unseen.into_iter().flatten() {
+            journal.leave_missing(Missing {
+                writer: self.guid,
+                first,
+                last,
+                reason: MissedReason::NotCaptured,
+            });
+        }
+    }
+
+    /// Whether it is of a sample that was under way when the sampled view ended.
+    pub(super) fn is_under_way(&self, sample: Sample<'_>) -> bool {
+        let (number, at) = (sample.sequence_number(), record_time(sample.record()));
+        self.sampled
+            .as_ref()
+            .is_some_and(|sampled| !sampled.is_current(at) && sampled.awaits(number))
+    }
+
+    pub(super) fn is_sampled(&self, now: Timestamp) -> bool {
+        let sampled = self.sampled.as_ref();
+        sampled.is_some_and(|sampled| sampled.is_current(now))
+    }
+
+    /// Takes in a record of a view in which what is missing may have been sent all the same.
+    pub(super) fn sampled_record(
+        &mut self,
+        record: &Record,
+        is_sampled: bool,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
+        let now = record_time(record);
+        let abandoned = match self.is_sampled(now) {
+            true => Vec::new(),
+            false => self.reception.abandon(),
+        };
+        self.tally.messages += abandoned.len() as u64;
+        let sampled = self
+            .sampled
+            .get_or_insert_with(|| Box::new(Sampled::new(now)));
+        sampled.take_over(&abandoned, self.reception.sequence().next(), now);
+        if is_sampled {
+            sampled.touch(now);
+        }
+        let reach = reach(record);
+        let sequence = self.reception.sequence_mut();
+        let told = match record.body() {
+            Body::Sample(sample) => {
+                let update = self.sampled_update(sample, reach, context.budget)?;
+                return self.sampled_sample(
+                    sample,
+                    &update,
+                    (now, context.wall_clock.wall_time(now)),
+                );
+            }
+            Body::Heartbeat(heartbeat) => {
+                self.traits.reliable = true;
+                sampled.exist(heartbeat.last(), reach, now, sequence)
+            }
+            Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
+            // The reader has all below.
+            Body::AckNack(acknack) => {
+                sampled.exist(acknack.base().saturating_sub(1), reach, now, sequence)
+            }
+            Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
+        };
+        self.tally.messages += told;
+        self.tally.window.current(now).messages += told;
+        None
+    }
+
+    /// What a sample, or a part of one, changes in the sampled view.
+    fn sampled_update(
+        &mut self,
+        sample: Sample<'_>,
+        reach: u64,
+        budget: &mut Budget,
+    ) -> Option<SampledUpdate> {
+        let sampled = self.sampled.as_mut()?;
+        let (number, now) = (sample.sequence_number(), record_time(sample.record()));
+        let source = sample.source_timestamp().timestamp();
+        let sequence = self.reception.sequence();
+        let unconfirmed = sequence.is_unconfirmed(number, source, reach);
+        let has = !unconfirmed && sampled.has(number, sequence.next());
+        let is_whole = match sample {
+            Sample::DataFrag(fragments) => {
+                !has && self.reception.assemble(fragments, unconfirmed, budget)
+            }
+            Sample::Data(_) => true,
+        };
+        let is_exact = sample.record().flags & flag::EXACT != 0;
+        let seen = match is_whole {
+            true => Seen::Whole,
+            // What is read in shared memory may come after what is seen in the process.
+            false if sample.is_end() && !is_exact => Seen::Tail,
+            false => Seen::Part,
+        };
+        let sequence = self.reception.sequence_mut();
+        Some(sampled.sample((number, seen, source), reach, now, sequence))
+    }
+
+    /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
+    /// it comes.
+    pub(super) fn catch_up(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
+        let is_whole = match sample {
+            Sample::Data(_) => true,
+            Sample::DataFrag(fragments) => {
+                self.reception.assemble(fragments, false, context.budget)
+            }
+        };
+        let seen = if is_whole { Seen::Whole } else { Seen::Part };
+        let number = sample.sequence_number();
+        let update = self.sampled.as_mut()?.catch_up(number, seen);
+        let now = record_time(sample.record());
+        self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
+    }
+
+    fn sampled_sample(
+        &mut self,
+        sample: Sample<'_>,
+        update: &SampledUpdate,
+        (now, wall_clock): (Timestamp, Timestamp),
+    ) -> Option<Counted> {
+        let (number, is_message) = (sample.sequence_number(), sample.is_message());
+        // Those that were not seen are taken for as large as the next one that was.
+        let disposals = u64::from(!is_message && update.samples > 0);
+        let messages = update.samples - disposals;
+        let bytes = u64::from(sample.size());
+        let told = (update.alike - disposals).saturating_mul(bytes);
+        self.tally.messages += messages;
+        self.tally.bytes = self.tally.bytes.saturating_add(told);
+        let slot = self.tally.window.current(now);
+        slot.messages += messages;
+        slot.bytes = slot.bytes.saturating_add(told);
+        if messages > 0 {
+            self.last_message = self.last_message.max(Some(now));
+        }
+        let sampled = self.sampled.as_mut()?;
+        let stamp = sampled.stamp(number, sample.header_stamp());
+        if let Some(interval) = update.interval {
+            self.interarrival.observe(seconds(interval));
+        }
+        let source = sample.source_timestamp();
+        if update.arrived && is_message {
+            self.delays(number, true, (source, stamp), (now, wall_clock));
+        }
+        if update.finished && is_message {
+            return Some(Counted {
+                number,
+                bytes,
+                source,
+                stamp: stamp.filter(|_| self.traits.has_header),
+                at: now,
+                began: now,
+                sampled: true,
+                unconfirmed: update.unconfirmed,
+            });
+        }
+        None
+    }
+}
