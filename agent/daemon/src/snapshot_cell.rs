@@ -1,7 +1,7 @@
 //! The latest snapshot, as the capture thread publishes it and surfaces read it.
 //!
 //! A reader takes the latest state and the writer replaces it: neither waits for the other. A reader
-//! may ask for a newer state and wait for it within its patience.
+//! may ask for a newer state and wait for it within its timeout.
 
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -128,9 +128,9 @@ impl SnapshotCell {
         &self.bell
     }
 
-    /// Asks for a newer state and waits for it, but no longer than `patience`: counters that a
+    /// Asks for a newer state and waits for it, but no longer than `timeout`: counters that a
     /// scrape reads should be those of its moment, or rates over short windows would be off.
-    pub async fn refresh(&self, patience: Duration) {
+    pub async fn refresh(&self, timeout: Duration) {
         let news = self.news.notified();
         if self.state.load().agent.finished {
             return;
@@ -138,7 +138,7 @@ impl SnapshotCell {
         self.asked.store(true, Ordering::Relaxed);
         self.bell.ring();
         // Late or not: the latest state is shown, with its age.
-        let _ = tokio::time::timeout(patience, news).await;
+        let _ = tokio::time::timeout(timeout, news).await;
     }
 
     /// Returns when a newer state is published, without asking for one.

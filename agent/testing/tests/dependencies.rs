@@ -27,8 +27,10 @@ const ALLOWED: &[(&str, &[&str])] = &[
         "daemon",
         &["wire", "model", "capture", "message", "bag", "api", "page"],
     ),
-    // The package is called ros2probe. `rp discover`, `rp doctor` and `rp top` use parts of the
-    // model and the capture beside the daemon.
+    // The package is called ros2probe. A running agent is asked through the API alone. What needs
+    // more: a replay within the process (`client/replay_agent.rs`) and `rp discover` (`ask.rs`)
+    // compose a capture and a model; `rp doctor` examines this host as the capture does; `rp bag
+    // record` (`client/samples.rs`) gives the daemon's recorder samples of the model.
     (
         "cli",
         &[
@@ -65,6 +67,8 @@ struct Workspace {
     names: BTreeMap<String, String>,
     /// Ids of normal dependencies by package id.
     dependencies: BTreeMap<String, Vec<String>>,
+    /// Names of normal dependencies that no feature leaves out, by package name.
+    required: BTreeMap<String, BTreeSet<String>>,
 }
 
 impl Workspace {
@@ -83,6 +87,18 @@ impl Workspace {
         let packages = metadata["packages"].as_array().unwrap().iter();
         let names: BTreeMap<_, _> = packages
             .map(|package| (text(&package["id"]), text(&package["name"])))
+            .collect();
+        let packages = metadata["packages"].as_array().unwrap().iter();
+        let required = packages
+            .map(|package| {
+                let all = package["dependencies"].as_array().unwrap().iter();
+                let required =
+                    all.filter(|each| each["kind"].is_null() && each["optional"] == false);
+                (
+                    text(&package["name"]),
+                    required.map(|each| text(&each["name"])).collect(),
+                )
+            })
             .collect();
         let members = metadata["workspace_members"].as_array().unwrap().iter();
         let ids = members
@@ -104,6 +120,7 @@ impl Workspace {
             ids,
             names,
             dependencies,
+            required,
         }
     }
 
@@ -172,6 +189,13 @@ fn the_model_is_built_without_input_output_or_configuration() {
             "ros2probe-model must not need {library}"
         );
     }
+}
+
+#[test]
+fn the_api_needs_serde_alone() {
+    let workspace = Workspace::read();
+    let required = &workspace.required["ros2probe-api"];
+    assert_eq!(*required, BTreeSet::from(["serde".to_owned()]));
 }
 
 #[test]

@@ -32,7 +32,7 @@ Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --h
 
 Examples:
   sudo rp doctor                        all of it
-  rp doctor --json | jq -r '.findings[] | select(.verdict == \"problem\").sentence'
+  rp doctor --json | jq -r '.findings[] | select(.severity == \"problem\").sentence'
   rp doctor --host robot2 --token-file ~/robot2.token
   rp doctor --replay robot.pcap.gz")]
 pub(crate) struct Doctor {

@@ -178,9 +178,9 @@ fn print(
         {
             let part = topics.iter().find(|(_, name)| *name == sample.topic);
             let part = part.and_then(|(part, _)| *part);
-            let told = echo.event(sample, &message_type, &payload, part);
-            eprint!("{}", visible_lines(&told.err));
-            output.write(&for_stdout(told.out.unwrap_or_default()))?;
+            let printed = echo.event(sample, &message_type, &payload, part);
+            eprint!("{}", visible_lines(&printed.err));
+            output.write(&for_stdout(printed.out.unwrap_or_default()))?;
         }
         Ok(StreamStatus::Open)
     })?;

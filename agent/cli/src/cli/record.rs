@@ -37,7 +37,7 @@ const SPACE: u8 = b' ';
 /// What ends a capture's recording that lacks something the capture holds.
 const INCOMPLETE: u8 = 3;
 /// How long an answer about announcements is waited for, and how old it may be.
-const GRAPH_PATIENCE: Duration = Duration::from_secs(2);
+const GRAPH_TIMEOUT: Duration = Duration::from_secs(2);
 const GRAPH_AGE: Duration = Duration::from_secs(1);
 
 /// `rp bag record`.
@@ -286,7 +286,7 @@ impl Record {
                 "Recording..."
             },
         );
-        let next = |patience: Duration| samples.next_within(patience);
+        let next = |timeout: Duration| samples.next_within(timeout);
         let (ended, broke) = record(recorder, next, &commands, |going| output.update(going));
         drop(keys);
         output.finish();
@@ -623,10 +623,10 @@ impl<'a> GraphCache<'a> {
     fn ask(&mut self) {
         let graph = self
             .agent
-            .get_within::<TopicList<'_>>("/topics?hidden=true", GRAPH_PATIENCE);
+            .get_within::<TopicList<'_>>("/topics?hidden=true", GRAPH_TIMEOUT);
         let participants = self
             .agent
-            .get_within::<ParticipantList<'_>>("/participants", GRAPH_PATIENCE);
+            .get_within::<ParticipantList<'_>>("/participants", GRAPH_TIMEOUT);
         let (Ok(graph), Ok(participants)) = (graph, participants) else {
             return;
         };

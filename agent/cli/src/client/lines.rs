@@ -69,18 +69,18 @@ impl<'a> Lines<'a> {
         agent.runtime.block_on(self.next_line())
     }
 
-    /// Waits for a line, but no longer than `patience`.
+    /// Waits for a line, but no longer than `longest`.
     ///
     /// # Errors
     /// As [`Self::line`].
-    pub fn line_within(&mut self, patience: Duration) -> Result<Next, ClientError> {
+    pub fn line_within(&mut self, longest: Duration) -> Result<Next, ClientError> {
         let agent = self.agent;
         agent.runtime.block_on(async {
-            match timeout(patience, self.next_line()).await {
+            match timeout(longest, self.next_line()).await {
                 Ok(line) => Ok(line?.map_or(Next::End, Next::Line)),
                 Err(_) => {
                     // What is left of the silence is shorter by that.
-                    self.waited += patience;
+                    self.waited += longest;
                     Ok(Next::Nothing)
                 }
             }

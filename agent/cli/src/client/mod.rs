@@ -38,7 +38,7 @@ pub use target::{InvalidEnvironment, Target};
 use transport::Transport;
 
 /// The longest wait for a whole answer: graphs of thousands of topics come within a second.
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 /// The longest silence of an agent: before its answer, within it, and in a stream of messages, which
 /// has a clock.
 const SILENCE: Duration = Duration::from_secs(5);
@@ -109,7 +109,7 @@ impl Agent {
     /// # Errors
     /// The agent is gone, refuses, or answers something else.
     pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
-        self.exchange(Method::GET, path, None, PATIENCE)
+        self.exchange(Method::GET, path, None, TIMEOUT)
     }
 
     /// As [`Self::get`], with control characters of all text escaped: names come from the network, and
@@ -123,16 +123,16 @@ impl Agent {
             .map_err(|source| self.transport.unreadable(path, source))
     }
 
-    /// As [`Self::get`], with an answer within `patience`.
+    /// As [`Self::get`], with an answer within `longest`.
     ///
     /// # Errors
     /// As [`Self::get`].
     pub fn get_within<T: DeserializeOwned>(
         &self,
         path: &str,
-        patience: Duration,
+        longest: Duration,
     ) -> Result<T, ClientError> {
-        self.exchange(Method::GET, path, None, patience)
+        self.exchange(Method::GET, path, None, longest)
     }
 
     /// Sends `body`.
@@ -144,7 +144,7 @@ impl Agent {
         path: &str,
         body: &B,
     ) -> Result<T, ClientError> {
-        self.exchange(Method::POST, path, Some(json(body)), PATIENCE)
+        self.exchange(Method::POST, path, Some(json(body)), TIMEOUT)
     }
 
     /// Puts `body` there.
@@ -156,7 +156,7 @@ impl Agent {
         path: &str,
         body: &B,
     ) -> Result<T, ClientError> {
-        self.exchange(Method::PUT, path, Some(json(body)), PATIENCE)
+        self.exchange(Method::PUT, path, Some(json(body)), TIMEOUT)
     }
 
     /// Removes what is there.
@@ -231,14 +231,14 @@ impl Agent {
         method: Method,
         path: &str,
         body: Option<Bytes>,
-        patience: Duration,
+        longest: Duration,
     ) -> Result<T, ClientError> {
         let answer = self.runtime.block_on(async {
             let exchange = async {
                 let answer = self.send(method, path, body).await?;
                 self.whole(path, answer).await
             };
-            let answer = timeout(patience, exchange).await;
+            let answer = timeout(longest, exchange).await;
             answer.unwrap_or_else(|_| Err(self.transport.slow()))
         })?;
         self.decoded(path, &answer)

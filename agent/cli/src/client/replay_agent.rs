@@ -29,7 +29,7 @@ const PIPE: usize = 1 << 20;
 /// A capture is read offline: what a live agent measures at once is no measure for it.
 const TOPICS: usize = 16_384;
 /// How long the end of a replay whose streams have ended is waited for.
-const PATIENCE: Duration = Duration::from_millis(500);
+const TIMEOUT: Duration = Duration::from_millis(500);
 
 /// How far a capture is replayed before anything is asked.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -192,9 +192,9 @@ impl ReplayAgent {
 
     /// How it ended; nothing while it goes on.
     pub(super) fn outcome(&self) -> Option<Outcome> {
-        let deadline = Instant::now() + PATIENCE;
+        let deadline = Instant::now() + TIMEOUT;
         while self.outcome.get().is_none() && Instant::now() < deadline {
-            std::thread::sleep(PATIENCE / 50);
+            std::thread::sleep(TIMEOUT / 50);
         }
         self.outcome.get().cloned()
     }

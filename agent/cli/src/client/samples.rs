@@ -65,9 +65,9 @@ impl<'a> Samples<'a> {
     ///
     /// # Errors
     /// The connection broke, or what comes cannot be read.
-    pub fn next_within(&mut self, patience: Duration) -> Result<NextItem, ClientError> {
+    pub fn next_within(&mut self, timeout: Duration) -> Result<NextItem, ClientError> {
         let agent = self.lines.agent();
-        let line = match self.lines.line_within(patience)? {
+        let line = match self.lines.line_within(timeout)? {
             Next::Line(line) => agent.decoded("/samples", &line)?,
             Next::Nothing => return Ok(NextItem::Pending),
             Next::End => return Ok(NextItem::Closed),

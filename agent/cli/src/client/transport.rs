@@ -26,7 +26,7 @@ const LOOPBACK: &str = "127.0.0.1:17401";
 /// Where an agent listens when only its host is named.
 const PORT: &str = "17401";
 /// The longest wait for a connection.
-const PATIENCE: Duration = Duration::from_secs(5);
+const TIMEOUT: Duration = Duration::from_secs(5);
 
 /// How an agent is reached.
 #[derive(Debug)]
@@ -206,7 +206,7 @@ impl fmt::Display for Transport {
 }
 
 async fn within<S>(connect: impl Future<Output = io::Result<S>>) -> io::Result<S> {
-    let connected = timeout(PATIENCE, connect).await;
+    let connected = timeout(TIMEOUT, connect).await;
     connected.unwrap_or_else(|_| Err(io::ErrorKind::TimedOut.into()))
 }
 

@@ -6,7 +6,7 @@
 //! as long as `ipfrag_time`. The kernel counts its own overhead, and gives twice what is asked for.
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::{Files, HostState, Unread};
 use ros2probe_api::measurement::Measurement;
 use ros2probe_api::topics::Topic;
@@ -130,27 +130,27 @@ fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
 }
 
 fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "receive", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "receive", severity, sentence);
     let (most, default) = (RECEIVE_MAX.read(files), RECEIVE_DEFAULT.read(files));
     let finding = match &most {
         Err(error) => {
             let sentence = format!("the maximum socket receive buffer is unknown: {error}");
-            report(Verdict::Unknown, sentence)
+            report(Severity::Unknown, sentence)
                 .remedy("sysctl net.core.rmem_max    # on the host itself")
         }
         Ok(most) => {
             let wanted = wanted(largest, MESSAGES_IN_BUFFER);
-            let (verdict, words) = match largest {
+            let (severity, words) = match largest {
                 None if *most >= wanted => (
-                    Verdict::Ok,
+                    Severity::Ok,
                     "enough for typical point clouds and images".to_owned(),
                 ),
                 None => (
-                    Verdict::Note,
+                    Severity::Note,
                     "point clouds and images of some MB need more".to_owned(),
                 ),
                 Some(largest) if *most >= largest.bytes.saturating_mul(MESSAGES_IN_BUFFER) => (
-                    Verdict::Ok,
+                    Severity::Ok,
                     format!(
                         "enough for two messages of {} ({})",
                         largest.topic,
@@ -158,7 +158,7 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                     ),
                 ),
                 Some(largest) => (
-                    Verdict::Warning,
+                    Severity::Warning,
                     format!(
                         "two messages of {} ({} each) do not fit: a busy subscriber loses a burst",
                         largest.topic,
@@ -167,8 +167,8 @@ fn receive(files: &Files, largest: Option<&Largest>) -> Finding {
                 ),
             };
             let sentence = format!("a socket may buffer {}: {words}", size(*most));
-            let finding = report(verdict, sentence);
-            if verdict == Verdict::Ok {
+            let finding = report(severity, sentence);
+            if severity == Severity::Ok {
                 finding
             } else {
                 finding.remedy(RECEIVE_MAX.set(wanted)).remedy(format!(
@@ -190,13 +190,13 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         } else {
             "reassembly_ipv6"
         };
-        let report = |verdict, sentence: String| Finding::new(AREA, check, verdict, sentence);
+        let report = |severity, sentence: String| Finding::new(AREA, check, severity, sentence);
         let Ok(most) = bytes else {
             // Without IPv6 there is none of it.
             if number == 0 {
                 let sentence = "the memory limit of IP reassembly is unknown".to_owned();
                 let finding =
-                    report(Verdict::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
+                    report(Severity::Unknown, sentence).remedy(format!("sysctl {}", memory.0));
                 findings.push(memory.show(finding, &bytes));
             }
             continue;
@@ -217,9 +217,9 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
                 );
                 report(
                     if number == 0 {
-                        Verdict::Note
+                        Severity::Note
                     } else {
-                        Verdict::Ok
+                        Severity::Ok
                     },
                     sentence,
                 )
@@ -227,7 +227,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
                 .remedy(time.set(3))
             }
             _ => report(
-                Verdict::Ok,
+                Severity::Ok,
                 format!("reassembly of {version} may use {}", size(most)),
             ),
         };
@@ -254,10 +254,10 @@ fn lost(
         ratio(count(topic), received)
     };
     let worst = lossy.iter().map(|topic| ratio(topic)).fold(0.0, f64::max);
-    let verdict = if worst >= MANY {
-        Verdict::Problem
+    let severity = if worst >= MANY {
+        Severity::Problem
     } else {
-        Verdict::Warning
+        Severity::Warning
     };
     let named: Vec<_> = lossy
         .iter()
@@ -273,7 +273,7 @@ fn lost(
         .collect();
     let sum: u64 = lossy.iter().map(|topic| count(topic)).sum();
     let sentence = format!("{sum} messages were lost {place}: {}", named.join(", "));
-    let finding = Finding::new(AREA, check, verdict, sentence);
+    let finding = Finding::new(AREA, check, severity, sentence);
     let finding = finding.seen(sum.to_string(), "GET /topics received");
     Some(helped(finding))
 }
@@ -360,7 +360,7 @@ mod tests {
     fn what_a_point_cloud_takes_is_computed() {
         let findings = found(&USUALLY, CLOUD);
         let receive = find(&findings, "receive");
-        assert_eq!(receive.verdict, Verdict::Warning);
+        assert_eq!(receive.severity, Severity::Warning);
         assert!(
             receive.sentence.contains("/points (2.7 MB each)"),
             "{}",
@@ -373,7 +373,7 @@ mod tests {
                 .starts_with("sudo sysctl -w net.core.rmem_max=6291456")
         );
         let reassembly = find(&findings, "reassembly");
-        assert_eq!(reassembly.verdict, Verdict::Note);
+        assert_eq!(reassembly.severity, Severity::Note);
         assert!(
             reassembly.remedies[0]
                 .line
@@ -385,8 +385,8 @@ mod tests {
         enough[0].1 = "8388608";
         enough[2].1 = "134217728";
         let findings = found(&enough, CLOUD);
-        assert_eq!(find(&findings, "receive").verdict, Verdict::Ok);
-        assert_eq!(find(&findings, "reassembly").verdict, Verdict::Ok);
+        assert_eq!(find(&findings, "receive").severity, Severity::Ok);
+        assert_eq!(find(&findings, "reassembly").severity, Severity::Ok);
     }
 
     #[test]
@@ -395,11 +395,11 @@ mod tests {
             r#"{"name":"/imu","publishers":[{"measurement":{"messages":10,"bytes":3200}}]}"#;
         let findings = found(&USUALLY, small);
         assert!(
-            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            findings.iter().all(|each| each.severity == Severity::Ok),
             "{findings:?}"
         );
         let findings = found(&USUALLY, "");
-        assert_eq!(find(&findings, "receive").verdict, Verdict::Note);
+        assert_eq!(find(&findings, "receive").severity, Severity::Note);
         assert!(
             find(&findings, "receive").remedies[0]
                 .line
@@ -416,10 +416,10 @@ mod tests {
             )
         };
         let findings = found(&USUALLY, &topic(2));
-        assert_eq!(find(&findings, "socket_losses").verdict, Verdict::Warning);
+        assert_eq!(find(&findings, "socket_losses").severity, Severity::Warning);
         let findings = found(&USUALLY, &topic(50));
         let lost = find(&findings, "socket_losses");
-        assert_eq!(lost.verdict, Verdict::Problem);
+        assert_eq!(lost.severity, Severity::Problem);
         assert!(
             lost.sentence.contains("/points 50 (4.8 %)"),
             "{}",
@@ -440,7 +440,7 @@ mod tests {
         let findings = check(&host, None);
         assert_eq!(findings.len(), 2);
         for finding in findings {
-            assert_eq!(finding.verdict, Verdict::Unknown);
+            assert_eq!(finding.severity, Severity::Unknown);
             assert!(
                 finding.remedies[0].line.starts_with("sysctl net."),
                 "{finding:?}"

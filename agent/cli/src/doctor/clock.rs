@@ -1,6 +1,6 @@
 //! The clock: whether times of this host may be compared with those of others.
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 
 const AREA: Area = Area::Clock;
@@ -21,14 +21,15 @@ const COARSE: i64 = 10_000;
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let keepers = keepers(host);
-    let report = |verdict, sentence: String| Finding::new(AREA, "synchronised", verdict, sentence);
+    let report =
+        |severity, sentence: String| Finding::new(AREA, "synchronised", severity, sentence);
     let kept = match keepers.as_slice() {
         [] => "no NTP/PTP service found".to_owned(),
         names => format!("kept by {}", names.join(", ")),
     };
     let finding = match &host.clock {
         Err(error) => report(
-            Verdict::Unknown,
+            Severity::Unknown,
             format!("the kernel does not report whether the clock is synchronised; {kept}"),
         )
         .seen(error, "adjtimex(2)")
@@ -43,7 +44,7 @@ pub fn check(host: &HostState) -> Vec<Finding> {
                     "the clock is not synchronised ({kept}): latency within this host is right; \
                      between hosts it is off by the difference of their clocks"
                 );
-                report(Verdict::Warning, sentence).remedy(
+                report(Severity::Warning, sentence).remedy(
                     "sudo apt install chrony    # on every host; for microseconds: linuxptp",
                 )
             } else if state.maximum_error > COARSE && state.estimated_error > COARSE {
@@ -51,14 +52,14 @@ pub fn check(host: &HostState) -> Vec<Finding> {
                     "the clock is synchronised to {estimated} ms ({kept}): shorter latencies \
                      between hosts are not meaningful"
                 );
-                report(Verdict::Note, sentence)
+                report(Severity::Note, sentence)
                     .remedy("chronyc tracking    # or ptp, for microseconds")
             } else {
                 let sentence = format!(
                     "the clock is synchronised, estimated error {estimated} ms, at most {maximum} ms \
                      ({kept})"
                 );
-                report(Verdict::Ok, sentence)
+                report(Severity::Ok, sentence)
             };
             finding.seen(
                 format!(
@@ -124,7 +125,7 @@ mod tests {
     #[test]
     fn a_good_clock_is_said_with_its_error_and_its_keeper() {
         let good = found(Ok(state(true, 120, 3_400)));
-        assert_eq!(good.verdict, Verdict::Ok);
+        assert_eq!(good.severity, Severity::Ok);
         assert_eq!(
             good.sentence,
             "the clock is synchronised, estimated error 0.12 ms, at most 3.40 ms (kept by chronyd)"
@@ -134,12 +135,12 @@ mod tests {
     #[test]
     fn a_coarse_a_free_and_an_unknown_clock_are_told_apart() {
         assert_eq!(
-            found(Ok(state(true, 50_000, 90_000))).verdict,
-            Verdict::Note
+            found(Ok(state(true, 50_000, 90_000))).severity,
+            Severity::Note
         );
-        assert_eq!(found(Ok(state(false, 0, 0))).verdict, Verdict::Warning);
+        assert_eq!(found(Ok(state(false, 0, 0))).severity, Severity::Warning);
         let unknown = found(Err("not permitted".to_owned()));
-        assert_eq!(unknown.verdict, Verdict::Unknown);
+        assert_eq!(unknown.severity, Severity::Unknown);
         assert!(!unknown.remedies.is_empty());
     }
 }

@@ -5,7 +5,7 @@ use serde::Serialize;
 /// How one thing is, from good to bad.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Verdict {
+pub enum Severity {
     /// As it should be.
     Ok,
     /// Good to know: what will not be shown, and by what choice.
@@ -52,7 +52,8 @@ pub struct Finding {
     /// The check's name, the same on every host.
     pub check: &'static str,
     /// How it is.
-    pub verdict: Verdict,
+    #[serde(rename = "verdict")]
+    pub severity: Severity,
     /// In plain words.
     pub sentence: String,
     /// What that rests on.
@@ -113,7 +114,7 @@ impl Area {
     }
 }
 
-impl Verdict {
+impl Severity {
     /// All, from bad to good.
     pub const ALL: [Self; 5] = [
         Self::Problem,
@@ -141,13 +142,13 @@ impl Finding {
     pub fn new(
         area: Area,
         check: &'static str,
-        verdict: Verdict,
+        severity: Severity,
         sentence: impl Into<String>,
     ) -> Self {
         Self {
             area,
             check,
-            verdict,
+            severity,
             sentence: sentence.into(),
             evidence: Vec::new(),
             remedies: Vec::new(),

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
 
@@ -36,14 +36,14 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
 }
 
 fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: usize) -> Finding {
-    let report = |verdict, sentence: String| {
-        let finding = Finding::new(AREA, "participants", verdict, sentence);
+    let report = |severity, sentence: String| {
+        let finding = Finding::new(AREA, "participants", severity, sentence);
         finding.seen(participants.len().to_string(), "GET /participants")
     };
     if participants.is_empty() {
         return match processes {
             Some(count @ 1..) => report(
-                Verdict::Problem,
+                Severity::Problem,
                 format!(
                     "the agent sees no participant, but {count} ROS processes are running here"
                 ),
@@ -52,7 +52,7 @@ fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: 
                 "rp doctor --verbose    # source, control group and interfaces above; RMW below",
             ),
             _ => report(
-                Verdict::Note,
+                Severity::Note,
                 "the agent sees no participant: no DDS traffic".to_owned(),
             ),
         };
@@ -73,7 +73,7 @@ fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: 
         })
         .collect();
     report(
-        Verdict::Ok,
+        Severity::Ok,
         format!(
             "{}, {}; {}",
             many(participants.len(), "participant"),
@@ -108,7 +108,7 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
          when a second one starts",
         domains.join(", ")
     );
-    let finding = Finding::new(AREA, "alone", Verdict::Note, sentence);
+    let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
     Some(finding.remedy("sudo rp discover --all    # asks it for them: a few packets"))
 }
@@ -128,7 +128,7 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
         "the topics or nodes of {} are unknown: they were announced once, before the agent started",
         many(count, "participant")
     );
-    let finding = Finding::new(AREA, "names", Verdict::Warning, sentence);
+    let finding = Finding::new(AREA, "names", Severity::Warning, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants");
     Some(finding.remedy(
         "sudo rp discover --all --dry-run    # then without --dry-run: a few packets to each",
@@ -144,7 +144,7 @@ fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
         "{} restored from saved state, awaiting confirmation; removed when the lease ends",
         many(count, "participant")
     );
-    let finding = Finding::new(AREA, "restored", Verdict::Note, sentence);
+    let finding = Finding::new(AREA, "restored", Severity::Note, sentence);
     Some(finding.seen(count.to_string(), "GET /participants"))
 }
 
@@ -157,7 +157,7 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
             "{count} writers are active whose announcement was missed; their topics are unknown"
         ),
     };
-    let finding = Finding::new(AREA, "unknown_writers", Verdict::Warning, sentence);
+    let finding = Finding::new(AREA, "unknown_writers", Severity::Warning, sentence);
     let finding = finding.seen(
         format!("{}: {}", writers.len(), first.guid),
         "GET /participants",
@@ -175,7 +175,7 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
          discovery is encrypted",
         many(count, "participant")
     );
-    let finding = Finding::new(AREA, "secured", Verdict::Note, sentence);
+    let finding = Finding::new(AREA, "secured", Severity::Note, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants secured");
     Some(
         finding.elsewhere(
@@ -198,7 +198,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     };
     let mut findings = Vec::new();
     let mut report = |check,
-                      verdict,
+                      severity,
                       topics: &[&Topic<'_>],
                       (verb, words): (&str, &str),
                       remedy: Option<Helps>| {
@@ -211,7 +211,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
             many(topics.len(), "topic"),
             listed(topics)
         );
-        let finding = Finding::new(AREA, check, verdict, sentence);
+        let finding = Finding::new(AREA, check, severity, sentence);
         let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
         findings.push(match remedy {
             Some(helps) => helps(finding),
@@ -221,12 +221,12 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     let shared = of("shared_memory");
     if able("shared_memory_exact") {
         let words = ("use", "only Fast DDS shared memory; every message is seen");
-        report("shared_memory", Verdict::Ok, &shared, words, None);
+        report("shared_memory", Severity::Ok, &shared, words, None);
     } else if able("shared_memory") {
         let words = ("use", "only Fast DDS shared memory, which is sampled");
         report(
             "shared_memory",
-            Verdict::Note,
+            Severity::Note,
             &shared,
             words,
             Some(|finding| {
@@ -239,7 +239,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
         let words = ("use", "only Fast DDS shared memory, which is not read");
         report(
             "shared_memory",
-            Verdict::Warning,
+            Severity::Warning,
             &shared,
             words,
             Some(|finding| finding.configure("capture: {shm: {mode: auto}}")),
@@ -247,7 +247,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     }
     report(
         "data_sharing",
-        Verdict::Warning,
+        Severity::Warning,
         &of("data_sharing"),
         ("use", "only Fast DDS data sharing and cannot be observed"),
         Some(|finding| {
@@ -258,7 +258,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     );
     report(
         "iceoryx",
-        Verdict::Warning,
+        Severity::Warning,
         &of("iceoryx"),
         ("use", "only iceoryx and cannot be observed"),
         Some(|finding| {
@@ -269,7 +269,7 @@ fn aside(answers: &Answers) -> Vec<Finding> {
     );
     report(
         "same_process",
-        Verdict::Note,
+        Severity::Note,
         &of("same_process"),
         ("stay", "inside one process and cannot be observed"),
         None,
@@ -316,7 +316,7 @@ fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
             return None;
         }
         let sentence = format!("{} {words}: {}", many(found.len(), "topic"), listed(&found));
-        let finding = Finding::new(AREA, kind, Verdict::Warning, sentence);
+        let finding = Finding::new(AREA, kind, Severity::Warning, sentence);
         let finding = finding.seen(found.len().to_string(), "GET /topics diagnoses");
         Some(finding.remedy(remedy))
     };
@@ -357,9 +357,9 @@ mod tests {
         }
     }
 
-    fn verdict(findings: &[Finding], check: &str) -> Option<Verdict> {
+    fn severity(findings: &[Finding], check: &str) -> Option<Severity> {
         let found = findings.iter().find(|finding| finding.check == check);
-        found.map(|finding| finding.verdict)
+        found.map(|finding| finding.severity)
     }
 
     const WELL: &str = r#"{"participants":[
@@ -380,9 +380,9 @@ mod tests {
     #[test]
     fn nobody_is_a_problem_only_where_somebody_should_be() {
         let nobody = answers("{}", "", "");
-        assert_eq!(check(&nobody, None)[0].verdict, Verdict::Note);
-        assert_eq!(check(&nobody, Some(0))[0].verdict, Verdict::Note);
-        assert_eq!(check(&nobody, Some(2))[0].verdict, Verdict::Problem);
+        assert_eq!(check(&nobody, None)[0].severity, Severity::Note);
+        assert_eq!(check(&nobody, Some(0))[0].severity, Severity::Note);
+        assert_eq!(check(&nobody, Some(2))[0].severity, Severity::Problem);
     }
 
     #[test]
@@ -402,12 +402,12 @@ mod tests {
             names.sentence
         );
         assert!(names.remedies[0].line.starts_with("sudo rp discover --all"));
-        assert_eq!(verdict(&findings, "restored"), Some(Verdict::Note));
+        assert_eq!(severity(&findings, "restored"), Some(Severity::Note));
         assert_eq!(
-            verdict(&findings, "unknown_writers"),
-            Some(Verdict::Warning)
+            severity(&findings, "unknown_writers"),
+            Some(Severity::Warning)
         );
-        assert_eq!(verdict(&findings, "secured"), Some(Verdict::Note));
+        assert_eq!(severity(&findings, "secured"), Some(Severity::Note));
     }
 
     #[test]
@@ -428,14 +428,14 @@ mod tests {
                 .line
                 .starts_with("sudo rp discover --all")
         );
-        assert_eq!(verdict(&lone, "names"), None);
+        assert_eq!(severity(&lone, "names"), None);
         // With a second one in its domain its announcements were missed.
         let two = of(r#"{"domain_id":3},{"domain_id":3,"writers":2}"#);
-        assert_eq!(verdict(&two, "alone"), None);
-        assert_eq!(verdict(&two, "names"), Some(Verdict::Warning));
+        assert_eq!(severity(&two, "alone"), None);
+        assert_eq!(severity(&two, "names"), Some(Severity::Warning));
         // Known, or not to be known.
-        assert_eq!(verdict(&of(r#"{"readers":1}"#), "alone"), None);
-        assert_eq!(verdict(&of(r#"{"secured":true}"#), "alone"), None);
+        assert_eq!(severity(&of(r#"{"readers":1}"#), "alone"), None);
+        assert_eq!(severity(&of(r#"{"secured":true}"#), "alone"), None);
         let apart = of(r#"{"domain_id":1},{"domain_id":2}"#);
         let finding = apart.iter().find(|each| each.check == "alone").unwrap();
         assert!(finding.sentence.contains("in domains 1, 2 and"));
@@ -450,23 +450,26 @@ mod tests {
             check(&answers(WELL, &topic("/x", &pairs(way)), ability), None)
         };
         let way = "shared_memory";
-        assert_eq!(verdict(&of(way, ""), way), Some(Verdict::Warning));
-        assert_eq!(verdict(&of(way, "shared_memory"), way), Some(Verdict::Note));
+        assert_eq!(severity(&of(way, ""), way), Some(Severity::Warning));
         assert_eq!(
-            verdict(&of(way, "shared_memory_exact"), way),
-            Some(Verdict::Ok)
+            severity(&of(way, "shared_memory"), way),
+            Some(Severity::Note)
         );
         assert_eq!(
-            verdict(&of("data_sharing", ""), "data_sharing"),
-            Some(Verdict::Warning)
+            severity(&of(way, "shared_memory_exact"), way),
+            Some(Severity::Ok)
         );
         assert_eq!(
-            verdict(&of("iceoryx", ""), "iceoryx"),
-            Some(Verdict::Warning)
+            severity(&of("data_sharing", ""), "data_sharing"),
+            Some(Severity::Warning)
         );
         assert_eq!(
-            verdict(&of("same_process", ""), "same_process"),
-            Some(Verdict::Note)
+            severity(&of("iceoryx", ""), "iceoryx"),
+            Some(Severity::Warning)
+        );
+        assert_eq!(
+            severity(&of("same_process", ""), "same_process"),
+            Some(Severity::Note)
         );
         // One pair over the network is enough for the messages to be counted.
         let both = format!("{},{}", pairs("network"), pairs("data_sharing"));

@@ -1,6 +1,6 @@
 //! Network interfaces: what DDS can use them for, and which of them the agent looks at.
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use ros2probe_api::health::Health;
 
@@ -33,7 +33,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
         Ok(names) => names,
         Err(error) => {
             let sentence = "the network interfaces are unknown";
-            let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
+            let finding = Finding::new(AREA, "interfaces", Severity::Unknown, sentence);
             return vec![finding.seen(error.to_string(), PLACE).remedy("ip link")];
         }
     };
@@ -51,7 +51,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
             "no multicast on {names}: participants there are found only if configured \
              (ROS_STATIC_PEERS, a discovery server)"
         );
-        let mut finding = Finding::new(AREA, "multicast", Verdict::Warning, sentence);
+        let mut finding = Finding::new(AREA, "multicast", Severity::Warning, sentence);
         for each in mute.iter().take(LISTED) {
             finding = finding
                 .seen(
@@ -69,7 +69,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
              fragment loses the message",
             list(&small)
         );
-        let mut finding = Finding::new(AREA, "mtu", Verdict::Note, sentence);
+        let mut finding = Finding::new(AREA, "mtu", Severity::Note, sentence);
         for each in small.iter().take(LISTED) {
             let from = format!("{PLACE}/{}/mtu", each.name);
             finding = finding.seen(each.mtu.to_string(), from);
@@ -101,7 +101,7 @@ fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
             .filter(|name| *name != "bonding_masters")
     })?;
     let sentence = "/sys shows the interfaces of another network namespace";
-    let finding = Finding::new(AREA, "interfaces", Verdict::Unknown, sentence);
+    let finding = Finding::new(AREA, "interfaces", Severity::Unknown, sentence);
     let finding = finding.seen(
         format!("{foreign} in one of them"),
         format!("{OWN}, {PLACE}"),
@@ -136,13 +136,13 @@ impl Interface {
 }
 
 fn overview(all: &[Interface]) -> Finding {
-    let report = |verdict, sentence: String| {
-        Finding::new(AREA, "interfaces", verdict, sentence).seen(all.len().to_string(), PLACE)
+    let report = |severity, sentence: String| {
+        Finding::new(AREA, "interfaces", severity, sentence).seen(all.len().to_string(), PLACE)
     };
     let used: Vec<_> = all.iter().filter(|each| each.is_used()).collect();
     if used.is_empty() {
         let sentence = "only loopback is up: only this host's own nodes are visible";
-        return report(Verdict::Note, sentence.to_owned()).remedy("ip link");
+        return report(Severity::Note, sentence.to_owned()).remedy("ip link");
     }
     let named: Vec<_> = used
         .iter()
@@ -155,7 +155,7 @@ fn overview(all: &[Interface]) -> Finding {
     } else {
         String::new()
     };
-    let mut finding = report(Verdict::Ok, format!("up: {}{more}", named.join(", ")));
+    let mut finding = report(Severity::Ok, format!("up: {}{more}", named.join(", ")));
     let down: Vec<_> = all.iter().filter(|each| !each.is_up()).collect();
     if !down.is_empty() {
         finding.sentence = format!("{}; down: {}", finding.sentence, list(&down));
@@ -165,26 +165,26 @@ fn overview(all: &[Interface]) -> Finding {
 
 fn loopback(all: &[Interface], localhost: bool) -> Option<Finding> {
     let loopback = all.iter().find(|each| each.flags & LOOPBACK != 0)?;
-    let report = |verdict, sentence: String| {
+    let report = |severity, sentence: String| {
         let from = format!("{PLACE}/{}/flags", loopback.name);
-        Finding::new(AREA, "loopback", verdict, sentence)
+        Finding::new(AREA, "loopback", severity, sentence)
             .seen(format!("{:#x}", loopback.flags), from)
     };
     let name = &loopback.name;
     Some(if loopback.flags & UP == 0 {
         let sentence = format!("{name} is down: nodes of this host cannot use it");
-        report(Verdict::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
+        report(Severity::Problem, sentence).remedy(format!("sudo ip link set {name} up"))
     } else if loopback.flags & MULTICAST != 0 {
-        report(Verdict::Ok, format!("{name} is up, with multicast"))
+        report(Severity::Ok, format!("{name} is up, with multicast"))
     } else if localhost {
         let sentence = format!(
             "{name} has no multicast, and nodes here are limited to it: some implementations \
              (Cyclone DDS) then discover each other only by probing unicast addresses"
         );
-        report(Verdict::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
+        report(Severity::Note, sentence).remedy(format!("sudo ip link set {name} multicast on"))
     } else {
         report(
-            Verdict::Ok,
+            Severity::Ok,
             format!("{name} is up, without multicast (the default)"),
         )
     })
@@ -210,7 +210,7 @@ fn looked_at(agent: &Health) -> Finding {
         }
         _ => format!("the agent sees RTPS packets on {}", join(&names)),
     };
-    let mut finding = Finding::new(AREA, "looked_at", Verdict::Ok, sentence);
+    let mut finding = Finding::new(AREA, "looked_at", Severity::Ok, sentence);
     for each in agent.interfaces.iter().take(LISTED) {
         if let Some(packets) = each.packets {
             let value = format!("{}: {packets} packets", each.interface);
@@ -259,9 +259,9 @@ mod tests {
         check(&host, None, localhost)
     }
 
-    fn verdict(findings: &[Finding], check: &str) -> Option<Verdict> {
+    fn severity(findings: &[Finding], check: &str) -> Option<Severity> {
         let found = findings.iter().find(|finding| finding.check == check);
-        found.map(|finding| finding.verdict)
+        found.map(|finding| finding.severity)
     }
 
     const LO: (&str, &str, &str, &str) = ("lo", "0x9", "65536", "unknown");
@@ -271,7 +271,7 @@ mod tests {
     fn an_ordinary_host_is_fine() {
         let findings = found(&[LO, ETH, ("docker0", "0x1003", "1500", "down")], false);
         assert!(
-            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            findings.iter().all(|each| each.severity == Severity::Ok),
             "{findings:?}"
         );
         assert_eq!(findings[0].sentence, "up: eth0 (MTU 1500); down: docker0");
@@ -284,33 +284,33 @@ mod tests {
             .iter()
             .find(|each| each.check == "multicast")
             .unwrap();
-        assert_eq!(finding.verdict, Verdict::Warning);
+        assert_eq!(finding.severity, Severity::Warning);
         assert_eq!(
             finding.remedies[0].line,
             "sudo ip link set tun0 multicast on"
         );
-        assert_eq!(verdict(&found(&[LO, ETH], false), "multicast"), None);
+        assert_eq!(severity(&found(&[LO, ETH], false), "multicast"), None);
     }
 
     #[test]
     fn loopback_matters_to_those_who_are_limited_to_it() {
         assert_eq!(
-            verdict(&found(&[LO, ETH], false), "loopback"),
-            Some(Verdict::Ok)
+            severity(&found(&[LO, ETH], false), "loopback"),
+            Some(Severity::Ok)
         );
         assert_eq!(
-            verdict(&found(&[LO, ETH], true), "loopback"),
-            Some(Verdict::Note)
+            severity(&found(&[LO, ETH], true), "loopback"),
+            Some(Severity::Note)
         );
         let with = ("lo", "0x1009", "65536", "unknown");
         assert_eq!(
-            verdict(&found(&[with, ETH], true), "loopback"),
-            Some(Verdict::Ok)
+            severity(&found(&[with, ETH], true), "loopback"),
+            Some(Severity::Ok)
         );
         let down = ("lo", "0x8", "65536", "down");
         assert_eq!(
-            verdict(&found(&[down, ETH], false), "loopback"),
-            Some(Verdict::Problem)
+            severity(&found(&[down, ETH], false), "loopback"),
+            Some(Severity::Problem)
         );
     }
 
@@ -321,34 +321,34 @@ mod tests {
             let mut files = vec![(OWN, table)];
             files.extend(interfaces);
             let (_directory, host) = host(&files);
-            verdict(&check(&host, None, false), "interfaces")
+            severity(&check(&host, None, false), "interfaces")
         };
         let lo = ("/sys/class/net/lo/flags", "0x9");
         let eth = ("/sys/class/net/eth9/flags", "0x1003");
         let up = ("/sys/class/net/eth9/operstate", "up");
         let bonding = ("/sys/class/net/bonding_masters", "");
-        assert_eq!(of(&[lo, eth, up]), Some(Verdict::Ok));
-        assert_eq!(of(&[lo, eth, up, bonding]), Some(Verdict::Ok));
-        assert_eq!(of(&[lo]), Some(Verdict::Unknown));
+        assert_eq!(of(&[lo, eth, up]), Some(Severity::Ok));
+        assert_eq!(of(&[lo, eth, up, bonding]), Some(Severity::Ok));
+        assert_eq!(of(&[lo]), Some(Severity::Unknown));
         let other = ("/sys/class/net/eth0/flags", "0x1003");
-        assert_eq!(of(&[lo, eth, up, other]), Some(Verdict::Unknown));
+        assert_eq!(of(&[lo, eth, up, other]), Some(Severity::Unknown));
     }
 
     #[test]
     fn a_host_alone_and_a_tunnel_of_small_packets_are_noted() {
         assert_eq!(
-            verdict(&found(&[LO], false), "interfaces"),
-            Some(Verdict::Note)
+            severity(&found(&[LO], false), "interfaces"),
+            Some(Severity::Note)
         );
         let tunnel = ("wg0", "0x10d1", "1280", "unknown");
         assert_eq!(
-            verdict(&found(&[LO, tunnel], false), "mtu"),
-            Some(Verdict::Note)
+            severity(&found(&[LO, tunnel], false), "mtu"),
+            Some(Severity::Note)
         );
         let (_directory, host) = host(&[]);
         assert_eq!(
-            verdict(&check(&host, None, false), "interfaces"),
-            Some(Verdict::Unknown)
+            severity(&check(&host, None, false), "interfaces"),
+            Some(Severity::Unknown)
         );
     }
 

@@ -1,7 +1,7 @@
 //! What the kernel has of what the agent can use: its version, its types, its compiler, control
 //! groups. What of the hooks really works is tried or asked for in `visibility`.
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
 use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
 
@@ -41,20 +41,20 @@ pub fn check(host: &HostState) -> Vec<Finding> {
 }
 
 fn version(release: &Result<String, Unread>) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "version", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "version", severity, sentence);
     match release {
-        Err(error) => report(Verdict::Unknown, "the kernel version is unknown".into())
+        Err(error) => report(Severity::Unknown, "the kernel version is unknown".into())
             .seen(error.to_string(), RELEASE)
             .remedy("uname -r"),
         Ok(text) => match parse(text) {
-            Some(own) if own >= OLDEST => report(Verdict::Ok, format!("Linux {text}")),
+            Some(own) if own >= OLDEST => report(Severity::Ok, format!("Linux {text}")),
             Some(_) => report(
-                Verdict::Problem,
+                Severity::Problem,
                 format!("Linux {text} is too old: live capture needs 5.10 or newer"),
             )
             .remedy("rp run --replay FILE    # a capture from tcpdump works on any kernel"),
             None => report(
-                Verdict::Unknown,
+                Severity::Unknown,
                 format!("Linux `{text}`: version not recognised"),
             ),
         }
@@ -67,57 +67,56 @@ fn types(host: &HostState) -> Finding {
         return Finding::new(
             AREA,
             "types",
-            Verdict::Ok,
+            Severity::Ok,
             "kernel type information (BTF) is available",
         )
         .seen("there", TYPES);
     }
     let sentence = "the kernel has no type information (BTF): socket owners and messages lost in \
         reassembly are unknown";
-    Finding::new(AREA, "types", Verdict::Warning, sentence)
+    Finding::new(AREA, "types", Severity::Warning, sentence)
         .seen("not there", TYPES)
         .elsewhere("CONFIG_DEBUG_INFO_BTF=y    # in the kernel's configuration")
 }
 
 fn compiler(host: &HostState) -> Finding {
-    let report = |verdict, sentence| Finding::new(AREA, "jit", verdict, sentence);
+    let report = |severity, sentence| Finding::new(AREA, "jit", severity, sentence);
     match host.files.number::<u32>(COMPILER) {
         Ok(0) => report(
-            Verdict::Warning,
+            Severity::Warning,
             "BPF programs are interpreted: each packet costs several times as much",
         )
         .seen("0", COMPILER)
         .remedy("sudo sysctl -w net.core.bpf_jit_enable=1"),
-        Ok(value) => {
-            report(Verdict::Ok, "BPF programs are compiled (JIT)").seen(value.to_string(), COMPILER)
-        }
+        Ok(value) => report(Severity::Ok, "BPF programs are compiled (JIT)")
+            .seen(value.to_string(), COMPILER),
         // Shown in the first network namespace only.
         Err(Unread::Missing) => report(
-            Verdict::Ok,
+            Severity::Ok,
             "BPF JIT status is not visible inside a container",
         )
         .seen("not there", COMPILER),
-        Err(error) => report(Verdict::Unknown, "the BPF JIT status is not readable")
+        Err(error) => report(Severity::Unknown, "the BPF JIT status is not readable")
             .seen(error.to_string(), COMPILER)
             .remedy("sudo sysctl net.core.bpf_jit_enable"),
     }
 }
 
 fn unprivileged(host: &HostState) -> Finding {
-    let report = |verdict, sentence| Finding::new(AREA, "unprivileged_bpf", verdict, sentence);
+    let report = |severity, sentence| Finding::new(AREA, "unprivileged_bpf", severity, sentence);
     match host.files.number::<u32>(UNPRIVILEGED) {
         Ok(0) => report(
-            Verdict::Note,
+            Severity::Note,
             "any user may load BPF programs; the agent does not need this",
         )
         .seen("0", UNPRIVILEGED)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
         Ok(value) => report(
-            Verdict::Ok,
+            Severity::Ok,
             "unprivileged BPF is disabled; loading needs CAP_BPF",
         )
         .seen(value.to_string(), UNPRIVILEGED),
-        Err(error) => report(Verdict::Ok, "loading BPF programs needs CAP_BPF")
+        Err(error) => report(Severity::Ok, "loading BPF programs needs CAP_BPF")
             .seen(error.to_string(), UNPRIVILEGED),
     }
 }
@@ -125,21 +124,21 @@ fn unprivileged(host: &HostState) -> Finding {
 fn lockdown(host: &HostState) -> Option<Finding> {
     let text = host.files.text(LOCKDOWN).ok()?;
     let mode = text.split_once('[')?.1.split_once(']')?.0.to_owned();
-    let (verdict, sentence) = match mode.as_str() {
+    let (severity, sentence) = match mode.as_str() {
         "confidentiality" => (
-            Verdict::Warning,
+            Severity::Warning,
             "the kernel is locked down for confidentiality: BPF programs may not read its \
              memory, so socket owners and causes of loss are unknown",
         ),
-        "none" => (Verdict::Ok, "the kernel is not locked down"),
+        "none" => (Severity::Ok, "the kernel is not locked down"),
         _ => (
-            Verdict::Ok,
+            Severity::Ok,
             "the kernel is locked down for integrity, which does not restrict the agent",
         ),
     };
-    let finding = Finding::new(AREA, "lockdown", verdict, sentence).seen(text, LOCKDOWN);
-    Some(match verdict {
-        Verdict::Warning => {
+    let finding = Finding::new(AREA, "lockdown", severity, sentence).seen(text, LOCKDOWN);
+    Some(match severity {
+        Severity::Warning => {
             finding.elsewhere("lockdown=integrity    # on the kernel's command line")
         }
         _ => finding,
@@ -147,31 +146,31 @@ fn lockdown(host: &HostState) -> Option<Finding> {
 }
 
 fn control_groups(host: &HostState) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "cgroup", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "cgroup", severity, sentence);
     let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
     let Some(point) = topmost(&mounts) else {
         let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
             only, not sockets";
-        return report(Verdict::Warning, sentence.to_owned())
+        return report(Severity::Warning, sentence.to_owned())
             .seen("no cgroup2", MOUNTS)
             .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
     };
     let point = point.display().to_string();
     match Cgroup::open(&host.files.path(&point)) {
         Ok(group) if group.is_whole_host() => {
-            report(Verdict::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
+            report(Severity::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
         }
         Ok(_) => report(
-            Verdict::Note,
+            Severity::Note,
             format!("{point} shows only part of the cgroup hierarchy: sockets of other \
                 containers are not visible"),
         )
         .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
         Err(CgroupError::Open { source, .. }) => report(
-            Verdict::Unknown,
+            Severity::Unknown,
             format!("the cgroup hierarchy at {point} cannot be opened: {source}"),
         ),
-        Err(error) => report(Verdict::Warning, error.to_string()),
+        Err(error) => report(Severity::Warning, error.to_string()),
     }
     .seen(point, MOUNTS)
 }
@@ -182,13 +181,13 @@ fn pages(host: &HostState) -> Finding {
         4 | 16 | 64 => Finding::new(
             AREA,
             "pages",
-            Verdict::Ok,
+            Severity::Ok,
             format!("pages of {kibibytes} KiB"),
         ),
         _ => Finding::new(
             AREA,
             "pages",
-            Verdict::Unknown,
+            Severity::Unknown,
             format!("pages of {kibibytes} KiB: untested"),
         ),
     };
@@ -197,20 +196,20 @@ fn pages(host: &HostState) -> Finding {
 
 /// Of kernels that charge BPF maps to it.
 fn locked_memory(host: &HostState) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "memlock", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "memlock", severity, sentence);
     let limits = host.files.text(LIMITS).unwrap_or_default();
     let line = limits
         .lines()
         .find_map(|line| line.strip_prefix("Max locked memory"));
     let soft = line.and_then(|line| line.split_whitespace().next());
     let finding = match soft {
-        Some("unlimited") => report(Verdict::Ok, "locked memory is not limited".to_owned()),
+        Some("unlimited") => report(Severity::Ok, "locked memory is not limited".to_owned()),
         Some(soft) if soft.parse().is_ok_and(|soft: u64| soft >= LOCKED_BYTES) => report(
-            Verdict::Ok,
+            Severity::Ok,
             format!("{soft} bytes may be locked, enough for the agent"),
         ),
         Some(soft) => report(
-            Verdict::Problem,
+            Severity::Problem,
             format!(
                 "this kernel counts BPF maps as locked memory, but only {soft} bytes may be \
                  locked here"
@@ -218,7 +217,7 @@ fn locked_memory(host: &HostState) -> Finding {
         )
         .remedy("ulimit -l unlimited    # the unit has LimitMEMLOCK=infinity"),
         None => report(
-            Verdict::Unknown,
+            Severity::Unknown,
             "the limit of locked memory is unknown".to_owned(),
         ),
     };
@@ -248,7 +247,7 @@ mod tests {
         ),
     ];
 
-    fn verdicts(changes: &[(&str, &str)]) -> Vec<(&'static str, Verdict)> {
+    fn severities(changes: &[(&str, &str)]) -> Vec<(&'static str, Severity)> {
         let mut files: Vec<_> = GOOD.into();
         files.push(("/sys/fs/cgroup/cgroup.controllers", ""));
         files.retain(|(path, _)| changes.iter().all(|(changed, _)| changed != path));
@@ -257,29 +256,29 @@ mod tests {
         let findings = check(&host);
         for finding in &findings {
             assert!(!finding.evidence.is_empty(), "{finding:?}");
-            let is_bad = finding.verdict > Verdict::Unknown;
+            let is_bad = finding.severity > Severity::Unknown;
             assert!(!is_bad || !finding.remedies.is_empty(), "{finding:?}");
         }
         findings
             .iter()
-            .map(|each| (each.check, each.verdict))
+            .map(|each| (each.check, each.severity))
             .collect()
     }
 
     #[track_caller]
-    fn gives(change: (&str, &str), check: &'static str, verdict: Verdict) {
-        let found = verdicts(&[change]);
-        assert!(found.contains(&(check, verdict)), "{found:?}");
+    fn gives(change: (&str, &str), check: &'static str, severity: Severity) {
+        let found = severities(&[change]);
+        assert!(found.contains(&(check, severity)), "{found:?}");
     }
 
     #[test]
     fn a_new_kernel_with_everything_is_fine() {
-        let found = verdicts(&[]);
+        let found = severities(&[]);
         assert!(
-            found.iter().all(|(check, verdict)| match *check {
+            found.iter().all(|(check, severity)| match *check {
                 // A directory of a test is not the topmost group.
-                "cgroup" => *verdict == Verdict::Note,
-                _ => *verdict == Verdict::Ok,
+                "cgroup" => *severity == Severity::Note,
+                _ => *severity == Severity::Ok,
             }),
             "{found:?}"
         );
@@ -288,25 +287,25 @@ mod tests {
 
     #[test]
     fn what_a_kernel_lacks_is_said() {
-        gives((RELEASE, "5.4.0-42"), "version", Verdict::Problem);
-        gives((RELEASE, "5.10.120-tegra"), "version", Verdict::Ok);
-        gives((RELEASE, "new"), "version", Verdict::Unknown);
-        gives((RELEASE, "gone"), "version", Verdict::Unknown);
-        gives((TYPES, "gone"), "types", Verdict::Warning);
-        gives((COMPILER, "0"), "jit", Verdict::Warning);
-        gives((COMPILER, "gone"), "jit", Verdict::Ok);
-        gives((UNPRIVILEGED, "0"), "unprivileged_bpf", Verdict::Note);
+        gives((RELEASE, "5.4.0-42"), "version", Severity::Problem);
+        gives((RELEASE, "5.10.120-tegra"), "version", Severity::Ok);
+        gives((RELEASE, "new"), "version", Severity::Unknown);
+        gives((RELEASE, "gone"), "version", Severity::Unknown);
+        gives((TYPES, "gone"), "types", Severity::Warning);
+        gives((COMPILER, "0"), "jit", Severity::Warning);
+        gives((COMPILER, "gone"), "jit", Severity::Ok);
+        gives((UNPRIVILEGED, "0"), "unprivileged_bpf", Severity::Note);
         let locked = "none integrity [confidentiality]";
-        gives((LOCKDOWN, locked), "lockdown", Verdict::Warning);
+        gives((LOCKDOWN, locked), "lockdown", Severity::Warning);
         gives(
             (LOCKDOWN, "none [integrity] confidentiality"),
             "lockdown",
-            Verdict::Ok,
+            Severity::Ok,
         );
         gives(
             (MOUNTS, "24 18 0:22 / /sys/fs/cgroup rw - cgroup cgroup rw"),
             "cgroup",
-            Verdict::Warning,
+            Severity::Warning,
         );
     }
 
@@ -314,18 +313,18 @@ mod tests {
     fn locked_memory_matters_to_kernels_that_charge_it() {
         let limit =
             |value: &str| format!("Max locked memory         {value}    {value}    bytes\n");
-        for (release, limit, verdict) in [
-            ("5.10.0", limit("65536"), Some(Verdict::Problem)),
-            ("5.10.0", limit("unlimited"), Some(Verdict::Ok)),
-            ("5.10.0", limit("134217728"), Some(Verdict::Ok)),
-            ("5.10.0", String::new(), Some(Verdict::Unknown)),
+        for (release, limit, severity) in [
+            ("5.10.0", limit("65536"), Some(Severity::Problem)),
+            ("5.10.0", limit("unlimited"), Some(Severity::Ok)),
+            ("5.10.0", limit("134217728"), Some(Severity::Ok)),
+            ("5.10.0", String::new(), Some(Severity::Unknown)),
             ("5.11.0", limit("65536"), None),
         ] {
-            let found = verdicts(&[(RELEASE, release), (LIMITS, &limit)]);
+            let found = severities(&[(RELEASE, release), (LIMITS, &limit)]);
             let found = found.iter().find(|(check, _)| *check == "memlock");
             assert_eq!(
-                found.map(|(_, verdict)| *verdict),
-                verdict,
+                found.map(|(_, severity)| *severity),
+                severity,
                 "{release} {limit}"
             );
         }
@@ -334,14 +333,14 @@ mod tests {
     #[test]
     fn pages_of_another_size_are_not_known() {
         let (_directory, mut host) = host(&[]);
-        for (bytes, verdict) in [
-            (4096, Verdict::Ok),
-            (16384, Verdict::Ok),
-            (65536, Verdict::Ok),
-            (8192, Verdict::Unknown),
+        for (bytes, severity) in [
+            (4096, Severity::Ok),
+            (16384, Severity::Ok),
+            (65536, Severity::Ok),
+            (8192, Severity::Unknown),
         ] {
             host.page_bytes = bytes;
-            assert_eq!(pages(&host).verdict, verdict);
+            assert_eq!(pages(&host).severity, severity);
         }
     }
 }

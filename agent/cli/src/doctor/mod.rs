@@ -129,7 +129,7 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
 mod tests {
     use super::host_state::tests::host;
     use super::*;
-    use finding::{Area, Verdict};
+    use finding::{Area, Severity};
 
     fn areas(report: &Report) -> Vec<Area> {
         let mut areas: Vec<_> = report.findings.iter().map(|finding| finding.area).collect();
@@ -158,7 +158,7 @@ mod tests {
             report
                 .findings
                 .iter()
-                .any(|each| each.verdict == Verdict::Unknown)
+                .any(|each| each.severity == Severity::Unknown)
         );
         for finding in &report.findings {
             assert!(!finding.evidence.is_empty(), "{finding:?}");
@@ -179,7 +179,7 @@ mod tests {
         let tried = report
             .findings
             .iter()
-            .any(|each| each.check == "source" && each.verdict == Verdict::Unknown);
+            .any(|each| each.check == "source" && each.severity == Severity::Unknown);
         assert!(!tried, "{report:?}");
     }
 

@@ -2,7 +2,7 @@
 //! capabilities are needed is `crate::privilege`'s to say.
 
 use super::answers::Answers;
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use ros2probe_api::health::Health;
 use ros2probe_daemon::config::{CaptureSettings, ExactChoice, ShmMode};
@@ -49,17 +49,17 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         1..=8 => held.join(", "),
         count => format!("{count} capabilities"),
     };
-    let report = |verdict, sentence: String| {
-        Finding::new(AREA, "capabilities", verdict, sentence).seen(&held, "CapEff, this process")
+    let report = |severity, sentence: String| {
+        Finding::new(AREA, "capabilities", severity, sentence).seen(&held, "CapEff, this process")
     };
     match privilege::missing(host.capabilities, settings) {
-        None => report(Verdict::Ok, "this shell may capture".to_owned()),
+        None => report(Severity::Ok, "this shell may capture".to_owned()),
         Some(_) if is_running => report(
-            Verdict::Ok,
+            Severity::Ok,
             "this shell may not capture; the running agent does".to_owned(),
         ),
         Some(missing) => report(
-            Verdict::Note,
+            Severity::Note,
             format!("this shell may not capture: it lacks {}", missing.needs()),
         )
         .remedy("sudo rp run    # or the service ros2probe")
@@ -72,17 +72,17 @@ fn of_agent(health: &Health) -> Finding {
         [] => "no capabilities".to_owned(),
         held => held.join(", "),
     };
-    let report = |verdict, sentence: String| {
-        let finding = Finding::new(AREA, "agent_capabilities", verdict, sentence);
+    let report = |severity, sentence: String| {
+        let finding = Finding::new(AREA, "agent_capabilities", severity, sentence);
         finding.seen(&held, "GET /health capabilities")
     };
     if let Some(reason) = &health.unfiltered_reason {
         let sentence =
             format!("the agent kept {held}, but its system calls are not filtered: {reason}");
-        return report(Verdict::Note, sentence);
+        return report(Severity::Note, sentence);
     }
     report(
-        Verdict::Ok,
+        Severity::Ok,
         format!("the agent kept {held} and dropped the rest"),
     )
 }
@@ -103,7 +103,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
         return None;
     }
     let sentence = "ROS runs in containers here, but the agent may not read their shared memory";
-    let finding = Finding::new(AREA, "containers", Verdict::Warning, sentence);
+    let finding = Finding::new(AREA, "containers", Severity::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
     Some(finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_PTRACE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
@@ -121,7 +121,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     }
     let missing = missing.join(" and ");
     let sentence = format!("capture.shm.exact needs {missing}, which this shell lacks");
-    let finding = Finding::new(AREA, "probes", Verdict::Note, sentence);
+    let finding = Finding::new(AREA, "probes", Severity::Note, sentence);
     let finding = finding.seen(&missing, "CapEff, this process");
     Some(finding.elsewhere(
         "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open, with systemctl edit ros2probe",
@@ -145,7 +145,7 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     if !host.files.exists(SYSTEMD) {
         return None;
     }
-    let report = |verdict, sentence| Finding::new(AREA, "unit", verdict, sentence);
+    let report = |severity, sentence| Finding::new(AREA, "unit", severity, sentence);
     let installed = UNITS
         .iter()
         .find(|place| host.files.exists(&format!("{place}/{UNIT}")));
@@ -153,10 +153,10 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
         return Some(
             match is_answering {
                 true => report(
-                    Verdict::Note,
+                    Severity::Note,
                     "the agent was started by hand: no service is installed to restart it",
                 ),
-                false => report(Verdict::Note, "the service ros2probe is not installed"),
+                false => report(Severity::Note, "the service ros2probe is not installed"),
             }
             .seen(
                 "not there",
@@ -172,19 +172,19 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     });
     let is_enabled = std::fs::symlink_metadata(host.files.path(ENABLED)).is_ok();
     let finding = match (is_running, is_enabled) {
-        (true, true) => report(Verdict::Ok, "the service ros2probe is running and enabled"),
+        (true, true) => report(Severity::Ok, "the service ros2probe is running and enabled"),
         (true, false) => report(
-            Verdict::Note,
+            Severity::Note,
             "the service ros2probe is running but not enabled at boot",
         )
         .remedy("sudo systemctl enable ros2probe"),
         (false, true) => report(
-            Verdict::Problem,
+            Severity::Problem,
             "the service ros2probe is enabled but not running",
         )
         .remedy("systemctl status ros2probe; journalctl -u ros2probe -b"),
         (false, false) => report(
-            Verdict::Note,
+            Severity::Note,
             "the service ros2probe is installed but not running",
         )
         .remedy("sudo systemctl enable --now ros2probe"),
@@ -217,14 +217,14 @@ mod tests {
     fn the_service_is_told_in_each_of_its_states() {
         let of = |files: &[(&str, &str)]| {
             let (_directory, host) = host(files);
-            unit(&host, false).map(|finding| finding.verdict)
+            unit(&host, false).map(|finding| finding.severity)
         };
         assert_eq!(of(&[]), None);
-        assert_eq!(of(&[BOOTED]), Some(Verdict::Note));
-        assert_eq!(of(&[BOOTED, INSTALLED]), Some(Verdict::Note));
-        assert_eq!(of(&[BOOTED, INSTALLED, ON]), Some(Verdict::Problem));
-        assert_eq!(of(&[BOOTED, INSTALLED, ON, RUNNING]), Some(Verdict::Ok));
-        assert_eq!(of(&[BOOTED, INSTALLED, RUNNING]), Some(Verdict::Note));
+        assert_eq!(of(&[BOOTED]), Some(Severity::Note));
+        assert_eq!(of(&[BOOTED, INSTALLED]), Some(Severity::Note));
+        assert_eq!(of(&[BOOTED, INSTALLED, ON]), Some(Severity::Problem));
+        assert_eq!(of(&[BOOTED, INSTALLED, ON, RUNNING]), Some(Severity::Ok));
+        assert_eq!(of(&[BOOTED, INSTALLED, RUNNING]), Some(Severity::Note));
     }
 
     #[test]
@@ -232,7 +232,7 @@ mod tests {
         let (_directory, mut host) = host(&[]);
         let settings = Config::default().capture;
         let finding = own(&host, &settings, false);
-        assert_eq!(finding.verdict, Verdict::Note);
+        assert_eq!(finding.severity, Severity::Note);
         assert!(
             finding.sentence.contains("CAP_NET_ADMIN"),
             "{}",
@@ -244,9 +244,9 @@ mod tests {
                 .iter()
                 .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
-        assert_eq!(own(&host, &settings, true).verdict, Verdict::Ok);
+        assert_eq!(own(&host, &settings, true).severity, Severity::Ok);
         host.capabilities = CapabilitySet::SYS_ADMIN | CapabilitySet::NET_ADMIN;
-        assert_eq!(own(&host, &settings, false).verdict, Verdict::Ok);
+        assert_eq!(own(&host, &settings, false).severity, Severity::Ok);
     }
 
     #[test]
@@ -257,11 +257,11 @@ mod tests {
             ..Health::default()
         };
         let kept = of_agent(&health(&["CAP_SYS_PTRACE"], None));
-        assert_eq!(kept.verdict, Verdict::Ok);
+        assert_eq!(kept.severity, Severity::Ok);
         assert!(kept.sentence.contains("kept CAP_SYS_PTRACE"));
-        assert_eq!(of_agent(&health(&[], None)).verdict, Verdict::Ok);
+        assert_eq!(of_agent(&health(&[], None)).severity, Severity::Ok);
         let open = of_agent(&health(&[], Some("no filters here")));
-        assert_eq!(open.verdict, Verdict::Note);
+        assert_eq!(open.severity, Severity::Note);
         assert!(open.sentence.ends_with(": no filters here"));
     }
 
@@ -295,6 +295,6 @@ mod tests {
         let mut settings = Config::default().capture;
         assert_eq!(probes(&host, &settings), None);
         settings.shm.exact = ExactChoice::Uprobe;
-        assert_eq!(probes(&host, &settings).unwrap().verdict, Verdict::Note);
+        assert_eq!(probes(&host, &settings).unwrap().severity, Severity::Note);
     }
 }

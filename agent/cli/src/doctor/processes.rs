@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread, base_name};
 use super::variables::{Range, Variables};
 use ros2probe_api::participants::ParticipantList;
@@ -156,12 +156,12 @@ impl Processes {
             count => format!("{count} processes"),
         };
         let sentence = format!("{which} cannot be inspected; skipped");
-        let verdict = if is_root {
-            Verdict::Note
+        let severity = if is_root {
+            Severity::Note
         } else {
-            Verdict::Unknown
+            Severity::Unknown
         };
-        let finding = Finding::new(AREA, "closed", verdict, sentence);
+        let finding = Finding::new(AREA, "closed", severity, sentence);
         let finding = finding.seen("not permitted", "/proc/<pid>/maps, /proc/<pid>/environ");
         Some(match is_root {
             true => finding,
@@ -170,13 +170,14 @@ impl Processes {
     }
 
     fn overview(&self) -> Finding {
-        let report = |verdict, sentence: String| Finding::new(AREA, "processes", verdict, sentence);
+        let report =
+            |severity, sentence: String| Finding::new(AREA, "processes", severity, sentence);
         let Some(first) = self.found.first() else {
             let sentence = "no ROS process was found on this host";
-            return report(Verdict::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
+            return report(Severity::Note, sentence.to_owned()).seen("0", "/proc/<pid>/maps");
         };
         let mut finding = report(
-            Verdict::Ok,
+            Severity::Ok,
             match self.found.len() {
                 1 => format!("1 ROS process: {}", first.name()),
                 count => format!("{count} ROS processes"),
@@ -222,7 +223,7 @@ impl Processes {
             .map(|(key, group)| format!("{key}: {}", names(group)))
             .collect();
         let sentence = format!("{consequence}; {}", named.join("; "));
-        let mut finding = Finding::new(AREA, check, Verdict::Warning, sentence);
+        let mut finding = Finding::new(AREA, check, Severity::Warning, sentence);
         for (key, group) in &groups {
             let from = group.iter().map(|process| process.id.to_string());
             let from: Vec<_> = from.collect();
@@ -246,7 +247,7 @@ impl Processes {
             "this shell uses domain {own}, all ROS processes use {}: its tools will not find them",
             listed.join(", ")
         );
-        let finding = Finding::new(AREA, "shell_domain", Verdict::Warning, sentence);
+        let finding = Finding::new(AREA, "shell_domain", Severity::Warning, sentence);
         let finding = finding.seen(own.to_string(), "ROS_DOMAIN_ID, this shell");
         Some(finding.remedy(format!("export ROS_DOMAIN_ID={first}")))
     }
@@ -524,14 +525,14 @@ mod tests {
         assert_eq!(closed(&[]).unseen(false), None);
         let finding = closed(&[3, 4]).unseen(false).unwrap();
         assert_eq!(
-            (finding.verdict, finding.remedies.len()),
-            (Verdict::Unknown, 1)
+            (finding.severity, finding.remedies.len()),
+            (Severity::Unknown, 1)
         );
         assert!(finding.sentence.starts_with("2 processes "));
         let finding = closed(&[3]).unseen(true).unwrap();
         assert_eq!(
-            (finding.verdict, finding.remedies.len()),
-            (Verdict::Note, 0)
+            (finding.severity, finding.remedies.len()),
+            (Severity::Note, 0)
         );
     }
 

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::finding::{Finding, Verdict};
+use super::finding::{Finding, Severity};
 use ros2probe_daemon::escape::visible;
 
 /// A report.
@@ -12,8 +12,9 @@ pub struct Report {
     pub version: &'static str,
     /// Whom it is about: a host, an agent elsewhere, a capture.
     pub subject: String,
-    /// The worst verdict of all.
-    pub verdict: Verdict,
+    /// The worst severity of all.
+    #[serde(rename = "verdict")]
+    pub severity: Severity,
     /// By area, in the order in which they are printed.
     pub findings: Vec<Finding>,
 }
@@ -22,11 +23,11 @@ impl Report {
     /// About `subject`.
     #[must_use]
     pub fn new(subject: impl Into<String>, findings: Vec<Finding>) -> Self {
-        let worst = findings.iter().map(|finding| finding.verdict).max();
+        let worst = findings.iter().map(|finding| finding.severity).max();
         Self {
             version: env!("CARGO_PKG_VERSION"),
             subject: subject.into(),
-            verdict: worst.unwrap_or(Verdict::Ok),
+            severity: worst.unwrap_or(Severity::Ok),
             findings,
         }
     }
@@ -34,23 +35,26 @@ impl Report {
     /// Something is broken.
     #[must_use]
     pub fn has_problems(&self) -> bool {
-        self.verdict == Verdict::Problem
+        self.severity == Severity::Problem
     }
 
-    /// How many of each verdict.
+    /// How many of each severity.
     #[must_use]
     pub fn headline(&self) -> String {
-        let count = |verdict: Verdict| {
-            let of_it = self.findings.iter().filter(|each| each.verdict == verdict);
-            match (of_it.count(), verdict) {
+        let count = |severity: Severity| {
+            let of_it = self
+                .findings
+                .iter()
+                .filter(|each| each.severity == severity);
+            match (of_it.count(), severity) {
                 (0, _) => None,
-                (count, Verdict::Ok | Verdict::Unknown) | (count @ 1, _) => {
-                    Some(format!("{count} {}", verdict.label()))
+                (count, Severity::Ok | Severity::Unknown) | (count @ 1, _) => {
+                    Some(format!("{count} {}", severity.label()))
                 }
-                (count, _) => Some(format!("{count} {}s", verdict.label())),
+                (count, _) => Some(format!("{count} {}s", severity.label())),
             }
         };
-        let counts: Vec<_> = Verdict::ALL.into_iter().filter_map(count).collect();
+        let counts: Vec<_> = Severity::ALL.into_iter().filter_map(count).collect();
         let (version, subject) = (self.version, visible(&self.subject));
         format!("rp doctor {version} on {subject}: {}", counts.join(", "))
     }
@@ -61,26 +65,26 @@ mod tests {
     use super::super::finding::Area;
     use super::*;
 
-    fn report(verdicts: &[Verdict]) -> Report {
-        let finding = |verdict: &Verdict| Finding::new(Area::Kernel, "x", *verdict, "x");
-        Report::new("robot1", verdicts.iter().map(finding).collect())
+    fn report(severities: &[Severity]) -> Report {
+        let finding = |severity: &Severity| Finding::new(Area::Kernel, "x", *severity, "x");
+        Report::new("robot1", severities.iter().map(finding).collect())
     }
 
     #[test]
     fn only_a_problem_is_a_problem() {
         assert!(!report(&[]).has_problems());
-        assert!(!report(&[Verdict::Ok, Verdict::Warning, Verdict::Unknown]).has_problems());
-        assert!(report(&[Verdict::Problem, Verdict::Ok]).has_problems());
+        assert!(!report(&[Severity::Ok, Severity::Warning, Severity::Unknown]).has_problems());
+        assert!(report(&[Severity::Problem, Severity::Ok]).has_problems());
     }
 
     #[test]
     fn the_headline_counts_the_worst_first() {
         let report = report(&[
-            Verdict::Ok,
-            Verdict::Ok,
-            Verdict::Warning,
-            Verdict::Problem,
-            Verdict::Problem,
+            Severity::Ok,
+            Severity::Ok,
+            Severity::Warning,
+            Severity::Problem,
+            Severity::Problem,
         ]);
         assert!(
             report
@@ -91,7 +95,7 @@ mod tests {
 
     #[test]
     fn the_report_is_json_for_fleets() {
-        let json = serde_json::to_value(report(&[Verdict::Warning])).unwrap();
+        let json = serde_json::to_value(report(&[Severity::Warning])).unwrap();
         assert_eq!(json["verdict"], "warning");
         assert_eq!(json["findings"][0]["area"], "kernel");
         assert_eq!(json["findings"][0]["evidence"], serde_json::json!([]));

@@ -1,7 +1,7 @@
 //! The ROS environment of this shell: what nodes and tools started from it will do, and what of that
 //! the agent cannot see.
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
 use super::variables::{Range, Variables};
 
@@ -38,7 +38,7 @@ fn none(host: &HostState) -> Finding {
     let finding = Finding::new(
         AREA,
         "environment",
-        Verdict::Note,
+        Severity::Note,
         if is_sudo {
             "no ROS variables: sudo does not pass them on"
         } else {
@@ -56,26 +56,26 @@ fn none(host: &HostState) -> Finding {
 }
 
 fn domain(host: &HostState, variables: &Variables) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "domain", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "domain", severity, sentence);
     let shown = variables
         .shown("ROS_DOMAIN_ID")
         .unwrap_or_else(|| "not set".to_owned());
     let finding = match variables.domain() {
         Err(text) => report(
-            Verdict::Problem,
+            Severity::Problem,
             format!("`{text}` is not a domain ID: nodes of this shell do not start"),
         )
         .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
         Ok(domain) => match ephemeral(host) {
             Some((first, last)) if overlaps(domain, first, last) => report(
-                Verdict::Warning,
+                Severity::Warning,
                 format!(
                     "the ports of domain {domain} are in the ephemeral range ({first} to \
                      {last}): a node may find its port in use"
                 ),
             )
             .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
-            _ => report(Verdict::Ok, format!("domain {domain}")),
+            _ => report(Severity::Ok, format!("domain {domain}")),
         },
     };
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
@@ -95,27 +95,27 @@ fn overlaps(domain: u32, first: u32, last: u32) -> bool {
 }
 
 fn implementation(variables: &Variables) -> Finding {
-    let report = |verdict, sentence: String| Finding::new(AREA, "rmw", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "rmw", severity, sentence);
     let name = variables.shown("RMW_IMPLEMENTATION");
     let finding = match name.as_deref() {
         None => report(
-            Verdict::Ok,
+            Severity::Ok,
             "the default implementation of ROS (Fast DDS)".to_owned(),
         ),
         Some(name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp")) => {
-            report(Verdict::Ok, name.to_owned())
+            report(Severity::Ok, name.to_owned())
         }
         Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => report(
-            Verdict::Note,
+            Severity::Note,
             format!("{name}: messages in its own shared memory are not visible"),
         ),
         Some(name) if name.starts_with("rmw_zenoh") => report(
-            Verdict::Warning,
+            Severity::Warning,
             format!("{name} is not DDS: its nodes are not visible"),
         )
         .remedy("export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another RTPS implementation"),
         Some(name) => report(
-            Verdict::Note,
+            Severity::Note,
             format!("{name}: visible where it uses RTPS over UDP"),
         ),
     };
@@ -124,26 +124,26 @@ fn implementation(variables: &Variables) -> Finding {
 }
 
 fn range(variables: &Variables) -> Finding {
-    let report = |verdict, sentence: &str| Finding::new(AREA, "range", verdict, sentence);
+    let report = |severity, sentence: &str| Finding::new(AREA, "range", severity, sentence);
     let peers = variables.shown("ROS_STATIC_PEERS");
     let mut finding = match variables.range() {
-        Range::Subnet => report(Verdict::Ok, "discovery range: subnet"),
+        Range::Subnet => report(Severity::Ok, "discovery range: subnet"),
         Range::System => report(
-            Verdict::Ok,
+            Severity::Ok,
             "discovery range: as configured in the RMW implementation",
         ),
         Range::Localhost => report(
-            Verdict::Note,
+            Severity::Note,
             "discovery range: this host only; other robots do not see these nodes",
         )
         .remedy("unset ROS_LOCALHOST_ONLY; export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
         Range::Off => report(
-            Verdict::Warning,
+            Severity::Warning,
             "discovery is off: nodes of this shell find no others",
         )
         .remedy("export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET"),
         Range::Wrong(_) => report(
-            Verdict::Warning,
+            Severity::Warning,
             "ROS_AUTOMATIC_DISCOVERY_RANGE is invalid: ROS uses LOCALHOST",
         )
         .remedy(
@@ -156,7 +156,7 @@ fn range(variables: &Variables) -> Finding {
         finding.sentence.push_str(
             "; ROS_LOCALHOST_ONLY makes ROS ignore ROS_AUTOMATIC_DISCOVERY_RANGE and ROS_STATIC_PEERS",
         );
-        finding.verdict = finding.verdict.max(Verdict::Warning);
+        finding.severity = finding.severity.max(Severity::Warning);
     } else if let Some(peers) = &peers {
         finding.sentence = format!("{}; static peers: {peers}", finding.sentence);
     }
@@ -178,7 +178,7 @@ fn server(variables: &Variables) -> Option<Finding> {
     let sentence = format!(
         "discovery server at {server}: the agent sees only the discovery traffic on this host"
     );
-    let finding = Finding::new(AREA, "discovery_server", Verdict::Note, sentence);
+    let finding = Finding::new(AREA, "discovery_server", Severity::Note, sentence);
     let finding = finding.seen(server, format!("ROS_DISCOVERY_SERVER, {FROM}"));
     Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
@@ -187,21 +187,21 @@ fn server(variables: &Variables) -> Option<Finding> {
 fn transports(variables: &Variables) -> Option<Finding> {
     let name = "FASTDDS_BUILTIN_TRANSPORTS";
     let value = variables.shown(name)?;
-    let report = |verdict, sentence: String| Finding::new(AREA, "transports", verdict, sentence);
+    let report = |severity, sentence: String| Finding::new(AREA, "transports", severity, sentence);
     let kind = value.split(['?', '&']).next().unwrap_or_default();
     let finding = match kind {
         "LARGE_DATA" | "LARGE_DATAv6" | "P2P" => report(
-            Verdict::Warning,
+            Severity::Warning,
             format!("with {kind}, Fast DDS uses TCP, which the agent does not read"),
         )
         .remedy("export FASTDDS_BUILTIN_TRANSPORTS=DEFAULT"),
         "SHM" => report(
-            Verdict::Note,
+            Severity::Note,
             "nodes of this shell use only shared memory, which is sampled; other hosts do not \
              see them"
                 .to_owned(),
         ),
-        _ => report(Verdict::Ok, format!("Fast DDS uses the transports {kind}")),
+        _ => report(Severity::Ok, format!("Fast DDS uses the transports {kind}")),
     };
     Some(finding.seen(value, format!("{name}, {FROM}")))
 }
@@ -215,13 +215,14 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
         .into_iter()
         .filter_map(|name| Some((name, variables.get(name)?)));
     set.map(|(name, path)| {
-        let report = |verdict, sentence: String| {
+        let report = |severity, sentence: String| {
             let shown = variables.shown(name).unwrap_or_default();
-            Finding::new(AREA, "profiles", verdict, sentence).seen(shown, format!("{name}, {FROM}"))
+            Finding::new(AREA, "profiles", severity, sentence)
+                .seen(shown, format!("{name}, {FROM}"))
         };
         match read(host, path) {
             Err(error) => report(
-                Verdict::Warning,
+                Severity::Warning,
                 format!("Fast DDS's profiles cannot be read: {error}; nodes run with the defaults"),
             )
             .remedy(format!("unset {name}    # or fix it")),
@@ -229,12 +230,12 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
                 let text = String::from_utf8_lossy(&bytes);
                 if text.contains("TCPv4") || text.contains("TCPv6") || text.contains("LARGE_DATA") {
                     report(
-                        Verdict::Warning,
+                        Severity::Warning,
                         "Fast DDS's profiles use TCP, which the agent does not read".to_owned(),
                     )
                     .elsewhere("<type>UDPv4</type>    # in the transport descriptors of that file")
                 } else {
-                    report(Verdict::Ok, "Fast DDS profiles found".to_owned())
+                    report(Severity::Ok, "Fast DDS profiles found".to_owned())
                 }
             }
         }
@@ -252,8 +253,8 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
     let name = "CYCLONEDDS_URI";
     let value = variables.get(name)?;
     let shown = variables.shown(name)?;
-    let report = |verdict, sentence: String| {
-        Finding::new(AREA, "cyclonedds", verdict, sentence)
+    let report = |severity, sentence: String| {
+        Finding::new(AREA, "cyclonedds", severity, sentence)
             .seen(shown.clone(), format!("{name}, {FROM}"))
     };
     let mut text = String::new();
@@ -270,9 +271,9 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
                 let sentence = format!(
                     "Cyclone DDS's configuration cannot be read: {error}; its nodes do not start"
                 );
-                let verdict = Verdict::Problem;
+                let severity = Severity::Problem;
                 return Some(
-                    report(verdict, sentence).remedy("unset CYCLONEDDS_URI    # or fix it"),
+                    report(severity, sentence).remedy("unset CYCLONEDDS_URI    # or fix it"),
                 );
             }
         }
@@ -285,13 +286,13 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
     };
     Some(if is_on(shared) || text.contains("PubSubMessageExchange") {
         report(
-            Verdict::Warning,
+            Severity::Warning,
             "Cyclone DDS uses iceoryx within this host, which the agent cannot see".to_owned(),
         )
         .elsewhere("<SharedMemory><Enable>false</Enable></SharedMemory>")
     } else {
         report(
-            Verdict::Ok,
+            Severity::Ok,
             "Cyclone DDS has its own configuration".to_owned(),
         )
     })
@@ -305,19 +306,19 @@ fn security(variables: &Variables) -> Option<Finding> {
         "ROS_SECURITY_ENCLAVE_OVERRIDE",
     ];
     names.iter().find(|name| variables.get(name).is_some())?;
-    let (verdict, sentence) = if variables.is_secured() {
+    let (severity, sentence) = if variables.is_secured() {
         (
-            Verdict::Note,
+            Severity::Note,
             "DDS security is on: participants are visible; encrypted names, rates and messages \
              are not",
         )
     } else {
         (
-            Verdict::Ok,
+            Severity::Ok,
             "DDS security is configured but off (ROS_SECURITY_ENABLE is not `true`)",
         )
     };
-    let mut finding = Finding::new(AREA, "security", verdict, sentence);
+    let mut finding = Finding::new(AREA, "security", severity, sentence);
     for name in names {
         if let Some(value) = variables.shown(name) {
             finding = finding.seen(value, format!("{name}, {FROM}"));
@@ -351,11 +352,11 @@ mod tests {
     }
 
     #[track_caller]
-    fn gives(name: &str, value: &str, check: &str, verdict: Verdict) {
+    fn gives(name: &str, value: &str, check: &str, severity: Severity) {
         let findings = found(&[("ROS_DISTRO", "jazzy"), (name, value)]);
         let finding = findings.iter().find(|finding| finding.check == check);
         let finding = finding.unwrap_or_else(|| panic!("{findings:?}"));
-        assert_eq!(finding.verdict, verdict, "{finding:?}");
+        assert_eq!(finding.severity, severity, "{finding:?}");
         assert!(
             finding
                 .evidence
@@ -367,7 +368,7 @@ mod tests {
 
     #[test]
     fn a_shell_without_ros_needs_nothing_and_sudo_is_named() {
-        assert_eq!(found(&[])[0].verdict, Verdict::Note);
+        assert_eq!(found(&[])[0].severity, Severity::Note);
         assert_eq!(
             found(&[("SUDO_USER", "me")])[0].remedies[0].line,
             "sudo -E rp doctor"
@@ -381,7 +382,7 @@ mod tests {
             ("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp"),
         ]);
         assert!(
-            findings.iter().all(|each| each.verdict == Verdict::Ok),
+            findings.iter().all(|each| each.severity == Severity::Ok),
             "{findings:?}"
         );
         assert_eq!(findings.len(), 3);
@@ -389,30 +390,30 @@ mod tests {
 
     #[test]
     fn domains_without_ports_of_their_own_are_told_apart_from_good_ones() {
-        for (domain, verdict) in [
-            ("0", Verdict::Ok),
-            ("101", Verdict::Ok),
-            ("102", Verdict::Warning),
-            ("214", Verdict::Warning),
-            ("215", Verdict::Ok),
-            ("232", Verdict::Ok),
-            ("233", Verdict::Problem),
-            ("x", Verdict::Problem),
+        for (domain, severity) in [
+            ("0", Severity::Ok),
+            ("101", Severity::Ok),
+            ("102", Severity::Warning),
+            ("214", Severity::Warning),
+            ("215", Severity::Ok),
+            ("232", Severity::Ok),
+            ("233", Severity::Problem),
+            ("x", Severity::Problem),
         ] {
-            gives("ROS_DOMAIN_ID", domain, "domain", verdict);
+            gives("ROS_DOMAIN_ID", domain, "domain", severity);
         }
     }
 
     #[test]
     fn each_variable_has_its_consequence() {
-        let (note, warning) = (Verdict::Note, Verdict::Warning);
+        let (note, warning) = (Severity::Note, Severity::Warning);
         gives("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw", warning);
         gives("RMW_IMPLEMENTATION", "rmw_connextdds", "rmw", note);
         gives("RMW_IMPLEMENTATION", "rmw_of_mine", "rmw", note);
         gives("ROS_LOCALHOST_ONLY", "1", "range", note);
         gives("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF", "range", warning);
         gives("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCAL", "range", warning);
-        gives("ROS_STATIC_PEERS", "10.0.0.9", "range", Verdict::Ok);
+        gives("ROS_STATIC_PEERS", "10.0.0.9", "range", Severity::Ok);
         gives(
             "ROS_DISCOVERY_SERVER",
             "10.0.0.1:11811",
@@ -429,7 +430,7 @@ mod tests {
             "FASTDDS_BUILTIN_TRANSPORTS",
             "UDPv4",
             "transports",
-            Verdict::Ok,
+            Severity::Ok,
         );
         gives(
             "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -441,7 +442,7 @@ mod tests {
             "FASTRTPS_DEFAULT_PROFILES_FILE",
             "/home/fast.xml",
             "profiles",
-            Verdict::Ok,
+            Severity::Ok,
         );
         gives(
             "FASTDDS_DEFAULT_PROFILES_FILE",
@@ -459,15 +460,15 @@ mod tests {
             "CYCLONEDDS_URI",
             "file:///home/none.xml",
             "cyclonedds",
-            Verdict::Problem,
+            Severity::Problem,
         );
-        gives("CYCLONEDDS_URI", "<General/>", "cyclonedds", Verdict::Ok);
+        gives("CYCLONEDDS_URI", "<General/>", "cyclonedds", Severity::Ok);
         gives("ROS_SECURITY_ENABLE", "true", "security", note);
         gives(
             "ROS_SECURITY_KEYSTORE",
             "/home/keys",
             "security",
-            Verdict::Ok,
+            Severity::Ok,
         );
     }
 
@@ -478,7 +479,7 @@ mod tests {
             ("ROS_STATIC_PEERS", "10.0.0.9"),
         ]);
         let finding = findings.iter().find(|each| each.check == "range").unwrap();
-        assert_eq!(finding.verdict, Verdict::Warning);
+        assert_eq!(finding.severity, Severity::Warning);
         assert!(finding.sentence.contains("ignore"), "{}", finding.sentence);
     }
 }

@@ -4,12 +4,12 @@
 
 use std::borrow::Cow;
 
-use super::finding::{Finding, Remedy, RemedyTarget, Verdict};
+use super::finding::{Finding, Remedy, RemedyTarget, Severity};
 use super::report::Report;
 use ros2probe_daemon::escape::visible;
 
 const WIDTH: usize = 80;
-/// Before sentences: two spaces, a verdict, a space.
+/// Before sentences: two spaces, a severity, a space.
 const INDENT: usize = 11;
 /// Lines of evidence of one finding, unless all of it is wanted.
 const EVIDENCE: usize = 3;
@@ -58,20 +58,20 @@ const DIM: &str = "2";
 
 impl Page {
     fn finding(&mut self, finding: &Finding) {
-        let verdict = format!("{:8}", finding.verdict.label());
-        let verdict = self.painted(colour(finding.verdict), &verdict);
+        let severity = format!("{:8}", finding.severity.label());
+        let severity = self.painted(colour(finding.severity), &severity);
         for (number, line) in wrapped(&visible(&finding.sentence)).iter().enumerate() {
             let start = if number == 0 {
-                verdict.as_str()
+                severity.as_str()
             } else {
                 "        "
             };
             self.line(&format!("  {start} {line}"));
         }
-        if self.style.verbose || finding.verdict >= Verdict::Unknown {
+        if self.style.verbose || finding.severity >= Severity::Unknown {
             self.evidence(finding);
         }
-        if finding.verdict != Verdict::Ok {
+        if finding.severity != Severity::Ok {
             for remedy in &finding.remedies {
                 self.remedy(remedy);
             }
@@ -137,13 +137,13 @@ impl Page {
     }
 }
 
-const fn colour(verdict: Verdict) -> &'static str {
-    match verdict {
-        Verdict::Ok => "32",
-        Verdict::Note => "36",
-        Verdict::Unknown => "35",
-        Verdict::Warning => "33",
-        Verdict::Problem => "1;31",
+const fn colour(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Ok => "32",
+        Severity::Note => "36",
+        Severity::Unknown => "35",
+        Severity::Warning => "33",
+        Severity::Problem => "1;31",
     }
 }
 
@@ -186,12 +186,12 @@ mod tests {
         Report::new(
             "robot1",
             vec![
-                Finding::new(Area::Kernel, "version", Verdict::Ok, "Linux 6.8")
+                Finding::new(Area::Kernel, "version", Severity::Ok, "Linux 6.8")
                     .seen("6.8", "/proc/x"),
                 Finding::new(
                     Area::Buffers,
                     "receive",
-                    Verdict::Warning,
+                    Severity::Warning,
                     "a socket may buffer 213 KB: two messages of /points (2.7 MB each) do not fit",
                 )
                 .seen("212992", "/proc/sys/net/core/rmem_max")
@@ -249,7 +249,7 @@ Buffers
     #[test]
     fn what_a_terminal_would_obey_is_escaped() {
         let hostile = "x\x1b]0;gotcha\x07".repeat(100);
-        let finding = Finding::new(Area::Graph, "x", Verdict::Warning, hostile.clone())
+        let finding = Finding::new(Area::Graph, "x", Severity::Warning, hostile.clone())
             .seen(hostile.clone(), hostile)
             .remedy("ls");
         let text = text(

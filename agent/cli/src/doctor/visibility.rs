@@ -1,7 +1,7 @@
 //! What will be seen on this host and what not: as the running agent says of itself, or as a trial
 //! tells where none runs. The reasons are those of `capture`; here they get their consequences.
 
-use super::finding::{Area, Finding, Verdict};
+use super::finding::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
@@ -62,7 +62,7 @@ impl Visibility {
 #[must_use]
 pub fn untried(reason: &str) -> Vec<Finding> {
     let sentence = "kernel support was not tested";
-    let finding = Finding::new(AREA, "source", Verdict::Unknown, sentence);
+    let finding = Finding::new(AREA, "source", Severity::Unknown, sentence);
     vec![
         finding
             .seen(reason, "this process")
@@ -74,7 +74,7 @@ pub fn untried(reason: &str) -> Vec<Finding> {
 #[must_use]
 pub fn failed(error: &str) -> Vec<Finding> {
     let sentence = format!("the agent cannot observe this host: {error}");
-    let finding = Finding::new(AREA, "source", Verdict::Problem, sentence);
+    let finding = Finding::new(AREA, "source", Severity::Problem, sentence);
     vec![
         finding
             .seen(error, TRIED)
@@ -91,7 +91,7 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
     let seen: Vec<_> = seen.into_iter().map(words).collect();
     if !seen.is_empty() {
         let sentence = format!("it sees {}", seen.join("; "));
-        let finding = Finding::new(AREA, "abilities", Verdict::Ok, sentence);
+        let finding = Finding::new(AREA, "abilities", Severity::Ok, sentence);
         findings.push(finding.seen("1", format!("{} abilities", visibility.from)));
     }
     findings.extend(
@@ -103,15 +103,15 @@ pub fn check(visibility: &Visibility) -> Vec<Finding> {
 }
 
 fn source(visibility: &Visibility) -> Finding {
-    let say = |verdict, sentence: String| Finding::new(AREA, "source", verdict, sentence);
+    let say = |severity, sentence: String| Finding::new(AREA, "source", severity, sentence);
     let finding = match (visibility.source.as_str(), &visibility.source_reason) {
         ("host", _) => say(
-            Verdict::Ok,
+            Severity::Ok,
             "the agent observes the sockets of this host: whole messages, per subscriber"
                 .to_owned(),
         ),
         ("wire", Some(reason)) => say(
-            Verdict::Warning,
+            Severity::Warning,
             format!(
                 "the agent observes interfaces only: no figures per subscriber, no causes of \
                  loss: {reason}"
@@ -119,13 +119,13 @@ fn source(visibility: &Visibility) -> Finding {
         )
         .configure("capture: {source: host}    # fails with the reason instead of falling back"),
         ("wire", None) => say(
-            Verdict::Note,
+            Severity::Note,
             "the agent observes interfaces, as configured: no figures per subscriber, no causes \
              of loss"
                 .to_owned(),
         )
         .configure("capture: {source: auto}"),
-        (source, _) => say(Verdict::Note, format!("packets come from a {source}")),
+        (source, _) => say(Severity::Note, format!("packets come from a {source}")),
     };
     finding.seen(&visibility.source, visibility.from)
 }
@@ -153,9 +153,9 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
         .find(|(blind, _)| *blind == ability);
     let reason = reason.map(|(_, reason)| reason.as_str());
     let is_host = visibility.source == "host";
-    let (verdict, mut sentence, remedy) = match ability {
+    let (severity, mut sentence, remedy) = match ability {
         Ability::Subscribers if is_host => {
-            (Verdict::Warning, format!("not {}", words(ability)), None)
+            (Severity::Warning, format!("not {}", words(ability)), None)
         }
         // The wire has none of these, which the source's line says.
         Ability::Subscribers
@@ -167,38 +167,38 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
             return None;
         }
         Ability::Containers if !is_host => (
-            Verdict::Note,
+            Severity::Note,
             "containers with their own network namespace are not seen".to_owned(),
             Some("capture: {network_namespaces: [/run/netns/NAME]}"),
         ),
         Ability::Containers => (
-            Verdict::Note,
+            Severity::Note,
             "limited to one cgroup; other containers are not visible".to_owned(),
             Some("capture: {cgroup: null}    # and in a container the host's /sys/fs/cgroup"),
         ),
         Ability::Forwarded => (
-            Verdict::Note,
+            Severity::Note,
             "traffic merely forwarded between other hosts is not seen".to_owned(),
             Some(
                 "capture: {mirror_interfaces: [eth1]}    # a mirror port or a gateway's interface",
             ),
         ),
         Ability::SharedMemory => (
-            Verdict::Warning,
+            Severity::Warning,
             "Fast DDS shared memory, which most nodes of one host use, is not seen".to_owned(),
             Some("capture: {shm: {mode: auto}}"),
         ),
         Ability::SharedMemoryExact => (
-            Verdict::Note,
+            Severity::Note,
             "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
             Some("capture: {shm: {exact: uprobe}}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
         ),
-        _ => (Verdict::Warning, format!("not {}", words(ability)), None),
+        _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };
     if let Some(reason) = reason {
         sentence = format!("{sentence}: {reason}");
     }
-    let finding = Finding::new(AREA, ability.label(), verdict, sentence);
+    let finding = Finding::new(AREA, ability.label(), severity, sentence);
     let finding = finding.seen(reason.unwrap_or("0"), visibility.from);
     Some(match remedy {
         Some(remedy) => finding.configure(remedy),
@@ -228,7 +228,7 @@ mod tests {
     fn who_sees_everything_is_told_so_in_two_lines() {
         let findings = check(&host(&Ability::ALL));
         assert_eq!(findings.len(), 2);
-        assert!(findings.iter().all(|each| each.verdict == Verdict::Ok));
+        assert!(findings.iter().all(|each| each.severity == Severity::Ok));
     }
 
     #[test]
@@ -240,7 +240,7 @@ mod tests {
         visibility.reasons = vec![(Ability::ReassemblyLosses, reason)];
         let findings = check(&visibility);
         let found = find(&findings, "reassembly_losses").unwrap();
-        assert_eq!(found.verdict, Verdict::Warning);
+        assert_eq!(found.severity, Severity::Warning);
         assert_eq!(
             found.sentence,
             "not messages lost in IP reassembly: the kernel does not tell"
@@ -255,11 +255,11 @@ mod tests {
             ..Visibility::default()
         };
         let chosen = check(&visibility);
-        assert_eq!(find(&chosen, "source").unwrap().verdict, Verdict::Note);
+        assert_eq!(find(&chosen, "source").unwrap().severity, Severity::Note);
         visibility.source_reason = Some("no cgroup v2 hierarchy is mounted".to_owned());
         let forced = check(&visibility);
         let source = find(&forced, "source").unwrap();
-        assert_eq!(source.verdict, Verdict::Warning);
+        assert_eq!(source.severity, Severity::Warning);
         assert!(
             source
                 .sentence
@@ -267,8 +267,8 @@ mod tests {
         );
         assert!(find(&forced, "owners").is_none());
         assert_eq!(
-            find(&forced, "shared_memory").unwrap().verdict,
-            Verdict::Warning
+            find(&forced, "shared_memory").unwrap().severity,
+            Severity::Warning
         );
     }
 
@@ -310,8 +310,8 @@ mod tests {
     #[test]
     fn without_a_trial_there_is_the_command_that_makes_one() {
         let findings = untried("CAP_BPF is missing");
-        assert_eq!(findings[0].verdict, Verdict::Unknown);
+        assert_eq!(findings[0].severity, Severity::Unknown);
         assert_eq!(findings[0].remedies[0].line, "sudo rp doctor");
-        assert_eq!(failed("x")[0].verdict, Verdict::Problem);
+        assert_eq!(failed("x")[0].severity, Severity::Problem);
     }
 }

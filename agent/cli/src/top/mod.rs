@@ -111,8 +111,8 @@ fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Opti
     let begun = Instant::now();
     let mut is_news = false;
     loop {
-        let patience = if is_news { CALM } else { TICK };
-        let next = match input.recv_timeout(patience.saturating_sub(begun.elapsed())) {
+        let timeout = if is_news { CALM } else { TICK };
+        let next = match input.recv_timeout(timeout.saturating_sub(begun.elapsed())) {
             Ok(next) => next,
             Err(RecvTimeoutError::Timeout) => return None,
             Err(RecvTimeoutError::Disconnected) => return Some(1),

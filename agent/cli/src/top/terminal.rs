@@ -25,7 +25,7 @@ const PANICKED: i32 = 101;
 const SIGNALLED: u8 = 128;
 
 /// How long drawing may take before a signal ends the program without it.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// The terminal is ours.
 static TAKEN: AtomicBool = AtomicBool::new(false);
@@ -141,7 +141,7 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
         let number = u8::try_from(kind.as_raw_value()).unwrap_or_default();
         let code = SIGNALLED.saturating_add(number);
         let _ = inputs.try_send(Input::End(code));
-        thread::sleep(PATIENCE);
+        thread::sleep(TIMEOUT);
         // The terminal takes nothing, and drawing waits for it: only its settings can be put back.
         let _ = disable_raw_mode();
         std::process::exit(code.into());
@@ -169,7 +169,7 @@ mod tests {
             let _screen = Screen::open().unwrap();
             let reader = thread::spawn(|| panic!("the reason"));
             let _ = reader.join();
-            thread::sleep(PATIENCE);
+            thread::sleep(TIMEOUT);
         }
     }
 

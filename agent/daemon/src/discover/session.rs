@@ -32,9 +32,9 @@ const SILENCE: u64 = 500 * MILLISECOND;
 /// Between the first HEARTBEAT and asking, for the second one.
 const GATHER: u64 = 20 * MILLISECOND;
 /// What was asked for comes within this, or it is asked for again.
-const PATIENCE: u64 = 300 * MILLISECOND;
+const TIMEOUT: u64 = 300 * MILLISECOND;
 /// How long the node list may take after everything else.
-const NODES_PATIENCE: u64 = 500 * MILLISECOND;
+const NODES_TIMEOUT: u64 = 500 * MILLISECOND;
 /// The whole conversation.
 const LIMIT: u64 = 3_000 * MILLISECOND;
 /// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
@@ -410,7 +410,7 @@ impl Session {
             None => both || since(heard, now) >= GATHER,
             Some(asked) => {
                 let came = self.publications.has_come() && self.subscriptions.has_come();
-                came || since(asked, now) >= PATIENCE
+                came || since(asked, now) >= TIMEOUT
             }
         };
         // Of the packets left, one is the node request and one the goodbye.
@@ -485,7 +485,7 @@ impl Session {
             self.send(datagram, outgoing);
         }
         // They have as long as anything that was asked for.
-        let later = Timestamp(now.0.saturating_add(PATIENCE - GATHER));
+        let later = Timestamp(now.0.saturating_add(TIMEOUT - GATHER));
         for at in self.partial.values_mut() {
             *at = later;
         }
@@ -497,7 +497,7 @@ impl Session {
             return false;
         };
         let settled = match self.asked {
-            Some(asked) => self.missing() == 0 || since(asked, now) >= PATIENCE,
+            Some(asked) => self.missing() == 0 || since(asked, now) >= TIMEOUT,
             // A participant without endpoints says so: 1..0.
             None => since(heard, now) >= GATHER && self.missing() == 0,
         };
@@ -509,8 +509,8 @@ impl Session {
         }
         match &mut self.nodes {
             Nodes::Told(_) | Nodes::Missing => true,
-            Nodes::FilterOptions(asked) => since(*asked, now) >= NODES_PATIENCE,
-            Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_PATIENCE,
+            Nodes::FilterOptions(asked) => since(*asked, now) >= NODES_TIMEOUT,
+            Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_TIMEOUT,
         }
     }
 

@@ -207,8 +207,8 @@ async fn who_waits_is_woken_by_the_next_event() {
 /// Waits for a future, or not for long.
 trait Soon: Future + Sized {
     async fn await_soon(self, expected: bool) {
-        let patience = Duration::from_millis(if expected { 10_000 } else { 20 });
-        let came = tokio::time::timeout(patience, self).await.is_ok();
+        let timeout = Duration::from_millis(if expected { 10_000 } else { 20 });
+        let came = tokio::time::timeout(timeout, self).await.is_ok();
         assert_eq!(came, expected);
     }
 }

@@ -15,7 +15,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 /// A pipe that is ready takes so many bytes without waiting (`PIPE_BUF`).
 const PIECE: usize = 4096;
 /// How long a reader that was quick so far may take.
-const PATIENCE: Timespec = Timespec {
+const TIMEOUT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 100_000_000,
 };
@@ -71,10 +71,10 @@ impl<W: Write + AsFd> Lines<W> {
     }
 
     fn ready(&self) -> io::Result<()> {
-        let patience = if self.is_stuck { NONE } else { PATIENCE };
+        let timeout = if self.is_stuck { NONE } else { TIMEOUT };
         let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
         // What has hung up is ready, too: writing tells.
-        match poll(&mut target, Some(&patience)) {
+        match poll(&mut target, Some(&timeout)) {
             Ok(0) => Err(io::ErrorKind::WouldBlock.into()),
             Ok(_) => Ok(()),
             Err(error) => Err(error.into()),

@@ -427,8 +427,8 @@ impl Recording {
         let _ = locked(&self.commands).send(command);
     }
 
-    /// Waits until the bag is complete, but no longer than `patience`.
-    pub async fn over(&self, patience: Duration) -> bool {
+    /// Waits until the bag is complete, but no longer than `timeout`.
+    pub async fn over(&self, timeout: Duration) -> bool {
         let wait = async {
             loop {
                 let over = self.over.notified();
@@ -438,7 +438,7 @@ impl Recording {
                 over.await;
             }
         };
-        tokio::time::timeout(patience, wait).await.is_ok()
+        tokio::time::timeout(timeout, wait).await.is_ok()
     }
 
     fn is_over(&self) -> bool {
@@ -453,8 +453,8 @@ impl Recording {
         events: &EventLog,
         figures: &RecordingFigures,
     ) {
-        let next = |patience| {
-            let item = subscription.next_blocking(patience);
+        let next = |timeout| {
+            let item = subscription.next_blocking(timeout);
             Ok::<_, std::convert::Infallible>(item.map_or(NextItem::Pending, NextItem::Item))
         };
         figures.active.fetch_add(1, Ordering::Relaxed);

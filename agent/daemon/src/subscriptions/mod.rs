@@ -422,11 +422,11 @@ impl Subscription {
         self.channel.next_blocking(timeout)
     }
 
-    /// Waits until the capture knows what is wanted, but no longer than `patience`: what is sent
+    /// Waits until the capture knows what is wanted, but no longer than `timeout`: what is sent
     /// from then on is given.
-    pub async fn in_force(&self, patience: Duration) -> bool {
+    pub async fn in_force(&self, timeout: Duration) -> bool {
         let known = self.channel.in_force();
-        tokio::time::timeout(patience, known).await.is_ok()
+        tokio::time::timeout(timeout, known).await.is_ok()
     }
 
     /// What is wanted.

@@ -206,7 +206,7 @@ fn router(sources: MetricSources) -> Router {
 static PAGES: LargeResponses = LargeResponses::new();
 
 /// The capture thread hears the bell at once, unless it has a flood of packets to read.
-const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
+const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
     let accepts: Vec<&str> = headers
@@ -216,7 +216,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
         .collect();
     let format = Format::negotiate(&accepts.join(","));
     let encoding = encoding(&headers);
-    pages.latest.refresh(REFRESH_PATIENCE).await;
+    pages.latest.refresh(REFRESH_TIMEOUT).await;
     let Some(turn) = PAGES.turn().await else {
         pages.limits.reached(Limit::MetricsClients, 1);
         let reason = "other clients are having pages made

@@ -19,13 +19,13 @@ const KEPT: usize = 4 << 20;
 /// From here on an answer is large.
 const LARGE: usize = 256 << 10;
 /// How long a turn is waited for.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
 #[derive(Debug)]
 pub(super) struct LargeResponses {
     making: Semaphore,
-    patience: Duration,
+    longest: Duration,
     kept: Mutex<Vec<Pending>>,
 }
 
@@ -56,14 +56,14 @@ impl LargeResponses {
     pub(super) const fn new() -> Self {
         Self {
             making: Semaphore::const_new(AT_ONCE),
-            patience: PATIENCE,
+            longest: TIMEOUT,
             kept: Mutex::new(Vec::new()),
         }
     }
 
     /// A turn, within a moment.
     pub(super) async fn turn(&'static self) -> Option<RenderPermit> {
-        let making = timeout(self.patience, self.making.acquire()).await;
+        let making = timeout(self.longest, self.making.acquire()).await;
         let making = making.ok()?.ok()?;
         Some(RenderPermit {
             of: self,
@@ -157,7 +157,7 @@ mod tests {
     async fn slow_readers_of_large_answers_never_keep_others_from_theirs() {
         static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
-            patience: Duration::ZERO,
+            longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
         let bytes = noise(1 << 20);
@@ -187,7 +187,7 @@ mod tests {
     async fn a_third_answer_waits_until_one_of_two_is_made() {
         static ANSWERS: LargeResponses = LargeResponses {
             making: Semaphore::const_new(AT_ONCE),
-            patience: Duration::ZERO,
+            longest: Duration::ZERO,
             kept: Mutex::new(Vec::new()),
         };
         let one = ANSWERS.turn().await.unwrap();

@@ -41,9 +41,9 @@ fn message_type() -> MessageType {
 
 fn echo(options: Options) -> Result<Option<String>, Refused> {
     let mut echo = Echo::new(options);
-    let told = echo.message(&sample(), Some(&message_type()), &payload())?;
-    assert_eq!(told.err, "");
-    Ok(told.out)
+    let printed = echo.message(&sample(), Some(&message_type()), &payload())?;
+    assert_eq!(printed.err, "");
+    Ok(printed.out)
 }
 
 fn fields(paths: &[&str]) -> Options {

@@ -269,7 +269,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_BODY",
         "agent/daemon/src/surface/api/security.rs",
-        "agent/daemon/src/surface/api/security.rs",
+        "agent/daemon/src/surface/api/security/tests.rs",
         "a_long_body_is_refused_before_it_is_read",
     ],
     [
@@ -359,7 +359,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_BYTES",
         "agent/daemon/src/state.rs",
-        "agent/daemon/src/state.rs",
+        "agent/daemon/src/state/tests.rs",
         "a_file_of_more_bytes_than_are_read_is_kept_aside",
     ],
     [

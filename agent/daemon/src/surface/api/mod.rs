@@ -73,7 +73,7 @@ use security::{Door, Needs};
 pub use server::{OpenError, Server};
 
 /// How long a reader waits for a snapshot that knows what was asked for just before.
-const PATIENCE: Duration = Duration::from_millis(600);
+const TIMEOUT: Duration = Duration::from_millis(600);
 
 /// What the routes work on.
 #[derive(Clone)]
@@ -109,7 +109,7 @@ pub struct Context {
 impl Context {
     /// What is known at this moment, or a little earlier where the capture has no time.
     async fn state(&self) -> Arc<State> {
-        self.latest.refresh(PATIENCE).await;
+        self.latest.refresh(TIMEOUT).await;
         self.latest.state()
     }
 }

@@ -50,7 +50,7 @@ async fn list(
     let scope = scope.checked()?;
     let state = context.state().await;
     let snapshot = state.known();
-    let desk = Desk::new(snapshot, scope);
+    let answers = NodeAnswers::new(snapshot, scope);
     let nodes = nodes(snapshot).filter(|nodes| {
         let first = nodes.first();
         first.is_some_and(|node| {
@@ -59,7 +59,7 @@ async fn list(
     });
     let answer = NodeList {
         timestamp_seconds: snapshot.at.seconds(),
-        nodes: nodes.filter_map(|nodes| desk.node(nodes)).collect(),
+        nodes: nodes.filter_map(|nodes| answers.node(nodes)).collect(),
     };
     Ok(Json(answer).into_response())
 }
@@ -97,8 +97,8 @@ async fn show(
         Problem::new(Code::NoSuchNode, format!("no node {name}{hint}"))
     };
     let nodes = only(found, &name, missing)?;
-    let desk = Desk::new(snapshot, scope);
-    Ok(Json(desk.node(nodes)).into_response())
+    let answers = NodeAnswers::new(snapshot, scope);
+    Ok(Json(answers.node(nodes)).into_response())
 }
 
 /// The node in a path, for the document.
@@ -123,14 +123,14 @@ fn is_hidden(name: &str) -> bool {
 }
 
 /// What answers are made of.
-struct Desk<'a> {
+struct NodeAnswers<'a> {
     snapshot: &'a Snapshot,
     index: Index<'a>,
     ends: Ends<'a>,
     scope: Scope,
 }
 
-impl<'a> Desk<'a> {
+impl<'a> NodeAnswers<'a> {
     fn new(snapshot: &'a Snapshot, scope: Scope) -> Self {
         Self {
             snapshot,

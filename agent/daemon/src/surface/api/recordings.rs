@@ -28,7 +28,7 @@ use crate::recording::{
 use ros2probe_bag::{Form, Options, Storage};
 
 /// How long an answer waits for a bag to be completed.
-const PATIENCE: Duration = Duration::from_secs(10);
+const TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest time of one file, a year.
 const MAX_DURATION: u64 = 31_536_000;
 
@@ -222,7 +222,7 @@ async fn end(
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
     recording.command(Command::Stop);
-    let status = if recording.over(PATIENCE).await {
+    let status = if recording.over(TIMEOUT).await {
         StatusCode::OK
     } else {
         StatusCode::ACCEPTED

@@ -47,7 +47,7 @@ const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
 const LEAST_BYTES: usize = 64 << 10;
 /// How long a stream waits with its first line for the capture to know what is wanted.
-const PATIENCE: Duration = Duration::from_secs(2);
+const TIMEOUT: Duration = Duration::from_secs(2);
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -162,7 +162,7 @@ async fn samples(
     let known = if is_replay {
         context.latest.state()
     } else {
-        subscription.in_force(PATIENCE).await;
+        subscription.in_force(TIMEOUT).await;
         context.state().await
     };
     let most = context.limits.caps().topics;
@@ -199,7 +199,7 @@ impl Pieces for Stream {
                 None if !lines.is_empty() => break,
                 None => self.wait().await,
             };
-            write(&mut lines, &self.told(&item));
+            write(&mut lines, &self.line(&item));
             match item {
                 Item::Sample(sample) => self.payload.clone_from(&sample.payload),
                 Item::End(_) => self.ended = true,
@@ -212,7 +212,7 @@ impl Pieces for Stream {
 
 impl Stream {
     /// The line for it; with what the writer announced where it is the writer's first.
-    fn told(&mut self, item: &Item) -> Line {
+    fn line(&mut self, item: &Item) -> Line {
         let mut line = line(item);
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
             && sample.payload.is_some()

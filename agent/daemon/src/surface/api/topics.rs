@@ -58,14 +58,14 @@ async fn list(
 ) -> Result<Response, Problem> {
     let scope = scope.checked()?;
     let (state, in_force) = (context.state().await, context.watches.in_force());
-    let desk = Desk::new(&state, &in_force);
-    let topics = desk.snapshot.topics.iter().filter(|topic| {
+    let answers = TopicAnswers::new(&state, &in_force);
+    let topics = answers.snapshot.topics.iter().filter(|topic| {
         let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicList {
-        timestamp_seconds: desk.snapshot.at.seconds(),
-        topics: topics.map(|topic| desk.topic(topic)).collect(),
+        timestamp_seconds: answers.snapshot.at.seconds(),
+        topics: topics.map(|topic| answers.topic(topic)).collect(),
     };
     Ok(Json(answer).into_response())
 }
@@ -110,9 +110,9 @@ async fn show(
     let Parameters(domain) = Parameters::<Domain>::of(&uri)?;
     let domain = domain.checked()?;
     let (state, in_force) = (context.state().await, context.watches.in_force());
-    let desk = Desk::new(&state, &in_force);
-    let topic = find(desk.snapshot, &name, domain)?;
-    Ok(Json(desk.details(topic)).into_response())
+    let answers = TopicAnswers::new(&state, &in_force);
+    let topic = find(answers.snapshot, &name, domain)?;
+    Ok(Json(answers.details(topic)).into_response())
 }
 
 /// The one topic of this name.
@@ -194,7 +194,7 @@ fn is_called(topic: &TopicFacts, name: &str) -> bool {
 }
 
 /// What answers are made of.
-struct Desk<'a> {
+struct TopicAnswers<'a> {
     in_force: &'a InForce,
     snapshot: &'a Snapshot,
     /// Every message into shared memory is seen.
@@ -202,7 +202,7 @@ struct Desk<'a> {
     circumstances: Circumstances<'a>,
 }
 
-impl<'a> Desk<'a> {
+impl<'a> TopicAnswers<'a> {
     fn new(state: &'a AgentState, in_force: &'a InForce) -> Self {
         let snapshot = state.known();
         let abilities = &state.agent.abilities;

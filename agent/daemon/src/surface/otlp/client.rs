@@ -23,7 +23,7 @@ use super::settings::{SettingsError, Target};
 /// Pauses between tries, before what the receiver asks for and before chance takes up to half.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// A receiver may ask for patience, not for oblivion.
+/// The longest pause that a receiver may ask for.
 const LONGEST_ASKED: Duration = Duration::from_mins(5);
 /// A connection that answers no ping for so long is opened anew.
 const PING: Duration = Duration::from_secs(30);
@@ -92,7 +92,7 @@ impl Client {
                 Err(failed) => failed,
             };
             self.failed(&failed);
-            if let Some(asked) = patience(&failed) {
+            if let Some(asked) = retry_delay(&failed) {
                 self.count(Outcome::Retried);
                 tokio::time::sleep(asked.unwrap_or_else(|| shortened(pause))).await;
                 pause = (pause * 2).min(LONGEST_PAUSE);
@@ -217,7 +217,7 @@ const fn path(signal: Signal) -> &'static str {
 }
 
 /// Whether to try again (OTLP 1.x, "Failures"), and after how long if the receiver says.
-fn patience(status: &Status) -> Option<Option<Duration>> {
+fn retry_delay(status: &Status) -> Option<Option<Duration>> {
     let asked = retry_info(status.details());
     let again = match status.code() {
         Code::Cancelled
@@ -342,7 +342,7 @@ mod tests {
 
     #[test]
     fn only_what_may_pass_is_tried_again_and_as_late_as_asked() {
-        let again = |status: Status| patience(&status);
+        let again = |status: Status| retry_delay(&status);
         assert_eq!(again(Status::unavailable("")), Some(None));
         assert_eq!(again(Status::resource_exhausted("")), None);
         assert_eq!(

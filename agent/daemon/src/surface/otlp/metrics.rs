@@ -14,7 +14,7 @@ use crate::surface::collect::{MetricSources, collect};
 use crate::surface::metric_sink::MetricSink;
 
 /// As long as a scrape waits for the capture thread.
-const REFRESH_PATIENCE: Duration = Duration::from_millis(600);
+const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
 /// Writes collections.
 pub(super) struct Collector {
@@ -43,7 +43,7 @@ impl Collector {
                 now = ticks.tick() => now,
                 () = sender.stopped() => break,
             };
-            self.sources.latest.refresh(REFRESH_PATIENCE).await;
+            self.sources.latest.refresh(REFRESH_TIMEOUT).await;
             let Collection { requests, dropped } = self.collect(SystemTime::now());
             sender.overflowed(dropped);
             sender.deliver(requests, Some(now + period)).await;

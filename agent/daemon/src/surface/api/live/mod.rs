@@ -34,7 +34,7 @@ use crate::agent_facts::SourceKind;
 use crate::events::Reader;
 use line::{End, Events, Line, Open, Replay};
 use ros2probe_model::snapshot::Transport;
-use shared_lines::Scene;
+use shared_lines::SharedLines;
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
 const MAX_TABS: usize = 16;
@@ -51,7 +51,7 @@ pub struct Live {
     /// How long figures are kept.
     history: Duration,
     places: Arc<Semaphore>,
-    scene: Mutex<Option<Scene>>,
+    shared: Mutex<Option<SharedLines>>,
 }
 
 /// One client's stream.
@@ -74,12 +74,12 @@ impl Live {
         Self {
             history,
             places: Arc::new(Semaphore::new(MAX_TABS)),
-            scene: Mutex::new(None),
+            shared: Mutex::new(None),
         }
     }
 
-    fn scene(&self) -> MutexGuard<'_, Option<Scene>> {
-        self.scene.lock().unwrap_or_else(PoisonError::into_inner)
+    fn shared(&self) -> MutexGuard<'_, Option<SharedLines>> {
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -173,9 +173,9 @@ impl Stream {
     fn batch(&mut self, lines: &mut Vec<u8>) {
         let context = &self.context;
         let (state, past) = (context.latest.state(), context.latest.past());
-        let mut scene = context.live.scene();
-        let scene = scene.get_or_insert_default();
-        scene.update(&state, &past, &context.watches.in_force());
+        let mut shared = context.live.shared();
+        let shared = shared.get_or_insert_default();
+        shared.update(&state, &past, &context.watches.in_force());
         let seen = self.seen.unwrap_or(0);
         if self.seen.is_none() {
             let replay = (state.agent.source == SourceKind::Replay).then(|| Replay {
@@ -195,11 +195,11 @@ impl Stream {
             };
             Line::Open(open).write(lines);
         }
-        for part in scene.parts(seen) {
+        for part in shared.parts(seen) {
             lines.extend_from_slice(part);
         }
         if self.seen.is_none() {
-            let history = values::history(state.known(), &past, &scene.ids);
+            let history = values::history(state.known(), &past, &shared.ids);
             Line::History(history).write(lines);
         }
         let log = &context.events;
@@ -217,8 +217,8 @@ impl Stream {
             };
             Line::Events(events).write(lines);
         }
-        Line::Values(scene.values(seen)).write(lines);
-        self.seen = Some(scene.round());
+        Line::Values(shared.values(seen)).write(lines);
+        self.seen = Some(shared.round());
     }
 }
 
@@ -227,7 +227,7 @@ impl Drop for Stream {
         self.permit = None;
         let live = &self.context.live;
         if live.places.available_permits() == MAX_TABS {
-            *live.scene() = None;
+            *live.shared() = None;
         }
     }
 }

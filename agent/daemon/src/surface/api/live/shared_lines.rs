@@ -20,7 +20,7 @@ use ros2probe_model::history::Past;
 
 /// One moment, and what it took to come there.
 #[derive(Debug, Default)]
-pub(super) struct Scene {
+pub(super) struct SharedLines {
     /// Counts the moments.
     round: u64,
     state: Option<Arc<State>>,
@@ -53,7 +53,7 @@ impl Part {
     }
 }
 
-impl Scene {
+impl SharedLines {
     /// Takes in a moment, unless it is the one that is shown.
     pub(super) fn update(&mut self, state: &Arc<State>, past: &Arc<Past>, in_force: &Arc<InForce>) {
         let is_same = self

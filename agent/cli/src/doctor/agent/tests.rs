@@ -1,0 +1,194 @@
+use super::super::host_state::tests::host;
+use super::*;
+
+fn answers(health: &str, watches: &str) -> Answers {
+    Answers {
+        health: serde_json::from_str(health).unwrap(),
+        watches: serde_json::from_str(watches).unwrap(),
+        ..Answers::default()
+    }
+}
+
+fn severity(findings: &[Finding], check: &str) -> Option<Severity> {
+    let found = findings.iter().find(|finding| finding.check == check);
+    found.map(|finding| finding.severity)
+}
+
+const WELL: &str = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+        "uptime_seconds":7300}"#;
+const WATCHED: &str = r#"{"watches":[{"topic":"/a","state":"measuring"}]}"#;
+
+#[test]
+fn an_agent_that_is_well_is_fine_in_everything() {
+    let findings = check(&answers(WELL, WATCHED), "/run/api.sock", "1.0.0");
+    assert!(
+        findings.iter().all(|each| each.severity == Severity::Ok),
+        "{findings:?}"
+    );
+    assert!(
+        findings[0].sentence.ends_with("up 2 h"),
+        "{}",
+        findings[0].sentence
+    );
+}
+
+#[test]
+fn what_is_wrong_with_an_agent_is_said_one_by_one() {
+    let ill = r#"{"ready":false,"reason":"no packet for 30 s","version":"0.9.0",
+            "source":"host","dropped_packets":5,"dropped_records":6,"topics_rejected":2,
+            "tables":[{"table":"endpoints","limit":10,"evictions":3},{"table":"nodes"}]}"#;
+    let watches = r#"{"watches":[{"topic":"/nobody","state":"waiting"}]}"#;
+    let findings = check(&answers(ill, watches), "here", "1.0.0");
+    for (check, expected) in [
+        ("ready", Severity::Problem),
+        ("version", Severity::Note),
+        ("dropped_packets", Severity::Warning),
+        ("dropped_records", Severity::Warning),
+        ("evictions", Severity::Warning),
+        ("topics_rejected", Severity::Warning),
+        ("watches", Severity::Note),
+        ("state", Severity::Warning),
+    ] {
+        assert_eq!(severity(&findings, check), Some(expected), "{check}");
+    }
+    let full = findings.iter().find(|each| each.check == "evictions");
+    let remedy = &full.unwrap().remedies[0].line;
+    assert_eq!(remedy, "limits: {endpoints: 20}");
+    assert!(Config::parse(remedy.as_bytes()).is_ok());
+    assert_eq!(severity(&findings, "dropped_datagrams"), None);
+    assert_eq!(
+        findings
+            .iter()
+            .filter(|each| each.check == "evictions")
+            .count(),
+        1
+    );
+}
+
+#[test]
+fn a_cap_that_is_or_was_reached_is_a_warning_with_the_line_to_change() {
+    let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+            "topics_rejected":2,"tables":[{"table":"deliveries","limit":10,"evictions":3},
+            {"table":"nodes","limit":5,"evictions":1}],
+            "limits":[{"limit":"topics","cap":10,"used":10,"reached":2},
+            {"limit":"flows","cap":10,"used":4,"reached":3},
+            {"limit":"recordings","cap":100,"used":100,"reached":0},
+            {"limit":"watches","cap":10,"used":9,"reached":0}]}"#;
+    let findings = check(&answers(full, WATCHED), "here", "1.0.0");
+    let of = |check: &str| {
+        let found = findings.iter().filter(|each| each.check == check);
+        found.map(|each| each.sentence.as_str()).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        of("limits"),
+        [
+            "limits.topics is reached (10): 2 refused or evicted so far",
+            "limits.flows was reached (10): 3 refused or evicted so far",
+            "limits.recordings is reached: 100 of 100, nothing refused so far",
+        ]
+    );
+    assert_eq!(of("evictions").len(), 1, "told once: {findings:?}");
+    assert!(of("topics_rejected").is_empty());
+    for finding in findings.iter().filter(|each| each.check == "limits") {
+        let line = &finding.remedies[0].line;
+        assert!(Config::parse(line.as_bytes()).is_ok(), "{line}");
+    }
+}
+
+#[test]
+fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more() {
+    let full = r#"{"ready":true,"version":"1.0.0","source":"host","watches_kept":true,
+            "limits":[{"limit":"participants","cap":1000,"used":1000,"reached":345,"at_limit":true},
+            {"limit":"topics","cap":1000,"used":900,"reached":3,"at_limit":false},
+            {"limit":"recordings","cap":4,"used":4,"reached":0,"at_limit":true}]}"#;
+    let findings = check(&answers(full, WATCHED), "here", "1.0.0");
+    let found: Vec<_> = findings
+        .iter()
+        .filter(|each| each.check == "limits")
+        .map(|each| (each.severity, each.sentence.as_str()))
+        .collect();
+    assert_eq!(
+        found,
+        [
+            (
+                Severity::Problem,
+                "limits.participants is reached (1000): 345 refused or evicted so far; part of \
+                     the robot may not be seen"
+            ),
+            (
+                Severity::Warning,
+                "limits.topics was reached (1000): 3 refused or evicted so far"
+            ),
+            (
+                Severity::Warning,
+                "limits.recordings is reached: 4 of 4, nothing refused so far"
+            ),
+        ]
+    );
+    let first = findings.iter().find(|each| each.check == "limits");
+    let remedy = &first.unwrap().remedies[0];
+    assert_eq!(remedy.line, "limits: {participants: 2000}");
+    assert_eq!(
+        remedy.comment.as_deref(),
+        Some("up to 2.0 MiB more memory; forged participants also cause this")
+    );
+}
+
+#[test]
+fn nothing_watched_is_a_note_with_the_command() {
+    let findings = check(&answers(WELL, "{}"), "here", "1.0.0");
+    assert_eq!(severity(&findings, "watches"), Some(Severity::Note));
+}
+
+#[test]
+fn a_port_that_is_taken_keeps_an_agent_from_starting() {
+    let table = "  sl  local_address rem_address   st\n\
+            0: 0100007F:43F8 00000000:0000 0A 00000000:00000000\n\
+            1: 0100007F:43F9 00000000:0000 01 00000000:00000000\n";
+    let (_directory, host) = host(&[("/proc/net/tcp", table)]);
+    let findings = absent(&host, &Config::default(), "nobody", false);
+    let busy: Vec<_> = findings
+        .iter()
+        .filter(|each| each.check == "ports")
+        .collect();
+    assert_eq!(busy.len(), 1);
+    assert!(busy[0].sentence.contains("17400"), "{}", busy[0].sentence);
+    assert_eq!(
+        busy[0].remedies[1].line,
+        "metrics: {listen: 127.0.0.1:PORT}"
+    );
+    assert_eq!(severity(&findings, "reachable"), Some(Severity::Warning));
+}
+
+#[test]
+fn an_agent_that_may_not_be_asked_is_unknown_and_nothing_else_is_guessed() {
+    let (_directory, host) = host(&[]);
+    let findings = absent(&host, &Config::default(), "permission denied", true);
+    assert_eq!(findings.len(), 1);
+    assert_eq!(findings[0].severity, Severity::Unknown);
+}
+
+#[test]
+fn where_state_would_be_kept_is_looked_at() {
+    let (_directory, mut host) = host(&[("/var/lib/ros2probe/x", ""), ("/file", "")]);
+    let of =
+        |host: &HostState, choice| state_directory(host, &choice).map(|finding| finding.severity);
+    let at = |path: &str| StateChoice::At(path.into());
+    assert_eq!(of(&host, StateChoice::Off), None);
+    assert_eq!(of(&host, at("/nowhere")), Some(Severity::Note));
+    assert_eq!(of(&host, at("/file")), Some(Severity::Problem));
+    host.user_id = 0;
+    assert_eq!(of(&host, StateChoice::Auto), Some(Severity::Ok));
+    host.user_id = 4_000_000;
+    assert_eq!(of(&host, StateChoice::Auto), Some(Severity::Note));
+}
+
+#[test]
+fn a_wrong_configuration_is_a_problem_with_its_first_mistake() {
+    let finding = misconfigured(Path::new("/etc/x.yaml"), "x:1: bad\nx:2: worse");
+    assert_eq!(finding.severity, Severity::Problem);
+    assert_eq!(
+        finding.sentence,
+        "the configuration is wrong: x:1: bad (and 1 more)"
+    );
+}

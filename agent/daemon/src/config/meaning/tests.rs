@@ -1,0 +1,317 @@
+use std::fmt::Write as _;
+
+use super::*;
+
+fn report(source: &str) -> String {
+    parse(source.as_bytes()).map_or_else(|mistakes| mistakes.report("f"), |_| String::new())
+}
+
+#[test]
+fn an_empty_file_means_the_defaults() {
+    for empty in [
+        "",
+        "# nothing\n",
+        "---\n",
+        "watch:\nlimits:\ncapture:\nmetrics:\n",
+        "{}",
+    ] {
+        assert_eq!(parse(empty.as_bytes()), Ok(Config::default()), "{empty:?}");
+    }
+    assert!(Config::default().watches.is_empty());
+    assert_eq!(
+        Config::default().metrics.listen.unwrap().to_string(),
+        "127.0.0.1:17400"
+    );
+}
+
+#[test]
+fn every_mistake_is_reported_with_its_place() {
+    let source = "\
+watch:
+  - /points
+  - topic: /imu
+    min_rate: 5
+    max_loss_ratio: 3
+  - topik: /scan
+  - scan
+metrics:
+  listen: 17400
+  per_writer: maybe
+log: loud
+limtis: {}
+lgo: 1
+";
+    assert_eq!(
+        report(source),
+        "f:4:5: watch[1].min_rate: unknown key; did you mean `min_rate_hz`?\n\
+             f:5:21: watch[1].max_loss_ratio: is 3, must be between 0 and 1\n\
+             f:6:5: watch[2]: the key `topic` is missing\n\
+             f:6:5: watch[2].topik: unknown key; did you mean `topic`?\n\
+             f:7:5: watch[3]: must begin with a slash, as in `/points`\n\
+             f:9:11: metrics.listen: is `17400`, must be text\n\
+             f:10:15: metrics.per_writer: is the text `maybe`, must be true or false\n\
+             f:11:6: log: is the text `loud`, must be one of error, warn, info, debug, trace\n\
+             f:12:1: limtis: unknown key; did you mean `limits`?\n\
+             f:13:1: lgo: unknown key; did you mean `log`?"
+    );
+}
+
+#[test]
+fn what_types_cannot_say_is_checked_too() {
+    let source = "\
+watch:
+  - points
+  - {topic: /a b}
+capture:
+  interfaces: {include: ['eth[']}
+  network_namespaces: [robot]
+metrics: {listen: localhost}
+";
+    assert_eq!(
+        report(source),
+        "f:2:5: watch[0]: must begin with a slash, as in `/points`\n\
+             f:3:13: watch[1].topic: has the character ` `: ROS names have letters, digits and \
+             `_`, globs also `*`\n\
+             f:5:26: capture.interfaces.include[0]: unclosed character class; missing ']'\n\
+             f:6:24: capture.network_namespaces[0]: must be an absolute path, as in \
+             `/run/netns/robot`\n\
+             f:7:19: metrics.listen: is `localhost`, must be an IP address and port, as in \
+             `127.0.0.1:17400` or `[::1]:17400`, or `off`"
+    );
+}
+
+#[test]
+fn values_are_compared_with_each_other() {
+    let source = "\
+watch:
+  - {topic: /a, min_rate_hz: 5, max_rate_hz: 1}
+  - /x
+  - {topic: /x, domain: 3}
+  - /x
+";
+    assert_eq!(
+        report(source),
+        "f:2:46: watch[0].max_rate_hz: is 1, below min_rate_hz, which is 5\n\
+             f:5:5: watch[3]: repeats watch[1]"
+    );
+}
+
+#[test]
+fn what_belongs_to_the_other_source_is_a_mistake() {
+    let source = "\
+capture:
+  source: host
+  cgroup: robot.slice
+  interfaces: {include: [eth0], exclude: []}
+";
+    assert_eq!(
+        report(source),
+        "f:3:11: capture.cgroup: must be an absolute path, as in `/sys/fs/cgroup/robot.slice`"
+    );
+    let source = source.replace("robot.slice", "/cg");
+    assert_eq!(
+        report(&source),
+        "f:4:25: capture.interfaces.include: selects frames on a wire, which `source: host` \
+             does not look at; use mirror_interfaces or `source: wire`"
+    );
+    assert_eq!(
+        report(&source.replace("host", "auto")),
+        "f:4:25: capture.interfaces.include: makes the wire the source, for which cgroup has \
+             no meaning"
+    );
+    assert_eq!(
+        report("capture: {source: wire, mirror_interfaces: [mirror0], cgroup: /cg}"),
+        "f:1:44: capture.mirror_interfaces: has no meaning for `source: wire`\n\
+             f:1:63: capture.cgroup: has no meaning for `source: wire`"
+    );
+    assert_eq!(
+        report("capture: {source: both, mirror_interfaces: ['a b']}"),
+        "f:1:19: capture.source: is the text `both`, must be one of auto, host, wire\n\
+             f:1:45: capture.mirror_interfaces[0]: must be an interface name or glob, as in `eth*`"
+    );
+    for good in [
+        "capture: {source: host, mirror_interfaces: [mirror*], cgroup: /sys/fs/cgroup/robot}",
+        "capture: {source: wire, interfaces: {include: [eth0]}}",
+        "capture: {interfaces: {exclude: [docker*]}}",
+        "capture: {mirror_interfaces: [eth1]}",
+        "capture: {source: wire, mirror_interfaces: [], cgroup: }",
+    ] {
+        assert_eq!(report(good), "", "{good}");
+    }
+}
+
+#[test]
+fn an_otlp_section_is_checked_down_to_the_names_an_operator_chooses() {
+    let source = "\
+otlp:
+  endpoint: collector:4317
+  headers: {a: b, c: 3}
+  headers_file: secret
+  compression: zip
+  attributes: {site: roof, floor: [2]}
+";
+    assert_eq!(
+        report(source),
+        "f:2:13: otlp.endpoint: must be an URL of a gRPC receiver, as in \
+             `http://collector:4317`, or `off`\n\
+             f:3:22: otlp.headers.c: is `3`, must be text\n\
+             f:4:17: otlp.headers_file: must be an absolute path, as in \
+             `/etc/ros2probe/otlp.headers`\n\
+             f:5:16: otlp.compression: is the text `zip`, must be one of none, gzip\n\
+             f:6:35: otlp.attributes.floor: is a list, must be text"
+    );
+    assert_eq!(report("otlp: {endpoint: 'off', headers: }"), "");
+}
+
+#[test]
+fn a_version_that_is_known_or_left_out_changes_nothing() {
+    for same in [
+        "version: 1\nlog: debug\n",
+        "log: debug\n",
+        "log: debug\nversion: 1",
+    ] {
+        assert_eq!(
+            parse(same.as_bytes()).unwrap().log.label(),
+            "debug",
+            "{same}"
+        );
+    }
+    assert_eq!(
+        report("version: 0"),
+        "f:1:10: version: is 0, must be between 1 and 1"
+    );
+    assert_eq!(
+        report("version: '1'\nlgo: x"),
+        "f:1:10: version: is the text `1`, must be a whole number\n\
+             f:2:1: lgo: unknown key; did you mean `log`?"
+    );
+}
+
+#[test]
+fn of_a_newer_file_one_line_says_what_to_do() {
+    let newer = "watch: {points: {colour: red}}\nversion: 2\nclouds: 7\n";
+    let version = env!("CARGO_PKG_VERSION");
+    assert_eq!(
+        report(newer),
+        format!(
+            "f:2:10: version: is 2, this rp {version} reads up to 1: upgrade rp, or write the \
+                 file for version 1"
+        )
+    );
+}
+
+#[test]
+fn a_key_that_is_called_otherwise_is_named() {
+    assert_eq!(
+        report("watchlist: []"),
+        "f:1:1: watchlist: unknown key; it is called `watch`"
+    );
+    let source = "watch: [{topic: /a, max_delay_ms: 3}]";
+    assert!(report(source).ends_with("unknown key; it is called `max_latency_ms`"));
+}
+
+#[test]
+fn a_key_written_twice_is_reported() {
+    assert_eq!(
+        report("log: info\nlog: warn"),
+        "f:2:1: log: written twice, first at 1:6"
+    );
+}
+
+#[test]
+fn broken_yaml_is_reported_with_its_place() {
+    for (source, place) in [
+        ("watch: [", "f:2:1:"),
+        ("watch:\n\t- /a", "f:2:2:"),
+        ("a: 'x", "f:1:"),
+        ("--- 1\n--- 2\n", "f:2:1:"),
+        ("- 1", "f:1:1: is a list, must be a map of keys"),
+        ("? [a]\n: 1", "f:1:3:"),
+    ] {
+        let report = report(source);
+        assert!(report.starts_with(place), "{source:?}: {report}");
+        assert!(!report.contains('\n'), "{source:?}: {report}");
+    }
+    assert!(
+        parse(b"log: \xff")
+            .unwrap_err()
+            .report("f")
+            .starts_with("f:1:6: not UTF-8")
+    );
+}
+
+#[test]
+fn bombs_are_refused_quickly() {
+    let aliases = "a: &a [x,x]\nb: &b [*a,*a]\nc: [*b,*b]\n";
+    assert!(report(aliases).contains("aliases are not supported"));
+    assert!(report(&"[".repeat(200)).contains("nested too deep"));
+    assert!(report(&"[".repeat(100_000)).contains("recursion limit"));
+    let steps: String = (0..1000)
+        .map(|depth| format!("{}a:\n", " ".repeat(depth)))
+        .collect();
+    assert!(report(&steps).contains("nested too deep"));
+    let mut long = "watch:\n".to_owned();
+    (0..100_000)
+        .try_for_each(|i| writeln!(long, "  - /t{i}"))
+        .unwrap();
+    assert!(report(&long).contains("too many values"));
+    let mut many = "watch:\n".to_owned();
+    (0..2_000)
+        .try_for_each(|i| writeln!(many, "  - /t{i}"))
+        .unwrap();
+    assert!(report(&many).contains("f:2:3: watch: has 2000 entries"));
+    let mut wrong = "watch:\n".to_owned();
+    (0..500)
+        .try_for_each(|i| writeln!(wrong, "  - t{i}"))
+        .unwrap();
+    assert!(report(&wrong).ends_with("f: and 450 more"));
+}
+
+#[test]
+fn a_full_file_is_understood() {
+    let source = "\
+watch:
+  - /tf
+  - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
+     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true, trace: 0.25}
+limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
+capture:
+  source: wire
+  interfaces: {include: [eth*], exclude: [docker0]}
+  network_namespaces: [/run/netns/a]
+  ring_bytes: 4194304
+  record_ring_bytes: 65536
+metrics: {listen: 'off', histograms: false, per_writer: true}
+topic_grace_s: 60
+log: debug
+";
+    let config = parse(source.as_bytes()).unwrap();
+    let points = config.watches.get(1).unwrap();
+    assert_eq!(
+        (points.pattern.as_str(), points.domain_id),
+        ("/points", Some(DomainId(5)))
+    );
+    assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+    assert!((points.trace - 0.25).abs() < 1e-9);
+    assert!(points.per_subscriber && !config.watches.first().unwrap().per_subscriber);
+    assert_eq!(config.capture.source, SourceChoice::Wire);
+    assert_eq!(config.limits.unknown_writers, 8);
+    assert_eq!(config.capture.exclude_interfaces, ["docker0"]);
+    assert_eq!(config.metrics.listen, None);
+    assert_eq!(
+        (config.topic_grace, config.log.label()),
+        (Duration::from_mins(1), "debug")
+    );
+    assert_eq!(
+        Config::default().needs_restart(&config),
+        ["limits", "capture", "metrics.listen", "topic_grace_s"]
+    );
+}
+
+#[test]
+fn no_cut_of_a_good_file_panics() {
+    let source = include_bytes!("../../../../../config/ros2probe.yaml");
+    for end in 0..source.len() {
+        let _ = parse(source.get(..end).unwrap());
+    }
+}

@@ -1,0 +1,290 @@
+use ros2probe_wire::{DomainId, EntityId, GuidPrefix};
+
+use super::*;
+use crate::subscriptions::{Missed, MissedReason};
+use ros2probe_bag::Options;
+
+const KEEPER: &str = r#"{"reliability": "RELIABLE", "durability": "TRANSIENT_LOCAL",
+        "history": "KEEP_LAST (1)", "deadline_seconds": null, "lifespan_seconds": null,
+        "liveliness": "AUTOMATIC", "liveliness_lease_seconds": null}"#;
+
+fn writer(number: u8) -> Guid {
+    Guid {
+        prefix: GuidPrefix([number; 12]),
+        entity: EntityId([0, 0, number, 3]),
+    }
+}
+
+fn topic(name: &str, message_type: &str) -> Arc<Topic> {
+    Arc::new(Topic {
+        domain_id: DomainId(0),
+        name: name.into(),
+        dds_name: format!("rt{name}").into(),
+        message_type: message_type.into(),
+        offered: None,
+    })
+}
+
+fn sample(name: &str, number: u64) -> Item {
+    Item::Sample(Arc::new(Sample {
+        topic: topic(name, "std_msgs/msg/String"),
+        time: Timestamp(1_000 + number),
+        writer: writer(1),
+        sequence_number: number,
+        source_timestamp: Some(Timestamp(number)),
+        header_stamp: None,
+        size: 12,
+        sampled: false,
+        payload: Some(vec![0, 1, 0, 0, 4, 0, 0, 0, b'a', b'b', b'c', 0].into()),
+    }))
+}
+
+fn durable_publishers() -> DiscoveredTopic {
+    let publishers = format!(r#"[{{"guid": "{}", "qos": {KEEPER}}}]"#, writer(1));
+    let json = format!(
+        r#"{{"message_types": [], "type_hashes": [], "publishers": {publishers},
+                "subscriptions": []}}"#
+    );
+    let topic: ros2probe_api::topics::Topic<'_> = serde_json::from_str(&json).unwrap();
+    DiscoveredTopic::from(&topic)
+}
+
+/// A publisher of `/tf_static` that keeps its samples.
+fn static_transforms() -> GraphSnapshot {
+    GraphSnapshot {
+        topics: vec![PublishedTopic {
+            name: "/tf_static".to_owned(),
+            subscribed: true,
+            durable_publishers: vec![writer(1).to_string()],
+            ..PublishedTopic::default()
+        }],
+        ..GraphSnapshot::default()
+    }
+}
+
+fn recorder(directory: &std::path::Path, options: FilterOptions) -> Recorder<'static> {
+    recorder_of(
+        directory,
+        options,
+        GraphSnapshot::default(),
+        static_transforms(),
+    )
+}
+
+/// With what is there when it begins and when it ends.
+fn recorder_of(
+    directory: &std::path::Path,
+    options: FilterOptions,
+    before: GraphSnapshot,
+    after: GraphSnapshot,
+) -> Recorder<'static> {
+    let sources = Sources {
+        graph: Box::new(move || after.clone()),
+        announced: Box::new(|names| {
+            let announced = names.iter().map(|name| match name.as_str() {
+                "/tf_static" => durable_publishers(),
+                _ => DiscoveredTopic::default(),
+            });
+            announced.collect()
+        }),
+        schema: Box::new(|_, _| None),
+    };
+    let bag = Writer::create(directory, Options::default()).unwrap();
+    Recorder::new(bag, Filter::new(options).unwrap(), 0, before, sources)
+}
+
+fn numbers(ended: &Finished) -> Vec<(String, u32)> {
+    let mut found = Vec::new();
+    for file in &ended.summary.as_ref().unwrap().files {
+        let bytes = std::fs::read(file).unwrap();
+        for message in mcap::MessageStream::new(&bytes).unwrap() {
+            let message = message.unwrap();
+            found.push((message.channel.topic.clone(), message.sequence));
+        }
+    }
+    found
+}
+
+#[test]
+fn what_the_filter_takes_is_in_the_bag_and_what_is_missing_in_the_report() {
+    let directory = tempfile::tempdir().unwrap();
+    let options = FilterOptions {
+        exclude_topics: vec!["/noise".to_owned()],
+        ..FilterOptions::everything()
+    };
+    let mut recorder = recorder(&directory.path().join("bag"), options);
+    for item in [sample("/a", 1), sample("/noise", 1), sample("/a", 2)] {
+        recorder.take(&item).unwrap();
+    }
+    let missed = |name| {
+        Item::Missed(Missed {
+            topic: topic(name, "std_msgs/msg/String"),
+            writer: writer(1),
+            first: 3,
+            last: 4,
+            samples: 2,
+            reason: MissedReason::QueueFull,
+        })
+    };
+    recorder.take(&missed("/a")).unwrap();
+    recorder.take(&missed("/noise")).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(
+        numbers(&ended),
+        [("/a".to_owned(), 1), ("/a".to_owned(), 2)]
+    );
+    assert_eq!((ended.report.messages, ended.report.missing), (2, 2));
+    assert_eq!(ended.report.topics.keys().collect::<Vec<_>>(), ["/a"]);
+    let metadata = ended.summary.unwrap().directory.join("metadata.yaml");
+    assert!(
+        std::fs::read_to_string(metadata)
+            .unwrap()
+            .contains("first_sequence_number")
+    );
+}
+
+#[test]
+fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
+    let directory = tempfile::tempdir().unwrap();
+    let limits = crate::config::RecordingLimits {
+        max_bytes: Some(10_000),
+        ..Default::default()
+    };
+    let quota = DiskQuota::new(directory.path(), limits);
+    let mut recorder =
+        recorder(&directory.path().join("bag"), FilterOptions::everything()).within(quota);
+    let refused = (1..).find_map(|number| recorder.take(&sample("/a", number)).err());
+    let ended = recorder.finish(refused);
+    let limit = ended.report.limit_reached.clone().unwrap();
+    assert!(limit.contains("recordings.max_bytes"), "{limit}");
+    assert_eq!(ended.report.missing, 0);
+    assert_eq!(numbers(&ended).len() as u64, ended.report.messages);
+    assert!(
+        (50..250).contains(&ended.report.messages),
+        "{:?}",
+        ended.report
+    );
+    assert!(
+        ended
+            .report
+            .shortfalls()
+            .concat()
+            .contains("ended by a limit")
+    );
+}
+
+#[test]
+fn samples_go_by_while_it_is_paused() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    recorder.take(&sample("/a", 1)).unwrap();
+    recorder.pause(true);
+    recorder.take(&sample("/a", 2)).unwrap();
+    recorder.pause(false);
+    recorder.take(&sample("/a", 3)).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(numbers(&ended).len(), 2);
+    assert_eq!(
+        (ended.report.topics["/a"].paused, ended.report.missing),
+        (1, 0)
+    );
+}
+
+#[test]
+fn a_topic_of_two_types_keeps_the_first_and_says_so() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    recorder.take(&sample("/a", 1)).unwrap();
+    let Item::Sample(other) = sample("/a", 2) else {
+        unreachable!()
+    };
+    let other = Sample {
+        topic: topic("/a", "std_msgs/msg/Int32"),
+        ..Sample::clone(&other)
+    };
+    recorder.take(&Item::Sample(Arc::new(other))).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(numbers(&ended).len(), 1);
+    assert_eq!(ended.report.left_out, ["/a"]);
+    assert!(ended.report.shortfalls()[0].ends_with("other types than the first are not recorded"));
+}
+
+#[test]
+fn what_publishers_sent_before_is_named_unless_it_is_there() {
+    for (number, expected) in [(1, 0), (2, 1)] {
+        let directory = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+        recorder.take(&sample("/tf_static", number)).unwrap();
+        recorder.take(&sample("/a", 2)).unwrap();
+        assert_eq!(recorder.finish(None).report.sent_before.len(), expected);
+    }
+    // Nothing came at all: it is in the bag by its name.
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    let topics = [
+        ("/tf_static", "tf2_msgs/msg/TFMessage"),
+        ("/nobody", "std_msgs/msg/String"),
+    ];
+    recorder.declare(topics).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!(ended.report.sent_before, ["/tf_static"]);
+    assert_eq!(ended.report.topics.len(), 1);
+}
+
+#[test]
+fn what_came_is_on_the_disk_after_a_second_of_samples() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = directory.path().join("bag");
+    let mut recorder = recorder(&bag, FilterOptions::everything());
+    recorder.take(&Item::Clock(Timestamp(1))).unwrap();
+    recorder.take(&sample("/a", 1)).unwrap();
+    let size = || std::fs::metadata(bag.join("bag_0.mcap")).unwrap().len();
+    let before = size();
+    recorder.take(&Item::Clock(Timestamp(SECOND + 1))).unwrap();
+    assert!(size() > before);
+}
+
+#[test]
+fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
+    let topic = |domain_id, name: &str, other_transport: Option<&str>, messages| PublishedTopic {
+        domain_id,
+        name: name.to_owned(),
+        subscribed: name != "/alone",
+        other_transport: other_transport.map(str::to_owned),
+        messages,
+        ..PublishedTopic::default()
+    };
+    let graph = |writers: &[(&str, u64)], others: u64| GraphSnapshot {
+        topics: vec![
+            topic(0, "/alone", None, None),
+            topic(0, "/quiet", None, None),
+            topic(0, "/a", Some("same_process"), None),
+            topic(0, "/imu", Some("same_process"), None),
+            topic(7, "/imu", None, Some(others)),
+            topic(7, "/odom", None, Some(0)),
+            topic(8, "/imu", None, None),
+        ],
+        unknown_writers: writers
+            .iter()
+            .map(|(writer, messages)| ((*writer).to_owned(), *messages))
+            .collect(),
+    };
+    let directory = tempfile::tempdir().unwrap();
+    let before = graph(&[("01", 5), ("02", 7)], 100);
+    let after = graph(&[("01", 5), ("02", 10), ("03", 1)], 140);
+    let bag = directory.path().join("bag");
+    let mut recorder = recorder_of(&bag, FilterOptions::everything(), before, after);
+    recorder.take(&sample("/a", 1)).unwrap();
+    let report = recorder.finish(None).report;
+    let why = |name: &str| report.unobserved.get(name).map(String::as_str);
+    assert_eq!(report.unobserved.len(), 2);
+    assert_eq!(why("/alone"), Some(NO_SUBSCRIBER));
+    assert_eq!(why("/imu"), Some("same_process"));
+    let unknown = report.unknown_writers;
+    assert_eq!((unknown.writers, unknown.messages), (2, 4));
+    let others = report.other_domains.iter();
+    let others: Vec<_> = others
+        .map(|each| (each.domain_id, each.topics, each.messages))
+        .collect();
+    assert_eq!(others, [(7, 2, Some(40)), (8, 1, None)]);
+}
