@@ -176,12 +176,12 @@ pub(crate) fn print_text(text: &str) -> Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// As [`say`]; a refusal goes to stderr.
+/// As [`print_text`]; a refusal goes to stderr.
 pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
     print_text(&text.map_err(|refused| UserError(refused.0))?)
 }
 
-/// As [`say`]; where there is nothing, the exit code says so alone.
+/// As [`print_text`]; where there is nothing, the exit code says so alone.
 pub(crate) fn print_or_fail(text: Option<&str>) -> Result<ExitCode> {
     match text {
         Some(text) => print_text(text),
