@@ -7,7 +7,7 @@ use ros2probe_wire::Timestamp;
 
 use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
-use crate::subscriptions;
+use ros2probe_model::payloads::MissedReason;
 
 /// One moment of the agent.
 #[derive(Clone, Debug)]
@@ -67,7 +67,7 @@ pub struct AgentFacts {
     /// asked for.
     pub exact: Vec<ExactFacts>,
     /// Who gets messages one by one.
-    pub subscriptions: subscriptions::Facts,
+    pub subscriptions: SubscriptionFacts,
     /// What keeps the agent from system calls that it does not make.
     pub sandbox: Sandbox,
 }
@@ -170,7 +170,7 @@ impl AgentFacts {
             state: None,
             shared_memory: None,
             exact: Vec::new(),
-            subscriptions: subscriptions::Facts::default(),
+            subscriptions: SubscriptionFacts::default(),
             sandbox: privilege::sandbox(),
         }
     }
@@ -227,4 +227,23 @@ impl Ability {
             Self::SharedMemoryExact => "shared_memory_exact",
         }
     }
+}
+
+/// Figures of all subscriptions.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SubscriptionFacts {
+    /// Open ones.
+    pub open: usize,
+    /// Refused ones so far.
+    pub refused: u64,
+    /// Samples put into queues so far, for each reader.
+    pub given: u64,
+    /// Samples not given so far, for each reader, in the order of [`MissedReason::ALL`].
+    pub missed: [u64; MissedReason::ALL.len()],
+    /// Of those, samples that had to go because all queues together were full.
+    pub crowded_out: u64,
+    /// Bytes that wait in queues.
+    pub queued_bytes: usize,
+    /// Bytes of messages that are retained.
+    pub retained_bytes: usize,
 }

@@ -18,6 +18,7 @@ use arc_swap::{ArcSwap, ArcSwapOption};
 use ros2probe_wire::Timestamp;
 use tokio_util::sync::CancellationToken;
 
+use crate::agent_facts::SubscriptionFacts;
 use crate::config::watch::{MAX_GLOB_BYTES, MAX_GLOBS};
 use crate::config::{Watch, check_globs};
 use crate::snapshot_cell::SnapshotCell;
@@ -141,25 +142,6 @@ pub struct Subscription {
     all: Arc<Subscriptions>,
 }
 
-/// What the subscriptions cost and lose.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Facts {
-    /// Open ones.
-    pub open: usize,
-    /// Refused ones so far.
-    pub refused: u64,
-    /// Samples put into queues so far, for each reader.
-    pub given: u64,
-    /// Samples not given so far, for each reader, in the order of [`MissedReason::ALL`].
-    pub missed: [u64; MissedReason::ALL.len()],
-    /// Of those, samples that had to go because all queues together were full.
-    pub crowded_out: u64,
-    /// Bytes that wait in queues.
-    pub queued_bytes: usize,
-    /// Bytes of messages that are retained.
-    pub retained_bytes: usize,
-}
-
 impl Subscriptions {
     /// None yet. What waits for a reader waits no longer than until `stop`.
     #[must_use]
@@ -217,9 +199,9 @@ impl Subscriptions {
 
     /// What they cost and lose.
     #[must_use]
-    pub fn facts(&self) -> Facts {
+    pub fn facts(&self) -> SubscriptionFacts {
         let missed = self.missed.each_ref();
-        Facts {
+        SubscriptionFacts {
             open: self.channels.load().len(),
             refused: self.refused.load(Ordering::Relaxed),
             given: self.given.load(Ordering::Relaxed),
