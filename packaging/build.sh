@@ -64,24 +64,28 @@ gzip -9n "$parts/changelog"
 # The libraries that are linked in, with their licences; a text that several share is there once.
 libraries() {
     local sources=${CARGO_HOME:-$HOME/.cargo}/registry/src name number licence file sum
-    declare -A users texts
-    local sums=()
+    declare -A library users texts
+    local files=() sums=()
     printf 'Libraries that are linked into rp %s, and their licences\n\n' "$version"
     while read -r name number licence; do
         number=${number#v}
         printf '%s %s: %s\n' "$name" "$number" "$licence"
         for file in "$sources"/*/"$name-$number"/{LICEN[CS]E,COPYING,COPYRIGHT,NOTICE}*; do
             [ -f "$file" ] || continue
-            sum=$(sha256sum <"$file")
-            [ -n "${texts[$sum]-}" ] || sums+=("$sum")
-            texts[$sum]=$file
-            case " ${users[$sum]-} " in
-            *" $name "*) ;;
-            *) users[$sum]="${users[$sum]-}${users[$sum]+ }$name" ;;
-            esac
+            files+=("$file")
+            library[$file]=$name
         done
     done < <(cd "$root" && cargo tree --locked --package ros2probe --edges normal --target "$target" \
         --prefix none --format '{p} {l}' | sed 's| (\*)$||; s| ([^)]*)||g' | grep -v '^ros2probe' | sort -u)
+    while read -r sum file; do
+        [ -n "${texts[$sum]-}" ] || sums+=("$sum")
+        texts[$sum]=$file
+        name=${library[$file]}
+        case " ${users[$sum]-} " in
+        *" $name "*) ;;
+        *) users[$sum]="${users[$sum]-}${users[$sum]+ }$name" ;;
+        esac
+    done < <(sha256sum "${files[@]}")
     for sum in "${sums[@]}"; do
         printf '\n\n==== %s\n\n' "${users[$sum]}"
         cat "${texts[$sum]}"

@@ -18,6 +18,7 @@ extern crate self as ros2probe_wire;
 pub mod cursor;
 #[cfg(feature = "alloc")]
 pub mod discovery;
+mod domain;
 #[cfg(feature = "alloc")]
 pub mod entities;
 pub mod filter;
@@ -39,6 +40,7 @@ pub mod time;
 pub mod walk;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
+pub use domain::DomainId;
 pub use guid::{EntityId, Guid, GuidPrefix};
 pub use record::Record;
 pub use time::{Duration, RtpsTime, Timestamp};

@@ -91,7 +91,7 @@ name!(
 
 /// What a DDS topic is to ROS.
 #[derive(Clone, PartialEq, Eq, Debug)]
-pub enum TopicKind {
+pub enum Demangled {
     /// A topic, also one that belongs to an action or a service's introspection.
     Topic(RosName),
     /// `_buf_cpu` beside a topic (`rmw_fastrtps` 9.4.6 and later): the topic's messages for
@@ -109,7 +109,7 @@ pub enum TopicKind {
     NotRos,
 }
 
-impl TopicKind {
+impl Demangled {
     /// The ROS topic the samples belong to; `None` for services and what is not ROS.
     #[must_use]
     pub const fn topic(&self) -> Option<&RosName> {
@@ -143,30 +143,30 @@ impl DdsTopic {
 
     /// What it is to ROS.
     #[must_use]
-    pub fn kind(&self) -> TopicKind {
+    pub fn demangle(&self) -> Demangled {
         let ros = |text: &str| RosName(text.into());
         let named = |name: &str| name.len() > 1 && name.starts_with('/');
         if self.as_str() == DISCOVERY {
-            return TopicKind::RosDiscovery;
+            return Demangled::RosDiscovery;
         }
         let Some((prefix, name)) = self.as_str().split_at_checked(2) else {
-            return TopicKind::NotRos;
+            return Demangled::NotRos;
         };
         match prefix {
             "rt" if named(name) => match buffer_base(name) {
-                Some((base, true)) => TopicKind::CpuBuffer(ros(base)),
-                Some((base, false)) => TopicKind::Buffer(ros(base)),
-                None => TopicKind::Topic(ros(name)),
+                Some((base, true)) => Demangled::CpuBuffer(ros(base)),
+                Some((base, false)) => Demangled::Buffer(ros(base)),
+                None => Demangled::Topic(ros(name)),
             },
             "rq" => match name.strip_suffix(REQUEST).filter(|name| named(name)) {
-                Some(service) => TopicKind::ServiceRequest(ros(service)),
-                None => TopicKind::NotRos,
+                Some(service) => Demangled::ServiceRequest(ros(service)),
+                None => Demangled::NotRos,
             },
             "rr" => match name.strip_suffix(REPLY).filter(|name| named(name)) {
-                Some(service) => TopicKind::ServiceReply(ros(service)),
-                None => TopicKind::NotRos,
+                Some(service) => Demangled::ServiceReply(ros(service)),
+                None => Demangled::NotRos,
             },
-            _ => TopicKind::NotRos,
+            _ => Demangled::NotRos,
         }
     }
 
@@ -310,16 +310,22 @@ mod tests {
         RosName::parse(text).unwrap()
     }
 
-    fn kind(text: &str) -> TopicKind {
-        DdsTopic::parse(text).unwrap().kind()
+    fn demangle(text: &str) -> Demangled {
+        DdsTopic::parse(text).unwrap().demangle()
     }
 
     #[test]
     fn topics_and_services_lose_prefix_and_suffix() {
-        assert_eq!(kind("rt/a/b"), TopicKind::Topic(ros("/a/b")));
-        assert_eq!(kind("rq/sRequest"), TopicKind::ServiceRequest(ros("/s")));
-        assert_eq!(kind("rr/n/sReply"), TopicKind::ServiceReply(ros("/n/s")));
-        assert_eq!(kind("ros_discovery_info"), TopicKind::RosDiscovery);
+        assert_eq!(demangle("rt/a/b"), Demangled::Topic(ros("/a/b")));
+        assert_eq!(
+            demangle("rq/sRequest"),
+            Demangled::ServiceRequest(ros("/s"))
+        );
+        assert_eq!(
+            demangle("rr/n/sReply"),
+            Demangled::ServiceReply(ros("/n/s"))
+        );
+        assert_eq!(demangle("ros_discovery_info"), Demangled::RosDiscovery);
     }
 
     #[test]
@@ -335,32 +341,32 @@ mod tests {
             "r",
             "rqRequest",
         ] {
-            assert_eq!(kind(name), TopicKind::NotRos, "{name}");
+            assert_eq!(demangle(name), Demangled::NotRos, "{name}");
         }
         // A character boundary that is not at two bytes.
-        assert_eq!(kind("€t/a"), TopicKind::NotRos);
+        assert_eq!(demangle("€t/a"), Demangled::NotRos);
     }
 
     #[test]
     fn buffer_topics_count_for_their_base() {
         assert_eq!(
-            kind("rt/camera/image/_buf_cpu"),
-            TopicKind::CpuBuffer(ros("/camera/image"))
+            demangle("rt/camera/image/_buf_cpu"),
+            Demangled::CpuBuffer(ros("/camera/image"))
         );
         assert_eq!(
-            kind("rt/image/_buf/010f0a"),
-            TopicKind::Buffer(ros("/image"))
+            demangle("rt/image/_buf/010f0a"),
+            Demangled::Buffer(ros("/image"))
         );
         assert_eq!(
-            kind("rt/image/_buf/other"),
-            TopicKind::Topic(ros("/image/_buf/other"))
+            demangle("rt/image/_buf/other"),
+            Demangled::Topic(ros("/image/_buf/other"))
         );
-        assert_eq!(kind("rt/_buf_cpu"), TopicKind::Topic(ros("/_buf_cpu")));
+        assert_eq!(demangle("rt/_buf_cpu"), Demangled::Topic(ros("/_buf_cpu")));
     }
 
     #[test]
     fn actions_are_recognized_by_their_parts() {
-        let TopicKind::ServiceRequest(service) = kind("rq/arm/_action/send_goalRequest") else {
+        let Demangled::ServiceRequest(service) = demangle("rq/arm/_action/send_goalRequest") else {
             panic!("not a service");
         };
         assert_eq!(service.action(), Some((ros("/arm"), ActionPart::SendGoal)));
@@ -426,17 +432,17 @@ mod tests {
         #[test]
         fn mangling_comes_back(name in "(/[a-z][a-zA-Z0-9_]{0,8}){1,4}") {
             let name = ros(&name);
-            prop_assert_eq!(DdsTopic::of_topic(&name).kind(), TopicKind::Topic(name.clone()));
-            let requests = DdsTopic::of_requests(&name).kind();
-            prop_assert_eq!(requests, TopicKind::ServiceRequest(name.clone()));
-            let replies = DdsTopic::of_replies(&name).kind();
-            prop_assert_eq!(replies, TopicKind::ServiceReply(name));
+            prop_assert_eq!(DdsTopic::of_topic(&name).demangle(), Demangled::Topic(name.clone()));
+            let requests = DdsTopic::of_requests(&name).demangle();
+            prop_assert_eq!(requests, Demangled::ServiceRequest(name.clone()));
+            let replies = DdsTopic::of_replies(&name).demangle();
+            prop_assert_eq!(replies, Demangled::ServiceReply(name));
         }
 
         #[test]
         fn no_text_makes_it_panic(text in ".{1,40}") {
             if let Ok(topic) = DdsTopic::parse(&text) {
-                let _ = topic.kind();
+                let _ = topic.demangle();
             }
             if let Ok(name) = RosName::parse(&text) {
                 let _ = (name.action(), name.service_of_events(), name.is_hidden());

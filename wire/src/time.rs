@@ -2,6 +2,8 @@
 
 /// One second in nanoseconds, the unit of [`Timestamp`].
 pub const SECOND: u64 = 1_000_000_000;
+/// One millisecond in nanoseconds.
+pub const MILLISECOND: u64 = 1_000_000;
 
 /// Nanoseconds since the Unix epoch. The agent's only clock reading; always passed in.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]

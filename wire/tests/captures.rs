@@ -23,7 +23,7 @@ use ros2probe_wire::discovery::{
 };
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::frame::{self, Link};
-use ros2probe_wire::names::TopicKind;
+use ros2probe_wire::names::Demangled;
 use ros2probe_wire::rtps::{InlineQos, Locator, LocatorKind, Payload};
 use ros2probe_wire::{Duration, EntityId, Guid};
 use serde_json::{Value, json};
@@ -124,7 +124,7 @@ impl Found {
     ) {
         match discovery::endpoint(role, vendor, payload, inline_qos).unwrap() {
             Discovery::Alive(endpoint) => {
-                if endpoint.topic.kind() == TopicKind::RosDiscovery && role == Role::Writer {
+                if endpoint.topic.demangle() == Demangled::RosDiscovery && role == Role::Writer {
                     self.discovery_info_writers.insert(endpoint.guid);
                 }
                 self.endpoints.entry(endpoint.guid).or_insert(endpoint);
@@ -313,7 +313,7 @@ fn check_participants(facts: &Value, found: &Found) {
         let domain = theirs["other"]["0x000f"].as_str();
         let ours = participant
             .domain_id
-            .map(|id| id.to_le_bytes().map(|b| format!("{b:02x}")));
+            .map(|id| id.0.to_le_bytes().map(|b| format!("{b:02x}")));
         assert_eq!(
             domain.map(Into::into),
             ours.map(|bytes| bytes.concat()),
@@ -349,48 +349,7 @@ fn check_endpoints(facts: &Value, found: &Found) {
             "type",
             &json!(endpoint.type_name.as_str()),
         );
-        check(
-            &context,
-            theirs,
-            "reliability",
-            &json!(endpoint.qos.reliability.to_string()),
-        );
-        check(
-            &context,
-            theirs,
-            "durability",
-            &json!(endpoint.qos.durability.to_string()),
-        );
-        check(
-            &context,
-            theirs,
-            "lifespan",
-            &seconds(endpoint.qos.lifespan),
-        );
-        check(
-            &context,
-            theirs,
-            "deadline",
-            &seconds(endpoint.qos.deadline),
-        );
-        check(
-            &context,
-            theirs,
-            "unicast_locator",
-            &locators(&endpoint.unicast),
-        );
-        let lease = seconds(endpoint.qos.liveliness_lease);
-        check(
-            &context,
-            theirs,
-            "liveliness",
-            &json!([endpoint.qos.liveliness.to_string(), lease]),
-        );
-        let history = endpoint.qos.history;
-        let text = history.map(|history| format!("{}({})", history.kind, history.depth));
-        check(&context, theirs, "history", &json!(text));
-        let is_fast = theirs["vendor"] == "1.15";
-        assert_eq!(history.is_none(), is_fast, "{context}: history");
+        check_qos(&context, theirs, endpoint);
         let hash = theirs["user_data"].as_str().and_then(|text| {
             Some(
                 text.split_once("typehash=")?
@@ -405,18 +364,53 @@ fn check_endpoints(facts: &Value, found: &Found) {
             endpoint.type_hash.map(|hash| hash.to_string()),
             "{context}"
         );
-        if theirs.get("reliability").is_none() {
-            let default = if endpoint.role == Role::Writer {
-                "RELIABLE"
-            } else {
-                "BEST_EFFORT"
-            };
-            assert_eq!(endpoint.qos.reliability.to_string(), default);
-        }
         assert!(
             !endpoint.is_truncated && endpoint.qos.partitions.is_empty(),
             "{context}"
         );
+    }
+}
+
+fn check_qos(context: &str, theirs: &Value, endpoint: &EndpointAnnouncement) {
+    check(
+        context,
+        theirs,
+        "reliability",
+        &json!(endpoint.qos.reliability.to_string()),
+    );
+    check(
+        context,
+        theirs,
+        "durability",
+        &json!(endpoint.qos.durability.to_string()),
+    );
+    check(context, theirs, "lifespan", &seconds(endpoint.qos.lifespan));
+    check(context, theirs, "deadline", &seconds(endpoint.qos.deadline));
+    check(
+        context,
+        theirs,
+        "unicast_locator",
+        &locators(&endpoint.unicast),
+    );
+    let lease = seconds(endpoint.qos.liveliness_lease);
+    check(
+        context,
+        theirs,
+        "liveliness",
+        &json!([endpoint.qos.liveliness.to_string(), lease]),
+    );
+    let history = endpoint.qos.history;
+    let text = history.map(|history| format!("{}({})", history.kind, history.depth));
+    check(context, theirs, "history", &json!(text));
+    let is_fast = theirs["vendor"] == "1.15";
+    assert_eq!(history.is_none(), is_fast, "{context}: history");
+    if theirs.get("reliability").is_none() {
+        let default = if endpoint.role == Role::Writer {
+            "RELIABLE"
+        } else {
+            "BEST_EFFORT"
+        };
+        assert_eq!(endpoint.qos.reliability.to_string(), default);
     }
 }
 

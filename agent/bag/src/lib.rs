@@ -39,16 +39,22 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+#![forbid(unsafe_code)]
+
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 
+use rustix::fs::OFlags;
+
 pub mod compression;
 mod file;
+mod file_compression;
 pub mod info;
 pub mod mcap;
 pub mod metadata;
+mod metadata_file;
 pub mod options;
 pub mod qos;
 pub mod read;
@@ -56,10 +62,9 @@ pub mod reindex;
 mod writer;
 
 pub use compression::{Compression, Progress};
+pub use file_compression::{Compressed, FileCompression};
 pub use options::{Form, Options, Storage};
-pub use writer::{
-    Compressed, FileCompression, Schema, Summary, TopicDescription, TopicId, TopicSummary, Writer,
-};
+pub use writer::{Schema, Summary, TopicDescription, TopicId, TopicSummary, Writer};
 
 /// Why a bag cannot be written. After an error a file is valid up to its last flushed chunk.
 #[derive(Debug, thiserror::Error)]
@@ -120,6 +125,13 @@ pub enum Error {
     },
 }
 
+fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".");
+    name.push(suffix);
+    PathBuf::from(name)
+}
+
 /// Makes a file of a bag, which must not exist: for its owner, and for the group to read.
 fn new_file(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
@@ -129,7 +141,8 @@ fn new_file(path: &Path) -> io::Result<File> {
 /// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
 /// open file is checked, so nothing can take its place in between.
 fn open_file(path: &Path) -> io::Result<File> {
-    let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
+    let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+    let flags = flags.bits().cast_signed();
     let mut options = OpenOptions::new();
     let file = options.read(true).custom_flags(flags).open(path)?;
     match file.metadata()?.is_file() {

@@ -4,7 +4,11 @@
 //! read again from files that were never finished. Knows nothing of files or of ROS. Reading is
 //! bounded: a length is believed only when its bytes are there.
 
+mod fields;
+
 use std::collections::BTreeMap;
+
+use fields::{Cursor, length, numbers, text, texts};
 
 /// Begins and ends a file.
 pub const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
@@ -485,90 +489,6 @@ pub fn next_record(bytes: &[u8]) -> Option<(Opcode, &[u8], &[u8])> {
     let length = usize::try_from(cursor.u64()?).ok()?;
     let content = cursor.take(length)?;
     Some((opcode, content, cursor.0))
-}
-
-fn length(out: &mut Vec<u8>, length: usize) {
-    // Nothing here comes near 4 GiB: names, definitions and lists are bounded where they enter.
-    let length = u32::try_from(length).unwrap_or(u32::MAX);
-    out.extend_from_slice(&length.to_le_bytes());
-}
-
-fn text(out: &mut Vec<u8>, text: &str) {
-    length(out, text.len());
-    out.extend_from_slice(text.as_bytes());
-}
-
-fn texts(out: &mut Vec<u8>, map: &BTreeMap<String, String>) {
-    let bytes = map.iter().map(|(key, value)| 8 + key.len() + value.len());
-    length(out, bytes.sum());
-    for (key, value) in map {
-        text(out, key);
-        text(out, value);
-    }
-}
-
-fn numbers(out: &mut Vec<u8>, map: &BTreeMap<u16, u64>) {
-    length(out, map.len() * 10);
-    for (key, value) in map {
-        out.extend_from_slice(&key.to_le_bytes());
-        out.extend_from_slice(&value.to_le_bytes());
-    }
-}
-
-/// What is left to read.
-struct Cursor<'a>(&'a [u8]);
-
-impl<'a> Cursor<'a> {
-    fn take(&mut self, length: usize) -> Option<&'a [u8]> {
-        let (taken, rest) = self.0.split_at_checked(length)?;
-        self.0 = rest;
-        Some(taken)
-    }
-
-    fn array<const N: usize>(&mut self) -> Option<[u8; N]> {
-        let (taken, rest) = self.0.split_first_chunk::<N>()?;
-        self.0 = rest;
-        Some(*taken)
-    }
-
-    fn u16(&mut self) -> Option<u16> {
-        self.array().map(u16::from_le_bytes)
-    }
-
-    fn u32(&mut self) -> Option<u32> {
-        self.array().map(u32::from_le_bytes)
-    }
-
-    fn u64(&mut self) -> Option<u64> {
-        self.array().map(u64::from_le_bytes)
-    }
-
-    fn sized(&mut self) -> Option<&'a [u8]> {
-        let length = self.u32()?;
-        self.take(usize::try_from(length).ok()?)
-    }
-
-    fn text(&mut self) -> Option<&'a str> {
-        std::str::from_utf8(self.sized()?).ok()
-    }
-
-    fn texts(&mut self) -> Option<BTreeMap<String, String>> {
-        let mut entries = Cursor(self.sized()?);
-        let mut map = BTreeMap::new();
-        while !entries.0.is_empty() {
-            map.insert(entries.text()?.to_owned(), entries.text()?.to_owned());
-        }
-        Some(map)
-    }
-
-    fn numbers(&mut self) -> Option<BTreeMap<u16, u64>> {
-        let mut entries = Cursor(self.sized()?);
-        let mut map = BTreeMap::new();
-        while !entries.0.is_empty() {
-            map.insert(entries.u16()?, entries.u64()?);
-        }
-        Some(map)
-    }
 }
 
 #[cfg(test)]

@@ -277,22 +277,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
                     return Ok(scan);
                 };
                 let index = read_chunk(&chunk, &mut records.expands, &mut scan, each)?;
-                indexed = Some(IndexedChunk {
-                    chunk: ChunkIndex {
-                        start: chunk.start,
-                        end: chunk.end,
-                        offset: start,
-                        length: records.position - start,
-                        message_indexes: BTreeMap::new(),
-                        message_indexes_length: 0,
-                        compression: chunk.compression.to_owned(),
-                        compressed_size: chunk.records.len() as u64,
-                        uncompressed_size: chunk.uncompressed_size,
-                    },
-                    offsets: BTreeMap::new(),
-                    length: 0,
-                    index,
-                });
+                indexed = Some(IndexedChunk::new(&chunk, start, records.position, index));
             }
             Opcode::MESSAGE => {
                 if let Some(message) = Message::read(&content) {
@@ -325,6 +310,28 @@ struct IndexedChunk {
     length: u64,
     /// What they should say.
     index: BTreeMap<u16, Vec<(u64, u64)>>,
+}
+
+impl IndexedChunk {
+    /// Of a record from `start` to `end`, before its message indexes.
+    fn new(chunk: &Chunk<'_>, start: u64, end: u64, index: BTreeMap<u16, Vec<(u64, u64)>>) -> Self {
+        Self {
+            chunk: ChunkIndex {
+                start: chunk.start,
+                end: chunk.end,
+                offset: start,
+                length: end - start,
+                message_indexes: BTreeMap::new(),
+                message_indexes_length: 0,
+                compression: chunk.compression.to_owned(),
+                compressed_size: chunk.records.len() as u64,
+                uncompressed_size: chunk.uncompressed_size,
+            },
+            offsets: BTreeMap::new(),
+            length: 0,
+            index,
+        }
+    }
 }
 
 /// `at_end`: the file ends here, and indexes that are missing can still be written.

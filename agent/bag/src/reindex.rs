@@ -14,9 +14,9 @@ use std::path::{Path, PathBuf};
 use super::file::FileWriter;
 use super::mcap::{self, Message, Opcode};
 use super::metadata::{self, Metadata, Topic};
+use super::metadata_file::{Durability, write_metadata};
 use super::read::{self, Contents, ReadError, Scan};
-use super::writer::{Durability, FileCompression, with_suffix, write_metadata};
-use super::{Compression, Error, info, open_file};
+use super::{Compression, Error, FileCompression, info, open_file, with_suffix};
 
 /// What was found and done.
 #[derive(Clone, PartialEq, Eq, Debug)]

@@ -5,9 +5,11 @@
 //! writer was killed is one that `ros2 bag info` still opens. What takes long, compressing whole
 //! files, is handed out as work for another thread.
 
+mod contents;
+
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, DirBuilder, File};
-use std::io::{self, Write as _};
+use std::io;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,14 +17,12 @@ use std::sync::Arc;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Qos;
 
-use super::compression::Progress;
 use super::file::{FileWriter, METADATA_NAME};
-use super::mcap::{Channel, Message, Metadata as MetadataRecord, Schema as SchemaRecord};
+use super::mcap::{Message, Metadata as MetadataRecord};
 use super::metadata::{self, Metadata};
-use super::{Compression, Error, Form, Options, qos};
-
-/// The only encoding of ROS 2 messages.
-const CDR: &str = "cdr";
+use super::metadata_file::{Durability, write_metadata};
+use super::{Compressed, Compression, Error, FileCompression, Form, Options, qos};
+use contents::{DoneFile, Topic, times};
 
 /// What a bag says about a topic.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -71,29 +71,6 @@ pub struct Writer {
     unwritten: BTreeMap<u16, (u64, u64)>,
 }
 
-#[derive(Debug)]
-struct Topic {
-    description: TopicDescription,
-    channel_id: u16,
-    schema_id: u16,
-    /// In complete files.
-    messages: u64,
-    /// Has messages: the description stays as it is.
-    is_written: bool,
-    /// All publishers, where they changed after that.
-    later: Option<Vec<Qos>>,
-}
-
-#[derive(Clone, Debug)]
-struct DoneFile {
-    /// Without the suffix of a compression.
-    name: String,
-    compression: Compression,
-    times: Option<(u64, u64)>,
-    messages: u64,
-    bytes: u64,
-}
-
 /// What became of a bag.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Summary {
@@ -120,22 +97,6 @@ pub struct TopicSummary {
     pub messages: u64,
     /// Taken by [`Writer::write`], and lost since the storage took no more.
     pub unwritten: u64,
-}
-
-/// Work for another thread: one complete file to compress.
-#[derive(Clone, Debug)]
-pub struct FileCompression {
-    path: PathBuf,
-    compression: Compression,
-    index: usize,
-}
-
-/// That work, done; for [`Writer::compressed`].
-#[derive(Debug)]
-pub struct Compressed {
-    index: usize,
-    compression: Compression,
-    bytes: u64,
 }
 
 impl Writer {
@@ -617,167 +578,4 @@ impl Writer {
 fn is_full(error: &io::Error) -> bool {
     use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
     matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
-}
-
-impl FileCompression {
-    /// For a file that is complete already.
-    pub(super) fn of(path: &Path, compression: Compression) -> Self {
-        Self {
-            path: path.to_owned(),
-            compression,
-            index: 0,
-        }
-    }
-
-    /// Bytes of the file.
-    #[must_use]
-    pub fn bytes(&self) -> u64 {
-        fs::metadata(&self.path).map_or(0, |metadata| metadata.len())
-    }
-
-    /// Compresses the file beside itself, then removes it. Takes long; needs room for both.
-    pub fn run(&self) -> Result<Compressed, Error> {
-        self.run_watched(&Progress::default())
-    }
-
-    /// As [`Self::run`]. Fails where `progress` is given up; the file then stays as it was.
-    pub fn run_watched(&self, progress: &Progress) -> Result<Compressed, Error> {
-        let into = with_suffix(&self.path, self.compression.name());
-        let part = with_suffix(&into, "part");
-        let wrong = |error| Error::writing(&part, error);
-        let done = || {
-            let source = super::open_file(&self.path)?;
-            let target = super::new_file(&part)?;
-            self.compression.compress_file(&source, &target, progress)?;
-            target.sync_data()?;
-            let bytes = target.metadata()?.len();
-            fs::rename(&part, &into)?;
-            fs::remove_file(&self.path)?;
-            Ok(bytes)
-        };
-        let bytes = done().map_err(|error| {
-            let _ = fs::remove_file(&part);
-            wrong(error)
-        })?;
-        Ok(Compressed {
-            index: self.index,
-            compression: self.compression,
-            bytes,
-        })
-    }
-}
-
-impl Topic {
-    fn records(&self, form: Form) -> (SchemaRecord, Channel) {
-        let description = &self.description;
-        let (encoding, data) = match &description.schema {
-            Some(schema) => (schema.encoding.as_str(), schema.text.as_bytes()),
-            // As in Humble. rosbag2 accepts `unknown` as well, PyPI `rosbags` does not.
-            None => ("", &[][..]),
-        };
-        let schema = SchemaRecord {
-            id: self.schema_id,
-            name: description.type_name.clone(),
-            encoding: encoding.to_owned(),
-            data: data.to_vec(),
-        };
-        let mut metadata = BTreeMap::new();
-        let profiles = qos::profiles(&description.publishers, form.spelling());
-        metadata.insert("offered_qos_profiles".to_owned(), profiles);
-        if form != Form::Humble {
-            let hash = description.type_hash.clone().unwrap_or_default();
-            metadata.insert("topic_type_hash".to_owned(), hash);
-        }
-        let channel = Channel {
-            id: self.channel_id,
-            schema_id: self.schema_id,
-            topic: description.name.clone(),
-            message_encoding: CDR.to_owned(),
-            metadata,
-        };
-        (schema, channel)
-    }
-
-    fn metadata(&self, form: Form, in_current: u64) -> metadata::Topic {
-        let hash = match form {
-            Form::Humble => None,
-            Form::Compatible | Form::Named => self.description.type_hash.clone(),
-        };
-        metadata::Topic {
-            name: self.description.name.clone(),
-            type_name: self.description.type_name.clone(),
-            serialization_format: CDR.to_owned(),
-            offered_qos_profiles: qos::profiles(&self.description.publishers, form.spelling()),
-            type_description_hash: hash.unwrap_or_default(),
-            message_count: self.messages + in_current,
-        }
-    }
-}
-
-impl DoneFile {
-    fn path(&self) -> String {
-        match self.compression {
-            Compression::None => self.name.clone(),
-            Compression::Lz4 | Compression::Zstd => {
-                format!("{}.{}", self.name, self.compression.name())
-            }
-        }
-    }
-
-    fn metadata(&self) -> metadata::File {
-        metadata::File {
-            path: self.name.clone(),
-            starting_time: self.times.map_or(metadata::NO_START, |(start, _)| start),
-            duration: self.times.map_or(0, |(start, end)| end - start),
-            message_count: self.messages,
-        }
-    }
-}
-
-/// What a metadata.yaml has to survive.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub(super) enum Durability {
-    /// The end of this process.
-    Process,
-    /// The loss of power.
-    Power,
-}
-
-/// Replaces a bag's metadata.yaml as a whole.
-pub(super) fn write_metadata(
-    directory: &Path,
-    metadata: &Metadata,
-    durability: Durability,
-) -> Result<(), Error> {
-    let path = directory.join(metadata::FILE_NAME);
-    let part = with_suffix(&path, "part");
-    let write = || {
-        // Left behind by one that was killed; made anew, so that nothing is written through a link.
-        match fs::remove_file(&part) {
-            Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(error),
-            _ => {}
-        }
-        let mut file = super::new_file(&part)?;
-        file.write_all(metadata.file_text().as_bytes())?;
-        if durability == Durability::Power {
-            file.sync_data()?;
-        }
-        fs::rename(&part, &path)
-    };
-    write().map_err(|error| {
-        let _ = fs::remove_file(&part);
-        Error::writing(&path, error)
-    })
-}
-
-pub(super) fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".");
-    name.push(suffix);
-    PathBuf::from(name)
-}
-
-fn times(files: &[&DoneFile]) -> Option<(u64, u64)> {
-    let times = files.iter().filter_map(|file| file.times);
-    times.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }

@@ -24,9 +24,11 @@
 
 pub mod ahead;
 pub mod bell;
+pub mod bpf;
 pub mod cgroup;
 pub mod cgroup_paths;
 pub mod clock_step;
+pub mod error_chain;
 pub mod filter;
 pub mod filter_reader;
 pub mod frame_decoder;

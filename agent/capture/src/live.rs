@@ -4,8 +4,9 @@
 //! for each namespace; also both, for interfaces with traffic that no socket receives. Nothing is
 //! ever sent.
 
+mod open;
+
 use std::collections::BTreeMap;
-use std::error::Error;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -16,11 +17,12 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::clock_step::ClockStep;
+use super::error_chain::in_words;
 use super::filter::{Filter, FilterError};
 use super::filter_reader::{self, FilterReader};
-use super::host_tap::{HostTap, HostTapError, HostTapSettings};
+use super::host_tap::{HostTap, HostTapError};
 use super::interfaces::Selection;
-use super::netns::{self, NetnsError};
+use super::netns::NetnsError;
 use super::shm::directories::{Scope, ShmDirectories};
 use super::shm::poll_interval::Budget as Shares;
 use super::shm::{self, SharedMemory};
@@ -28,9 +30,10 @@ use super::system::{Clocks, give_back_memory, wait};
 use super::threads::Spawn;
 use super::uprobe::Uprobe;
 use super::uprobe::search::Facts as UprobeFacts;
-use super::wire_tap::{self, WireTap, WireTapError, WireTapSettings};
+use super::wire_tap::{self, WireTap, WireTapError};
 use crate::reassembly::Limits;
-use crate::settings::{CaptureSettings, ExactChoice, ShmMode, SourceChoice};
+use crate::settings::{CaptureSettings, ShmMode};
+use open::{open_exact, open_host, open_wires, scope};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
@@ -40,8 +43,6 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 /// Handed out in small portions, so that a storm that comes while we are held up leaves most of the
 /// record ring to the writers we know.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
-/// A fragmented datagram fits in, however many network namespaces share the cap.
-const LEAST_REASSEMBLY: usize = 1 << 17;
 /// How long news from the host hook is gathered: a node that starts announces its endpoints one by
 /// one, and each round costs.
 const GATHER: Duration = Duration::from_millis(10);
@@ -538,111 +539,4 @@ impl LiveSource {
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
     }
-}
-
-/// Whose shared memory belongs to what is looked at otherwise.
-fn scope(settings: &CaptureSettings, host: bool) -> Scope {
-    match &settings.cgroup {
-        Some(cgroup) if host => Scope::Cgroup(cgroup.clone()),
-        _ if host => Scope::AllProcesses,
-        _ => {
-            let own = PathBuf::from("/proc/self/ns/net");
-            let networks = std::iter::once(own).chain(settings.network_namespaces.clone());
-            Scope::Networks(networks.collect())
-        }
-    }
-}
-
-/// The tap at the sockets, or why there is none.
-fn open_host(
-    settings: &CaptureSettings,
-) -> Result<(Option<HostTap>, Option<String>), CaptureError> {
-    let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
-    match settings.source {
-        SourceChoice::Wire => return Ok((None, None)),
-        SourceChoice::Auto if named => {
-            let reason = "the configuration names interfaces (capture.interfaces)";
-            return Ok((None, Some(reason.to_owned())));
-        }
-        SourceChoice::Host | SourceChoice::Auto => {}
-    }
-    let opened = HostTap::open(&HostTapSettings {
-        cgroup: settings.cgroup.clone(),
-        ring_bytes: settings.ring_bytes,
-        record_ring_bytes: settings.record_ring_bytes,
-    });
-    match opened {
-        Ok(host) => Ok((Some(host), None)),
-        Err(error) if settings.source == SourceChoice::Host => Err(error.into()),
-        Err(error) => Ok((None, Some(in_words(&error)))),
-    }
-}
-
-/// The programs for messages into shared memory, or why there are none. Without them shared memory
-/// is looked at as usual.
-fn open_exact(settings: &CaptureSettings, host: bool) -> (Option<Uprobe>, Option<String>) {
-    if settings.shm.exact == ExactChoice::Off {
-        return (None, None);
-    }
-    if !host {
-        // Of processes, only control groups can be told apart where the programs run.
-        let reason = "it goes with looking at the host's sockets (capture.source)";
-        return (None, Some(reason.to_owned()));
-    }
-    let opened = Uprobe::open(
-        settings.cgroup.as_deref(),
-        settings.ring_bytes,
-        settings.record_ring_bytes,
-        settings.shm.exact == ExactChoice::Auto,
-    );
-    match opened {
-        Ok(exact) => (Some(exact), None),
-        Err(error) => (None, Some(in_words(&error))),
-    }
-}
-
-/// A tap for this namespace and one for each configured one.
-fn open_wires(
-    settings: &CaptureSettings,
-    limits: Limits,
-    selection: Selection,
-) -> Result<Vec<WireTap>, CaptureError> {
-    // All of them together keep the cap.
-    let share = limits.bytes / (1 + settings.network_namespaces.len());
-    let limits = Limits {
-        bytes: share.max(LEAST_REASSEMBLY),
-        ..limits
-    };
-    let wire = WireTapSettings {
-        selection,
-        ring_bytes: settings.ring_bytes,
-        record_ring_bytes: settings.record_ring_bytes,
-        reassembly: limits,
-    };
-    let mut wires = vec![WireTap::open(&wire, 0, None)?];
-    for (number, path) in (1..).zip(&settings.network_namespaces) {
-        let open = || WireTap::open(&wire, number, Some(path.clone()));
-        wires.push(netns::within(path, open)??);
-    }
-    Ok(wires)
-}
-
-/// An error and its causes in one line; of a verifier's log, the first line.
-#[must_use]
-pub fn in_words(error: &dyn Error) -> String {
-    let mut words = String::new();
-    let mut cause = Some(error);
-    while let Some(error) = cause {
-        let message = error.to_string();
-        let first = message.lines().next().unwrap_or_default();
-        // A transparent error says what its cause says.
-        if !words.ends_with(first) {
-            if !words.is_empty() {
-                words.push_str(": ");
-            }
-            words.push_str(first);
-        }
-        cause = error.source();
-    }
-    words
 }

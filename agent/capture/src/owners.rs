@@ -7,15 +7,19 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, Read as _};
-use std::os::fd::{AsFd, AsRawFd as _, FromRawFd as _, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd as _, OwnedFd};
 
 use aya::programs::{Iter, ProgramError};
 use aya::{Btf, BtfError, Ebpf};
 use ros2probe_wire::host;
 use zerocopy::FromBytes;
 
+use crate::bpf;
+
 /// Bytes that one run may give: some 20,000 sockets.
 const LIMIT: u64 = 1 << 20;
+/// `BPF_TRACE_ITER` of `linux/bpf.h`.
+const TRACE_ITER: u32 = 28;
 
 /// Who holds a socket.
 #[derive(Clone, PartialEq, Eq, Debug)]
@@ -67,8 +71,7 @@ impl Owners {
         program.load("task_file", &Btf::from_sys_fs()?)?;
         // A link of aya's gives one run only.
         let program = program.fd()?.as_fd().as_raw_fd().cast_unsigned();
-        let link = bpf(command::LINK_CREATE, &[program, 0, command::TRACE_ITER, 0])
-            .map_err(OwnersError::Run)?;
+        let link = bpf::create_link(program, 0, TRACE_ITER).map_err(OwnersError::Run)?;
         Ok(Self { link })
     }
 
@@ -80,7 +83,7 @@ impl Owners {
     /// The kernel refuses.
     pub fn refresh(&self, sockets: &BTreeSet<u64>) -> Result<BTreeMap<u64, Owner>, OwnersError> {
         let link = self.link.as_raw_fd().cast_unsigned();
-        let run = bpf(command::ITER_CREATE, &[link, 0]).map_err(OwnersError::Run)?;
+        let run = bpf::create_iterator(link).map_err(OwnersError::Run)?;
         let mut bytes = Vec::new();
         File::from(run)
             .take(LIMIT)
@@ -116,32 +119,6 @@ impl From<&host::Owner> for Owner {
             drops: (found.drops_known != 0).then_some(found.drops),
         }
     }
-}
-
-/// Numbers of `linux/bpf.h`.
-mod command {
-    pub(super) const LINK_CREATE: libc::c_int = 28;
-    pub(super) const ITER_CREATE: libc::c_int = 33;
-    pub(super) const TRACE_ITER: u32 = 28;
-}
-
-/// The bpf system call, for commands whose attributes are words and whose result is a descriptor.
-fn bpf(command: libc::c_int, attributes: &[u32]) -> io::Result<OwnedFd> {
-    // SAFETY: the attributes' size is given, and the kernel takes what lies beyond as zero.
-    let result = unsafe {
-        libc::syscall(
-            libc::SYS_bpf,
-            command,
-            attributes.as_ptr(),
-            size_of_val(attributes),
-        )
-    };
-    let descriptor = i32::try_from(result).unwrap_or(-1);
-    if descriptor < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: these commands return a descriptor that nobody else has.
-    Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
 }
 
 #[cfg(test)]

@@ -15,8 +15,8 @@ use std::thread::{Builder, JoinHandle};
 use std::time::Duration;
 
 use super::cgroup::{Cgroup, CgroupError};
+use super::error_chain::in_words;
 use super::filter::{FilterError, Links};
-use super::live::in_words;
 use super::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
 

@@ -193,8 +193,8 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use ros2probe_wire::time::MILLISECOND;
 
-    const MILLISECOND: u64 = 1_000_000;
     const SETTLE: u64 = 80 * MILLISECOND;
 
     fn clocks(milliseconds: u64) -> Clocks {

@@ -272,6 +272,36 @@ pub fn thread_cpu() -> u64 {
     nanoseconds(libc::CLOCK_THREAD_CPUTIME_ID)
 }
 
+/// The kernel's state of its clock, `adjtimex(2)`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClockState {
+    /// A program keeps it synchronised.
+    pub synchronised: bool,
+    /// Estimated error in microseconds.
+    pub estimated_error: i64,
+    /// Largest error in microseconds.
+    pub maximum_error: i64,
+}
+
+/// Reads the state of the kernel's clock, and changes nothing.
+///
+/// # Errors
+/// The kernel refuses.
+pub fn clock_state() -> io::Result<ClockState> {
+    // SAFETY: a `timex` is plain numbers, for which zero is a value; zero modes change nothing.
+    let mut state: libc::timex = unsafe { std::mem::zeroed() };
+    // SAFETY: `state` is ours and outlives the call.
+    let result = unsafe { libc::adjtimex(&raw mut state) };
+    if result < 0 {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(ClockState {
+        synchronised: result != libc::TIME_ERROR && state.status & libc::STA_UNSYNC == 0,
+        estimated_error: state.esterror,
+        maximum_error: state.maxerror,
+    })
+}
+
 fn nanoseconds(clock: libc::clockid_t) -> u64 {
     let mut time = libc::timespec {
         tv_sec: 0,

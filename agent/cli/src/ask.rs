@@ -57,7 +57,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     let mut failed = 0;
     for (target, domain_id) in &targets {
-        let answered = ask(target, *domain_id, options, &mut out)?;
+        let answered = ask(target, domain_id.0, options, &mut out)?;
         failed += usize::from(!answered);
     }
     if failed > 0 {
@@ -91,7 +91,9 @@ fn listen(mut live: LiveSource, options: &Discover) -> Result<Vec<ParticipantFac
     let mut observer = Observer::new(Settings::default());
     let end = Instant::now() + Duration::from_secs(options.listen);
     let is_meant = |participant: &ParticipantFacts| {
-        options.domain.is_none_or(|it| it == participant.domain_id)
+        options
+            .domain
+            .is_none_or(|it| it == participant.domain_id.0)
             && options
                 .participant
                 .is_none_or(|it| it == participant.guid.prefix)

@@ -13,6 +13,8 @@
 //! assert_eq!(Dialect::of_distro("humble"), Some(Dialect::Humble));
 //! ```
 
+#![forbid(unsafe_code)]
+
 pub use ros2probe_bag as bag;
 pub use ros2probe_capture as capture;
 pub use ros2probe_daemon::{

@@ -1,5 +1,7 @@
 //! `rp`: the agent and its tools.
 
+#![forbid(unsafe_code)]
+
 mod ask;
 mod cli;
 

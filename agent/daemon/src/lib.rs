@@ -15,6 +15,8 @@
 //! # Ok::<_, ros2probe_daemon::config::Mistakes>(())
 //! ```
 
+#![cfg_attr(not(test), forbid(unsafe_code))]
+
 pub mod agent;
 pub mod agent_facts;
 pub mod config;

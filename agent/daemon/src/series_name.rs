@@ -2,11 +2,15 @@
 
 use std::borrow::Cow;
 
+use ros2probe_model::topic_kind::TopicKind;
+
 /// Services and other plumbing keep their DDS names: a request, its reply and a topic may share
 /// their ROS name. A DDS name that looks like a ROS name is marked.
-pub(crate) fn series_name<'a>(kind: &str, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
+pub(crate) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
     match kind {
-        "topic" | "action_feedback" | "action_status" => Cow::Borrowed(name),
+        TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {
+            Cow::Borrowed(name)
+        }
         _ if dds_name.starts_with('/') => Cow::Owned(format!("dds:{dds_name}")),
         _ => Cow::Borrowed(dds_name),
     }

@@ -6,6 +6,7 @@
 
 mod persistence;
 
+use ros2probe_wire::DomainId;
 use std::collections::HashSet;
 use std::io;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
@@ -151,7 +152,7 @@ impl InForce {
     /// The watch with this pattern for this domain.
     #[must_use]
     pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
-        let place = self.watchlist.position(pattern, domain_id)?;
+        let place = self.watchlist.position(pattern, domain_id.map(DomainId))?;
         self.entries.get(place)
     }
 }
@@ -202,7 +203,9 @@ impl Watches {
         let asked = watches.len();
         let mut globs: Vec<String> = in_force.globs().map(str::to_owned).collect();
         let fits = |watch: &Watch| {
-            let is_there = in_force.find(&watch.pattern, watch.domain_id).is_some();
+            let is_there = in_force
+                .find(&watch.pattern, watch.domain_id.map(|id| id.0))
+                .is_some();
             if is_there {
                 return true;
             }
@@ -321,7 +324,7 @@ impl Watches {
     fn put(&self, watch: Watch, replace: bool) -> Result<Done, Refused> {
         let watch = Arc::new(watch);
         let done = self.change(|lists, in_force| {
-            let done = match in_force.find(&watch.pattern, watch.domain_id) {
+            let done = match in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0)) {
                 Some(old) if old.watch == watch => return Ok(Done::Unchanged),
                 Some(old) if old.origin != Origin::Api => {
                     return Err(Refused::Given { by: old.origin });
@@ -330,7 +333,9 @@ impl Watches {
                 Some(_) => Done::Replaced,
                 None => Done::Added,
             };
-            let same = |other: &&mut Arc<Watch>| is_for(other, &watch.pattern, watch.domain_id);
+            let same = |other: &&mut Arc<Watch>| {
+                is_for(other, &watch.pattern, watch.domain_id.map(|id| id.0))
+            };
             if let Some(old) = lists.added.iter_mut().find(same) {
                 *old = Arc::clone(&watch);
             } else {
@@ -341,7 +346,7 @@ impl Watches {
         if done != Done::Unchanged {
             self.events.record(AgentEvent::WatchAdded {
                 watch: watch.pattern.clone(),
-                domain_id: watch.domain_id,
+                domain_id: watch.domain_id.map(|id| id.0),
             });
         }
         Ok(done)
@@ -406,7 +411,7 @@ impl InForce {
 }
 
 fn is_for(watch: &Watch, pattern: &str, domain_id: Option<u32>) -> bool {
-    watch.pattern == pattern && watch.domain_id == domain_id
+    watch.pattern == pattern && watch.domain_id == domain_id.map(DomainId)
 }
 
 #[cfg(test)]

@@ -24,7 +24,7 @@ use ros2probe::message::filter::{Filter, Subject};
 use ros2probe::message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
 use ros2probe_wire::Timestamp;
@@ -408,7 +408,7 @@ const SMALL: Settings = Settings {
     sample_bytes: 1 << 12,
     payload_bytes: 1 << 14,
     topic_grace: 1_000_000_000,
-    telling: 400_000_000,
+    payload_delay: 400_000_000,
     directed: true,
 };
 
@@ -417,7 +417,7 @@ fn small_observer() -> Observer {
     let watches = ["/**", "/a"].map(|pattern| Watch::named(pattern).expect("a pattern"));
     let watchlist = Watchlist::new(watches.to_vec());
     observer.input(Input::Watchlist(Arc::new(watchlist.expect("patterns"))));
-    observer.input(Input::Wishes(Arc::new(vec![Wish {
+    observer.input(Input::SampleRequests(Arc::new(vec![SampleRequest {
         id: 1,
         selection: Arc::new(Selection::all()),
         domain_id: None,

@@ -9,6 +9,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::size::Size;
@@ -18,7 +19,7 @@ const OVERHEAD: usize = 128;
 /// Samples under way at once.
 const SAMPLES: usize = 16_384;
 /// A sample that got nothing for so long will not be complete, nor counted.
-const FORGET: u64 = 30_000_000_000;
+const FORGET: u64 = 30 * SECOND;
 /// Least memory that is asked for at once.
 const LEAST: usize = 4096;
 
@@ -103,8 +104,8 @@ impl Assembly {
         (self.bytes, self.limit, self.evictions)
     }
 
-    /// Keeps what a DATA or DATA_FRAG brings; `beside` bytes are spent elsewhere.
-    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], beside: usize) {
+    /// Keeps what a DATA or DATA_FRAG brings; `other_bytes` bytes are spent elsewhere.
+    pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], other_bytes: usize) {
         let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
         };
@@ -132,7 +133,7 @@ impl Assembly {
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + beside > self.limit || self.parts.len() > SAMPLES {
+        while self.bytes + other_bytes > self.limit || self.parts.len() > SAMPLES {
             let Some((_, key)) = self.ages.first_key_value() else {
                 return;
             };
@@ -287,8 +288,8 @@ mod tests {
     }
 
     /// [`Assembly::put`] of the sample that a record reports.
-    fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], beside: usize) {
-        assembly.put(record.sample().unwrap(), payload, beside);
+    fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], other_bytes: usize) {
+        assembly.put(record.sample().unwrap(), payload, other_bytes);
     }
 
     fn fragment(of: Guid, number: u64, start: u32, count: u32, size: u32, of_size: u32) -> Record {

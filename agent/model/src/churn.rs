@@ -1,6 +1,7 @@
 //! How often participants, endpoints and nodes came and went: the counters behind an alert on a
 //! flapping robot. Bounded: few kinds, and no more domains than ports allow.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeMap;
 
 use ros2probe_wire::discovery::Role;
@@ -75,7 +76,7 @@ impl Event {
 /// The counters.
 #[derive(Debug, Default)]
 pub struct Churn {
-    counts: BTreeMap<(u32, Entity, Event), u64>,
+    counts: BTreeMap<(DomainId, Entity, Event), u64>,
 }
 
 impl Churn {
@@ -89,7 +90,7 @@ impl Churn {
     }
 
     /// Counts one.
-    pub fn count(&mut self, domain_id: u32, entity: Entity, event: Event) {
+    pub fn count(&mut self, domain_id: DomainId, entity: Entity, event: Event) {
         *self.counts.entry((domain_id, entity, event)).or_default() += 1;
     }
 
@@ -97,7 +98,7 @@ impl Churn {
     #[must_use]
     pub fn facts(&self) -> Vec<ChurnCount> {
         let fact =
-            |((domain_id, entity, event), count): (&(u32, Entity, Event), &u64)| ChurnCount {
+            |((domain_id, entity, event), count): (&(DomainId, Entity, Event), &u64)| ChurnCount {
                 domain_id: *domain_id,
                 entity: entity.label(),
                 event: event.label(),

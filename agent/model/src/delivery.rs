@@ -5,38 +5,39 @@
 //! who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a cause.
 //! What leaves has no losses: what was not sent is nobody's.
 
-mod deciding;
+mod accounting;
 
 use std::collections::BTreeSet;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
-use deciding::Deciding;
-pub use deciding::Totals;
+use accounting::Accounting;
+pub use accounting::Totals;
 
-use super::cancelled::Cancelled;
 use super::cause::LossCause;
-use super::deaths::{Deaths, REASSEMBLY};
 use super::journal::Journal;
+use super::loss_causes::{LossCauses, REASSEMBLY};
 use super::reception::{Outcome, Reception, Whole};
+use super::route::Route;
 use super::samples::Budget;
 use super::sequence::REACH;
 use super::size::Size;
 use super::snapshot::{Delivered, Direction};
-use super::way::Way;
+use super::undelivered::Undelivered;
 use super::writer::settle_window;
 
 /// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
 /// delivery begins anew.
 const EXCUSED: u64 = 512;
 /// What left this host a moment ago may be under way still.
-const UNDER_WAY: u64 = 1_000_000_000;
+const UNDER_WAY: u64 = SECOND;
 /// A receiver that is silent for so long and of which nothing tells whether it lives has lost what
 /// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a socket
 /// was closed.
-const SILENCE: u64 = 18_000_000_000;
-const FIRST_MOMENTS: u64 = 5_000_000_000;
+const SILENCE: u64 = 18 * SECOND;
+const FIRST_MOMENTS: u64 = 5 * SECOND;
 /// Samples that are lost in one go and wait for their cause when two deliveries become one.
 const LONG_RUN: u64 = 256;
 
@@ -46,12 +47,12 @@ pub enum Receiver {
     /// A participant, by whatever ways.
     Participant(GuidPrefix),
     /// Whoever is at the end of this way.
-    Way(Way),
+    Route(Route),
 }
 
 /// What a record changes besides the delivery itself.
 #[derive(Debug)]
-pub struct Scene<'a> {
+pub struct DeliveryContext<'a> {
     /// The time of the record, or of the look at the clock.
     pub now: Timestamp,
     /// Whose samples.
@@ -73,11 +74,11 @@ pub struct Scene<'a> {
 pub struct Delivery {
     receiver: Receiver,
     /// By which way new samples come.
-    main: Way,
+    main: Route,
     reception: Reception,
     tally: Delivered,
-    cancelled: Cancelled,
-    deaths: Deaths,
+    undelivered: Undelivered,
+    loss_causes: LossCauses,
     first_seen: Timestamp,
     last_seen: Timestamp,
     /// When a reader appeared for which it is, after what it saw last.
@@ -85,31 +86,31 @@ pub struct Delivery {
     /// Since when something has left for here that has not arrived.
     waiting: Option<Timestamp>,
     /// What left since then was taken for lost.
-    told: bool,
+    presumed_lost: bool,
     /// All its readers are best effort: nothing is sent to them again, nothing is said to them.
     best_effort: bool,
     /// Samples come here over the network, or should: not all by shared memory.
-    proven: bool,
+    uses_network: bool,
 }
 
 impl Delivery {
     /// Nothing seen yet.
     #[must_use]
-    pub fn new(receiver: Receiver, main: Way, now: Timestamp) -> Self {
+    pub fn new(receiver: Receiver, main: Route, now: Timestamp) -> Self {
         Self {
             receiver,
             main,
             reception: Reception::default(),
             tally: Delivered::default(),
-            cancelled: Cancelled::default(),
-            deaths: Deaths::default(),
+            undelivered: Undelivered::default(),
+            loss_causes: LossCauses::default(),
             first_seen: now,
             last_seen: now,
             opened: Timestamp(0),
             waiting: None,
-            told: false,
+            presumed_lost: false,
             best_effort: false,
-            proven: false,
+            uses_network: false,
         }
     }
 
@@ -121,23 +122,23 @@ impl Delivery {
             main: _,
             reception,
             tally: _,
-            cancelled,
-            deaths,
+            undelivered,
+            loss_causes,
             first_seen: _,
             last_seen: _,
             opened: _,
             waiting: _,
-            told: _,
+            presumed_lost: _,
             best_effort: _,
-            proven: _,
+            uses_network: _,
         } = self;
-        let sizes = reception.sizes().chain(cancelled.sizes());
-        sizes.chain(deaths.sizes())
+        let sizes = reception.sizes().chain(undelivered.sizes());
+        sizes.chain(loss_causes.sizes())
     }
 
     /// Samples in fragments that begin before this may lack some that nobody lost.
-    pub const fn doubt(&mut self, until: Timestamp) {
-        self.reception.doubt(until);
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.reception.allow_incomplete(until);
     }
 
     /// Who gets the samples.
@@ -153,13 +154,13 @@ impl Delivery {
 
     /// By which way new samples come.
     #[must_use]
-    pub const fn main(&self) -> Way {
+    pub const fn main(&self) -> Route {
         self.main
     }
 
     /// New samples come another way.
-    pub const fn move_to(&mut self, way: Way) {
-        self.main = way;
+    pub const fn move_to(&mut self, route: Route) {
+        self.main = route;
     }
 
     /// Leaving or arriving.
@@ -205,7 +206,7 @@ impl Delivery {
     /// This sample came another way that may be the same receiver's.
     pub fn know(&mut self, number: u64, totals: &mut Totals) {
         self.reception.sequence_mut().know(number);
-        if self.deaths.resolve(number) {
+        if self.loss_causes.resolve(number) {
             self.tally.pending = self.tally.pending.saturating_sub(1);
             totals.received.pending = totals.received.pending.saturating_sub(1);
         }
@@ -223,7 +224,7 @@ impl Delivery {
 
     /// The last reader is gone: what it has not got since its last sample it did not want.
     pub fn close(&mut self, budget: &mut Budget) {
-        (self.waiting, self.told) = (None, false);
+        (self.waiting, self.presumed_lost) = (None, false);
         self.reception.close(budget);
     }
 
@@ -234,18 +235,22 @@ impl Delivery {
     }
 
     /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
-    pub fn sample(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+    pub fn sample(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<Whole>) {
         self.touch(sample.record());
-        (self.waiting, self.told, self.proven) = (None, false, true);
-        if self.cancelled.is_empty() {
-            return self.take(sample, scene);
+        (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
+        if self.undelivered.is_empty() {
+            return self.take(sample, context);
         }
         let (mut again, mut whole) = (false, None);
         let parts = self
-            .cancelled
-            .delivered(sample, &mut scene.budget.evictions);
+            .undelivered
+            .delivered(sample, &mut context.budget.evictions);
         for part in parts.iter().filter_map(Record::sample) {
-            let (came_again, completed) = self.take(part, scene);
+            let (came_again, completed) = self.take(part, context);
             again |= came_again;
             whole = completed.or(whole);
         }
@@ -253,67 +258,69 @@ impl Delivery {
     }
 
     /// Takes in that the socket had no room for this DATA or DATA_FRAG.
-    pub fn no_room(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) {
+    pub fn no_room(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(sample.record());
-        (self.waiting, self.told, self.proven) = (None, false, true);
-        if self.cancelled.note(sample) {
-            scene.budget.evictions += 1;
+        (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
+        if self.undelivered.note(sample) {
+            context.budget.evictions += 1;
         }
         let number = sample.sequence_number();
         let is_tail = !sample.is_start() && number > 1;
-        let (reception, budget, mut deciding) = self.split(scene);
-        let is_believed =
-            reception.recognise(sample, budget, &mut |decision| deciding.take(decision));
-        if !is_believed {
+        let (reception, budget, mut accounting) = self.split(context);
+        let is_confirmed =
+            reception.recognise(sample, budget, &mut |decision| accounting.take(decision));
+        if !is_confirmed {
             // Its cause, should its number be believed later.
-            let is_full = self.deaths.note(number, LossCause::SocketBuffer, scene.now);
-            scene.budget.evictions += u64::from(is_full);
+            let is_full = self
+                .loss_causes
+                .note(number, LossCause::SocketBuffer, context.now);
+            context.budget.evictions += u64::from(is_full);
             return;
         }
         let sequence = self.reception.sequence_mut();
         sequence.begin(number.saturating_add(u64::from(is_tail)));
-        self.die(number, LossCause::SocketBuffer, scene);
+        self.record_cause(number, LossCause::SocketBuffer, context);
     }
 
     /// Takes in that the kernel gave up on some IP fragments of this sample.
-    pub fn not_reassembled(&mut self, number: u64, scene: &mut Scene<'_>) {
-        self.proven = true;
+    pub fn not_reassembled(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
+        self.uses_network = true;
         let sequence = self.reception.sequence();
         if !sequence.started() || number > sequence.next().saturating_add(REACH) {
             return;
         }
-        if self.deaths.resolve(number) {
+        if self.loss_causes.resolve(number) {
             self.tally.pending -= 1;
-            scene.totals.received.pending = scene.totals.received.pending.saturating_sub(1);
-            self.split(scene)
+            context.totals.received.pending = context.totals.received.pending.saturating_sub(1);
+            self.split(context)
                 .2
                 .lose(LossCause::Reassembly, number, number);
             return;
         }
-        self.die(number, LossCause::Reassembly, scene);
+        self.record_cause(number, LossCause::Reassembly, context);
     }
 
     /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before; but
     /// as long as nothing comes and nothing is asked for, its samples may go by shared memory.
-    pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, scene: &mut Scene<'_>) {
+    pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(heartbeat.record());
         let end = heartbeat.last().saturating_add(1);
         self.reception.sequence_mut().begin(end);
-        if !self.proven {
+        if !self.uses_network {
             return;
         }
         let sequence = self.reception.sequence();
         let before = (sequence.next(), sequence.last_advance());
-        let (reception, budget, mut deciding) = self.split(scene);
-        reception.heartbeat(heartbeat, budget, &mut |decision| deciding.take(decision));
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.heartbeat(heartbeat, budget, &mut |decision| accounting.take(decision));
         self.excuse_unheard(before);
     }
 
     /// Takes in a GAP for this receiver.
-    pub fn gap(&mut self, gap: Gap<'_>, scene: &mut Scene<'_>) {
+    pub fn gap(&mut self, gap: Gap<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(gap.record());
-        let (reception, budget, mut deciding) = self.split(scene);
-        reception.gap(gap, budget, &mut |decision| deciding.take(decision));
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
 
     /// Takes in an ACKNACK: a reader asks for samples again.
@@ -321,7 +328,7 @@ impl Delivery {
         let missing = acknack.missing();
         let sequence = self.reception.sequence_mut();
         let first = sequence.first();
-        self.proven |= sequence.started() && missing.iter().any(|number| number >= first);
+        self.uses_network |= sequence.started() && missing.iter().any(|number| number >= first);
         sequence.requested(missing.iter());
     }
 
@@ -337,56 +344,57 @@ impl Delivery {
         newest: u64,
         alive: Option<Timestamp>,
         left_by: impl Fn(Timestamp) -> Option<u64>,
-        scene: &mut Scene<'_>,
+        context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
-            (self.waiting, self.told) = (None, false);
+            (self.waiting, self.presumed_lost) = (None, false);
             return;
         }
-        let since = self.waiting.get_or_insert(scene.now).0;
+        let since = self.waiting.get_or_insert(context.now).0;
         let mut until = alive.map_or(0, |alive| {
-            alive.0.min(scene.now.0.saturating_sub(UNDER_WAY))
+            alive.0.min(context.now.0.saturating_sub(UNDER_WAY))
         });
-        if !self.told && since.saturating_add(SILENCE) <= scene.now.0 {
-            self.told = true;
+        if !self.presumed_lost && since.saturating_add(SILENCE) <= context.now.0 {
+            self.presumed_lost = true;
             until = until.max(since.saturating_add(FIRST_MOMENTS));
         }
         let lost = left_by(Timestamp(until)).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
-            self.exists(number, scene);
+            self.exists(number, context);
         }
     }
 
     /// Nothing more will come of what has left for here.
-    pub fn expect_no_more(&mut self, newest: u64, scene: &mut Scene<'_>) {
-        if self.reception.sequence().started() && !self.told {
-            self.exists(newest, scene);
+    pub fn expect_no_more(&mut self, newest: u64, context: &mut DeliveryContext<'_>) {
+        if self.reception.sequence().started() && !self.presumed_lost {
+            self.exists(newest, context);
         }
     }
 
     /// Settles what has waited long enough.
-    pub fn advance(&mut self, scene: &mut Scene<'_>) {
-        let (now, window) = (scene.now, settle_window(self.is_reliable(scene)));
-        let (reception, budget, mut deciding) = self.split(scene);
+    pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
+        let (now, window) = (context.now, settle_window(self.is_reliable(context)));
+        let (reception, budget, mut accounting) = self.split(context);
         reception.advance(now, (window, window), budget, &mut |decision| {
-            deciding.take(decision);
+            accounting.take(decision);
         });
-        self.conclude(now, scene);
-        self.deaths.settled(self.reception.sequence().settled());
-        self.cancelled.expire(now.0);
+        self.conclude(now, context);
+        self.loss_causes
+            .settled(self.reception.sequence().settled());
+        self.undelivered.expire(now.0);
     }
 
     /// Settles everything, also what is pending: nothing more will come.
-    pub fn settle(&mut self, scene: &mut Scene<'_>) {
-        let (reception, budget, mut deciding) = self.split(scene);
-        reception.settle(budget, &mut |decision| deciding.take(decision));
-        self.conclude(Timestamp(u64::MAX), scene);
+    pub fn settle(&mut self, context: &mut DeliveryContext<'_>) {
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.settle(budget, &mut |decision| accounting.take(decision));
+        self.conclude(Timestamp(u64::MAX), context);
     }
 
     /// `other` turned out to be the same receiver.
-    pub fn absorb(&mut self, mut other: Self, scene: &mut Scene<'_>) {
-        let mut runs = self.deaths.due(Timestamp(u64::MAX));
-        runs.extend(other.deaths.due(Timestamp(u64::MAX)));
+    pub fn absorb(&mut self, mut other: Self, context: &mut DeliveryContext<'_>) {
+        let mut runs = self.loss_causes.due(Timestamp(u64::MAX));
+        runs.extend(other.loss_causes.due(Timestamp(u64::MAX)));
         // So many at once are no matter of single fragments, nor of single repairs.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
@@ -397,24 +405,24 @@ impl Delivery {
             .filter(|number| !self.has(*number) && !other.has(*number))
             .collect();
         self.tally.add(&other.tally);
-        let total = &mut scene.totals.received.pending;
+        let total = &mut context.totals.received.pending;
         *total = total.saturating_sub(std::mem::take(&mut self.tally.pending));
-        self.deaths.absorb(other.deaths);
+        self.loss_causes.absorb(other.loss_causes);
         self.first_seen = self.first_seen.min(other.first_seen);
         self.last_seen = self.last_seen.max(other.last_seen);
         self.opened = self.opened.max(other.opened);
-        self.proven |= other.proven;
-        let now = scene.now;
+        self.uses_network |= other.uses_network;
+        let now = context.now;
         let settled = other.reception.sequence().settled();
-        let (reception, budget, mut deciding) = self.split(scene);
+        let (reception, budget, mut accounting) = self.split(context);
         for (first, last) in long {
-            deciding.lose(LossCause::BeforeHost, first, last);
+            accounting.lose(LossCause::BeforeHost, first, last);
         }
         for number in pending {
-            deciding.wait(number, number);
+            accounting.wait(number, number);
         }
         reception.absorb(other.reception, now, budget, &mut |decision| {
-            deciding.take(decision);
+            accounting.take(decision);
         });
         // What was decided there is not decided again.
         let sequence = self.reception.sequence_mut();
@@ -422,41 +430,45 @@ impl Delivery {
         (sequence.settled()..settled).for_each(|number| sequence.know(number));
     }
 
-    const fn is_reliable(&self, scene: &Scene<'_>) -> bool {
-        scene.reliable && !self.best_effort
+    const fn is_reliable(&self, context: &DeliveryContext<'_>) -> bool {
+        context.reliable && !self.best_effort
     }
 
     fn touch(&mut self, record: &Record) {
         self.last_seen = self.last_seen.max(Timestamp(record.time));
     }
 
-    fn take(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
-        let (number, reliable) = (sample.sequence_number(), self.is_reliable(scene));
-        self.begin_anew(number, scene);
+    fn take(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<Whole>) {
+        let (number, reliable) = (sample.sequence_number(), self.is_reliable(context));
+        self.begin_anew(number, context);
         let sequence = self.reception.sequence();
         let is_sent = self.direction() == Direction::Sent;
         let source = sample.source_timestamp().timestamp();
         let is_late = self.misses(number) && number < sequence.settled();
-        if !is_sent && is_late && !sequence.doubts(number, source, REACH) {
-            return self.late(sample, scene);
+        if !is_sent && is_late && !sequence.is_unconfirmed(number, source, REACH) {
+            return self.late(sample, context);
         }
         let before = (sequence.next(), sequence.last_advance());
-        let (reception, budget, mut deciding) = self.split(scene);
+        let (reception, budget, mut accounting) = self.split(context);
         let outcome = reception.sample(sample, reliable, budget, &mut |decision| {
-            deciding.take(decision);
+            accounting.take(decision);
         });
         self.excuse_unheard(before);
         match outcome {
             Outcome::Open => (false, None),
-            Outcome::Again => {
+            Outcome::Duplicate => {
                 // One multicast may be seen on its way out by several interfaces.
-                if !is_sent || !self.main.place.is_multicast() {
-                    self.count(scene, |tally| tally.duplicates += 1);
+                if !is_sent || !self.main.destination.is_multicast() {
+                    self.count(context, |tally| tally.duplicates += 1);
                 }
                 (true, None)
             }
             Outcome::Whole(whole) => {
-                self.whole(&whole, scene);
+                self.whole(&whole, context);
                 (false, Some(whole))
             }
         }
@@ -471,26 +483,26 @@ impl Delivery {
         }
     }
 
-    fn whole(&mut self, whole: &Whole, scene: &mut Scene<'_>) {
+    fn whole(&mut self, whole: &Whole, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
-        let is_history = whole.number < sequence.first() && !whole.doubted;
+        let is_history = whole.number < sequence.first() && !whole.unconfirmed;
         let missed = sequence.missed_since(whole.number);
-        let death = self.deaths.forget(whole.number);
-        let recovered = (whole.recovered || death.is_some()) && !is_history;
+        let known_loss = self.loss_causes.forget(whole.number);
+        let recovered = (whole.recovered || known_loss.is_some()) && !is_history;
         if !whole.is_message {
             return;
         }
         let mut waited = 0.0;
         if recovered && self.direction() == Direction::Received {
-            let noticed = death.map(|death| death.at).or(missed);
+            let noticed = known_loss.map(|known_loss| known_loss.at).or(missed);
             let waited_for = noticed.map_or(whole.repaired_after, |noticed| {
-                scene.now.nanoseconds_since(noticed)
+                context.now.nanoseconds_since(noticed)
             });
             waited = seconds(waited_for);
-            let breakdown = scene.totals.breakdown.get_or_insert_default();
+            let breakdown = context.totals.breakdown.get_or_insert_default();
             breakdown.retransmission.observe(waited);
         }
-        self.count(scene, |tally| {
+        self.count(context, |tally| {
             tally.messages += 1;
             tally.bytes += whole.bytes;
             tally.history += u64::from(is_history);
@@ -501,11 +513,15 @@ impl Delivery {
 
     /// A sample that comes after it was settled as lost: too late for the counters, unless its cause
     /// was still awaited.
-    fn late(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> (bool, Option<Whole>) {
+    fn late(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut DeliveryContext<'_>,
+    ) -> (bool, Option<Whole>) {
         let number = sample.sequence_number();
         let is_whole = matches!(sample, Sample::Data(_));
-        if is_whole && self.deaths.resolve(number) {
-            self.count(scene, |tally| {
+        if is_whole && self.loss_causes.resolve(number) {
+            self.count(context, |tally| {
                 tally.pending = tally.pending.saturating_sub(1);
                 tally.messages += 1;
                 tally.bytes += u64::from(sample.size());
@@ -517,75 +533,77 @@ impl Delivery {
         if is_whole {
             self.reception.sequence_mut().know(number);
         }
-        self.count(scene, |tally| tally.duplicates += 1);
+        self.count(context, |tally| tally.duplicates += 1);
         (true, None)
     }
 
     /// After so many numbers that nobody here was to get, all count afresh.
-    fn begin_anew(&mut self, number: u64, scene: &mut Scene<'_>) {
+    fn begin_anew(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_far = number.saturating_sub(sequence.next()) > EXCUSED;
         if sequence.started() && is_far && sequence.last_advance() < self.opened {
-            let (reception, budget, mut deciding) = self.split(scene);
-            reception.settle(budget, &mut |decision| deciding.take(decision));
+            let (reception, budget, mut accounting) = self.split(context);
+            reception.settle(budget, &mut |decision| accounting.take(decision));
             self.reception = Reception::default();
         }
     }
 
-    fn die(&mut self, number: u64, cause: LossCause, scene: &mut Scene<'_>) {
+    fn record_cause(&mut self, number: u64, cause: LossCause, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         if sequence.has(number) || number < sequence.settled().max(sequence.first()) {
             return;
         }
-        let now = scene.now;
-        self.exists(number, scene);
-        if self.deaths.note(number, cause, now) {
-            scene.budget.evictions += 1;
+        let now = context.now;
+        self.exists(number, context);
+        if self.loss_causes.note(number, cause, now) {
+            context.budget.evictions += 1;
         }
     }
 
-    fn exists(&mut self, number: u64, scene: &mut Scene<'_>) {
-        let now = scene.now;
-        let (reception, budget, mut deciding) = self.split(scene);
-        reception.exists(number, now, budget, &mut |decision| deciding.take(decision));
+    fn exists(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
+        let now = context.now;
+        let (reception, budget, mut accounting) = self.split(context);
+        reception.exists(number, now, budget, &mut |decision| {
+            accounting.take(decision);
+        });
     }
 
     /// What was pending until `now` never reached this host.
-    fn conclude(&mut self, now: Timestamp, scene: &mut Scene<'_>) {
-        for (first, last) in self.deaths.due(now) {
-            let (_, _, mut deciding) = self.split(scene);
-            deciding.conclude(first, last);
+    fn conclude(&mut self, now: Timestamp, context: &mut DeliveryContext<'_>) {
+        for (first, last) in self.loss_causes.due(now) {
+            let (_, _, mut accounting) = self.split(context);
+            accounting.conclude(first, last);
         }
     }
 
-    fn count(&mut self, scene: &mut Scene<'_>, change: impl Fn(&mut Delivered)) {
+    fn count(&mut self, context: &mut DeliveryContext<'_>, change: impl Fn(&mut Delivered)) {
         change(&mut self.tally);
-        change(scene.totals.of(self.main.direction));
+        change(context.totals.of(self.main.direction));
     }
 
     /// The reception, the memory for it, and what its decisions change.
     const fn split<'a>(
         &'a mut self,
-        scene: &'a mut Scene<'_>,
-    ) -> (&'a mut Reception, &'a mut Budget, Deciding<'a>) {
-        let wait = REASSEMBLY - settle_window(self.is_reliable(scene));
-        let until = if scene.reassembled {
-            Some(Timestamp(scene.now.0.saturating_add(wait)))
+        context: &'a mut DeliveryContext<'_>,
+    ) -> (&'a mut Reception, &'a mut Budget, Accounting<'a>) {
+        let wait = REASSEMBLY - settle_window(self.is_reliable(context));
+        let until = if context.reassembled {
+            Some(Timestamp(context.now.0.saturating_add(wait)))
         } else {
             None
         };
-        let deciding = Deciding {
+        let accounting = Accounting {
             tally: &mut self.tally,
-            deaths: &mut self.deaths,
-            totals: &mut scene.totals.received,
-            journal: scene.journal,
-            writer: scene.writer,
+            loss_causes: &mut self.loss_causes,
+            totals: &mut context.totals.received,
+            journal: context.journal,
+            writer: context.writer,
             receiver: self.receiver,
             main: self.main,
-            at: scene.now,
+            at: context.now,
             until,
         };
-        (&mut self.reception, scene.budget, deciding)
+        (&mut self.reception, context.budget, accounting)
     }
 }
 

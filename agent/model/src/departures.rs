@@ -5,8 +5,8 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
 
+use super::route::Destination;
 use super::size::Size;
-use super::way::Place;
 
 /// Departures remembered: a sample is under way for a moment, to a few destinations.
 const LIMIT: usize = 64;
@@ -22,7 +22,7 @@ pub struct Departures {
 #[derive(Clone, Copy, Debug)]
 struct Departure {
     number: u64,
-    place: Place,
+    destination: Destination,
     at: Timestamp,
 }
 
@@ -44,18 +44,22 @@ impl Departures {
     }
 
     /// The sample has left whole for this place.
-    pub fn note(&mut self, number: u64, place: Place, at: Timestamp) {
+    pub fn note(&mut self, number: u64, destination: Destination, at: Timestamp) {
         if self.latest.len() >= LIMIT {
             self.latest.pop_front();
         }
-        self.latest.push_back(Departure { number, place, at });
+        self.latest.push_back(Departure {
+            number,
+            destination,
+            at,
+        });
     }
 
     /// When it left for there.
     #[must_use]
-    pub fn find(&self, number: u64, place: Place) -> Option<Timestamp> {
+    pub fn find(&self, number: u64, destination: Destination) -> Option<Timestamp> {
         let mut latest = self.latest.iter().rev();
-        let found = latest.find(|each| each.number == number && each.place == place);
+        let found = latest.find(|each| each.number == number && each.destination == destination);
         found.map(|departure| departure.at)
     }
 }
@@ -67,18 +71,18 @@ mod tests {
     #[test]
     fn departures_for_several_places_are_told_apart_and_bounded() {
         let mut departures = Departures::default();
-        let place = |port| Place {
+        let destination = |port| Destination {
             port,
-            ..Place::default()
+            ..Destination::default()
         };
         for number in 1..=1000 {
             let source = Timestamp(number);
             assert!(departures.is_first(source) && !departures.is_first(source));
-            departures.note(number, place(1), Timestamp(number));
-            departures.note(number, place(2), Timestamp(number + 5));
+            departures.note(number, destination(1), Timestamp(number));
+            departures.note(number, destination(2), Timestamp(number + 5));
         }
-        assert_eq!(departures.find(1000, place(2)), Some(Timestamp(1005)));
-        assert_eq!(departures.find(1, place(1)), None);
+        assert_eq!(departures.find(1000, destination(2)), Some(Timestamp(1005)));
+        assert_eq!(departures.find(1, destination(1)), None);
         assert!(departures.latest.len() <= LIMIT);
     }
 }

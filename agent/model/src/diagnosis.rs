@@ -11,12 +11,14 @@ mod examiner;
 mod matching;
 mod nodes;
 
+use ros2probe_wire::DomainId;
 use std::cmp::Ordering;
 use std::sync::Arc;
 
 use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::TypeHash;
 
+use super::topic_kind::TopicKind;
 pub use examiner::Examiner;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
 
@@ -24,13 +26,13 @@ pub use matching::{Offer, Policies, Policy, Verdict, verdict};
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TopicKey {
     /// Its domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// Its DDS name: with the domain its identity.
     pub dds_name: Arc<str>,
     /// Its ROS name, or the DDS name.
     pub name: Arc<str>,
-    /// As [`super::snapshot::TopicFacts::kind`].
-    pub kind: &'static str,
+    /// What it is.
+    pub kind: TopicKind,
 }
 
 /// One finding. What comes first in a variant identifies it, what comes last may change.
@@ -66,7 +68,7 @@ pub enum Diagnosis {
     /// Several nodes of one name in one domain.
     DuplicateNode {
         /// Domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// Fully qualified name.
         node: Arc<str>,
         /// The participant of each, sorted; one that has several of them is there as often.
@@ -97,7 +99,7 @@ pub enum Diagnosis {
         /// One of its participants, the lowest.
         participant: Guid,
         /// Domains, sorted.
-        domains: Vec<u32>,
+        domains: Vec<DomainId>,
     },
 }
 
@@ -203,19 +205,21 @@ impl Diagnosis {
     }
 
     /// What tells findings of one kind and topic apart.
-    fn within_topic(&self) -> (u32, &str, Option<Guid>, Option<Guid>) {
+    fn within_topic(&self) -> (DomainId, &str, Option<Guid>, Option<Guid>) {
         match self {
-            Self::QosIncompatible { writer, reader, .. } => (0, "", Some(*writer), Some(*reader)),
-            Self::TypeConflict { .. } => (0, "", None, None),
-            Self::TypeHashConflict { message_type, .. } => (0, message_type, None, None),
+            Self::QosIncompatible { writer, reader, .. } => {
+                (DomainId(0), "", Some(*writer), Some(*reader))
+            }
+            Self::TypeConflict { .. } => (DomainId(0), "", None, None),
+            Self::TypeHashConflict { message_type, .. } => (DomainId(0), message_type, None, None),
             Self::DuplicateNode {
                 domain_id, node, ..
             } => (*domain_id, node, None, None),
-            Self::UnheardPublisher { writer, .. } => (0, "", Some(*writer), None),
-            Self::UnfedSubscriber { reader, .. } => (0, "", Some(*reader), None),
+            Self::UnheardPublisher { writer, .. } => (DomainId(0), "", Some(*writer), None),
+            Self::UnfedSubscriber { reader, .. } => (DomainId(0), "", Some(*reader), None),
             Self::NodeInSeveralDomains {
                 node, participant, ..
-            } => (0, node, Some(*participant), None),
+            } => (DomainId(0), node, Some(*participant), None),
         }
     }
 }
@@ -274,10 +278,10 @@ mod tests {
     fn unheard(name: &str, writer: u8, reason: Unmatched) -> Diagnosis {
         Diagnosis::UnheardPublisher {
             topic: TopicKey {
-                domain_id: 0,
+                domain_id: DomainId(0),
                 dds_name: format!("rt{name}").into(),
                 name: name.into(),
-                kind: "topic",
+                kind: TopicKind::Topic,
             },
             writer: guid(writer),
             reason,
@@ -286,7 +290,7 @@ mod tests {
 
     fn duplicate(node: &str) -> Diagnosis {
         Diagnosis::DuplicateNode {
-            domain_id: 3,
+            domain_id: DomainId(3),
             node: node.into(),
             participants: vec![guid(1), guid(2)],
         }
@@ -327,7 +331,7 @@ mod tests {
             Diagnosis::NodeInSeveralDomains {
                 node: "/a".into(),
                 participant: guid(1),
-                domains: vec![0, 5],
+                domains: vec![DomainId(0), DomainId(5)],
             },
         ];
         all.sort();

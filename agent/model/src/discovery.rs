@@ -5,13 +5,13 @@
 //! again says nothing about it. Every table is capped: what was there before a flood of forgeries
 //! stays, and a newcomer that is worth no more is refused until there is room.
 
+mod disposals;
+mod entity;
+mod eviction;
 mod facts;
-mod graveyard;
 mod memory;
-mod room;
-mod subject;
-mod waiting;
-mod worth;
+mod pending;
+mod priority;
 
 use std::cmp::Reverse;
 use std::collections::{BTreeSet, HashMap};
@@ -22,16 +22,17 @@ use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement, R
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::rtps::Locator;
-use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
+use disposals::Disposals;
+use entity::DiscoveredEntity;
+use eviction::{FORSAKEN, Newcomer, Table, Victims};
 use facts::{ADDRESSES, domain, named};
-pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, Portrait};
-use graveyard::Graveyard;
+pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
 pub use memory::{Memory, hexadecimal};
-use room::{FORSAKEN, Newcomer, Table, Victims};
-use subject::Subject;
-use waiting::Waiting;
-pub use worth::Worth;
+use pending::PendingTable;
+pub use priority::Priority;
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -39,7 +40,6 @@ use super::size::Size;
 use super::topic::Naming;
 use crate::watch::Watchlist;
 
-const SECOND: u64 = 1_000_000_000;
 /// Endpoints and nodes whose participant is not known yet: how many and how long.
 const PENDING: usize = 1024;
 /// Participants for which there was no room.
@@ -80,7 +80,7 @@ pub enum Change {
 #[derive(Debug)]
 struct PendingEndpoint {
     at: Timestamp,
-    tells_readers: bool,
+    announces_readers: bool,
     announcement: Box<EndpointAnnouncement>,
 }
 
@@ -88,7 +88,7 @@ struct PendingEndpoint {
 #[derive(Debug)]
 struct PendingNodes {
     at: Timestamp,
-    worth: Worth,
+    priority: Priority,
     writer: Guid,
     sequence_number: u64,
     nodes: Vec<Node>,
@@ -104,10 +104,10 @@ pub struct Discovery {
     watchlist: Arc<Watchlist>,
     participants: HashMap<GuidPrefix, Box<Participant>>,
     endpoints: HashMap<Guid, Box<Endpoint>>,
-    applicants: Waiting<GuidPrefix, Box<Participant>>,
-    pending_endpoints: Waiting<Guid, PendingEndpoint>,
+    applicants: PendingTable<GuidPrefix, Box<Participant>>,
+    pending_endpoints: PendingTable<Guid, PendingEndpoint>,
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
-    graveyard: Graveyard,
+    disposals: Disposals,
     node_count: usize,
     /// Writers and readers that nodes name.
     named: usize,
@@ -141,10 +141,10 @@ impl Discovery {
             watchlist: Arc::default(),
             participants: HashMap::new(),
             endpoints: HashMap::new(),
-            applicants: Waiting::new(APPLICANTS),
-            pending_endpoints: Waiting::new(PENDING),
+            applicants: PendingTable::new(APPLICANTS),
+            pending_endpoints: PendingTable::new(PENDING),
             pending_nodes: HashMap::new(),
-            graveyard: Graveyard::default(),
+            disposals: Disposals::default(),
             node_count: 0,
             named: 0,
             changes: Vec::new(),
@@ -199,7 +199,7 @@ impl Discovery {
             applicants,
             pending_endpoints,
             pending_nodes,
-            graveyard,
+            disposals,
             node_count: _,
             named: _,
             changes,
@@ -217,7 +217,7 @@ impl Discovery {
                 sequence_number: _,
                 nodes,
                 bytes: _,
-                worth: _,
+                priority: _,
             } = pending;
             nodes.iter().map(Node::bytes).sum::<usize>()
         };
@@ -267,15 +267,15 @@ impl Discovery {
             // Taken after each datagram.
             Size::new("discovery.changes", changes.len(), caps.endpoints),
         ];
-        sizes.extend(graveyard.sizes());
+        sizes.extend(disposals.sizes());
         sizes.extend(churn.sizes());
         sizes
     }
 
     /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.
     #[must_use]
-    pub fn was_buried(&self, guid: Guid, now: Timestamp) -> bool {
-        self.graveyard.holds(guid, now)
+    pub fn was_disposed(&self, guid: Guid, now: Timestamp) -> bool {
+        self.disposals.is_recent(guid, now)
     }
 
     /// What happened to endpoints since the last call.
@@ -288,7 +288,7 @@ impl Discovery {
     pub fn knows(&self, prefix: GuidPrefix) -> bool {
         let mut waiting = self.pending_endpoints.range(endpoints_of(prefix));
         self.participants.contains_key(&prefix)
-            || self.applicants.worth(&prefix).is_some()
+            || self.applicants.priority(&prefix).is_some()
             || waiting.next().is_some()
     }
 
@@ -300,9 +300,9 @@ impl Discovery {
             self.rate(prefix);
         }
         let watchlist = &self.watchlist;
-        self.pending_endpoints.rate(|worth, pending| Worth {
+        self.pending_endpoints.rate(|priority, pending| Priority {
             watched: is_named(watchlist, None, &pending.announcement.topic),
-            ..worth
+            ..priority
         });
         self.participant_victims = Victims::default();
         self.endpoint_victims = Victims::default();
@@ -311,23 +311,23 @@ impl Discovery {
 
     /// Something of this participant was seen: its lease begins anew. Returns whether it is worth
     /// more by that than it was: see [`Self::learn`].
-    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp, evidence: Worth) -> bool {
-        let worth = match self.participants.get_mut(&prefix) {
+    pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp, evidence: Priority) -> bool {
+        let priority = match self.participants.get_mut(&prefix) {
             Some(participant) => {
                 participant.seen(at);
-                Some(participant.worth())
+                Some(participant.priority())
             }
-            None if evidence == Worth::NOTHING => None,
-            None => self.applicants.worth(&prefix),
+            None if evidence == Priority::NOTHING => None,
+            None => self.applicants.priority(&prefix),
         };
-        worth.is_some_and(|worth| worth.or(evidence) != worth)
+        priority.is_some_and(|priority| priority.or(evidence) != priority)
     }
 
     /// A participant is worth more than it was. Returns whether it finds room by that.
     pub fn learn(
         &mut self,
         prefix: GuidPrefix,
-        evidence: Worth,
+        evidence: Priority,
         at: Timestamp,
         journal: &mut Journal,
     ) -> bool {
@@ -337,10 +337,10 @@ impl Discovery {
             self.adopt_pending(prefix, at, journal);
             return false;
         }
-        let Some((worth, participant)) = self.applicants.remove(&prefix) else {
+        let Some((priority, participant)) = self.applicants.remove(&prefix) else {
             return false;
         };
-        self.enter(prefix, participant, worth.or(evidence), at, journal)
+        self.enter(prefix, participant, priority.or(evidence), at, journal)
     }
 
     /// Asks anew which participants a socket of this host sends for.
@@ -355,15 +355,15 @@ impl Discovery {
         &mut self,
         announcement: &ParticipantAnnouncement,
         origin: &Origin,
-        evidence: Worth,
+        evidence: Priority,
         journal: &mut Journal,
     ) {
         let guid = announcement.guid;
-        if self.graveyard.is_stale(guid, origin) {
+        if self.disposals.is_stale(guid, origin) {
             return;
         }
         let (domain_id, source) = domain(announcement.domain_id, origin);
-        let portrait = Portrait::of(announcement);
+        let proxy = ParticipantProxy::of(announcement);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.seen(origin.at);
             let addresses = Addresses::of(announcement);
@@ -371,24 +371,24 @@ impl Discovery {
                 participant.addresses = addresses;
                 self.revision += 1;
             }
-            if participant.portrait != portrait {
-                participant.portrait = portrait;
+            if participant.proxy != proxy {
+                participant.proxy = proxy;
                 let domain_id = participant.domain_id;
-                let portrait = Portrait::of(announcement);
-                let subject = Subject::participant(domain_id, guid, &portrait);
-                self.note(&subject, Event::Changed, origin.at, journal);
+                let proxy = ParticipantProxy::of(announcement);
+                let entity = DiscoveredEntity::participant(domain_id, guid, &proxy);
+                self.note(&entity, Event::Changed, origin.at, journal);
             }
             self.move_to(guid.prefix, domain_id, source);
             self.learn(guid.prefix, evidence, origin.at, journal);
             return;
         }
         let waiting = self.pending_endpoints.range(endpoints_of(guid.prefix));
-        let known = waiting.map(|(_, worth)| worth);
-        let known = known.fold(evidence, Worth::or);
+        let known = waiting.map(|(_, priority)| priority);
+        let known = known.fold(evidence, Priority::or);
         let before = self.applicants.remove(&guid.prefix);
-        let worth = before.map_or(known, |(worth, _)| worth.or(known));
+        let priority = before.map_or(known, |(priority, _)| priority.or(known));
         let participant = Box::new(Participant {
-            portrait,
+            proxy,
             addresses: Addresses::of(announcement),
             restored: None,
             domain_id,
@@ -396,14 +396,14 @@ impl Discovery {
             last_seen: origin.at,
             endpoints: BTreeSet::new(),
             nodes: Vec::new(),
-            readers_told: false,
+            all_readers_announced: false,
             watched: 0,
             local: false,
             sends: false,
             domain_source: source,
             nodes_from: None,
         });
-        self.enter(guid.prefix, participant, worth, origin.at, journal);
+        self.enter(guid.prefix, participant, priority, origin.at, journal);
     }
 
     /// SPDP: it says goodbye.
@@ -411,7 +411,7 @@ impl Discovery {
         if guid.entity != EntityId::PARTICIPANT {
             return;
         }
-        self.graveyard.bury(guid, origin);
+        self.disposals.add(guid, origin);
         self.applicants.remove(&guid.prefix);
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
@@ -422,7 +422,7 @@ impl Discovery {
         &mut self,
         announcement: EndpointAnnouncement,
         origin: &Origin,
-        evidence: Worth,
+        evidence: Priority,
         journal: &mut Journal,
     ) -> bool {
         let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
@@ -430,14 +430,14 @@ impl Discovery {
             self.evictions.endpoints += 1;
             return false;
         }
-        if self.graveyard.is_stale(announcement.guid, origin) {
+        if self.disposals.is_stale(announcement.guid, origin) {
             return false;
         }
         let guid = announcement.guid;
-        let tells_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
+        let announces_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
         let pending = PendingEndpoint {
             at: origin.at,
-            tells_readers,
+            announces_readers,
             announcement: Box::new(announcement),
         };
         let is_known = self.participants.contains_key(&guid.prefix);
@@ -450,19 +450,19 @@ impl Discovery {
             return false;
         };
         let watched = is_named(&self.watchlist, None, &pending.announcement.topic);
-        let worth = Worth {
+        let priority = Priority {
             watched,
             ..evidence
         };
-        let is_crowded = self.pending_endpoints.put(guid, worth, pending);
+        let is_crowded = self.pending_endpoints.put(guid, priority, pending);
         self.evictions.endpoints += u64::from(is_known || is_crowded);
-        let is_more = !is_known && self.seen(guid.prefix, origin.at, worth);
-        is_more && self.learn(guid.prefix, worth, origin.at, journal)
+        let is_more = !is_known && self.seen(guid.prefix, origin.at, priority);
+        is_more && self.learn(guid.prefix, priority, origin.at, journal)
     }
 
     /// SEDP: an endpoint says goodbye.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
-        self.graveyard.bury(guid, origin);
+        self.disposals.add(guid, origin);
         self.pending_endpoints.remove(&guid);
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.remove(&guid);
@@ -477,7 +477,7 @@ impl Discovery {
         entities: &ParticipantEntities,
         writer: Guid,
         origin: &Origin,
-        evidence: Worth,
+        evidence: Priority,
         journal: &mut Journal,
     ) {
         // A participant tells of its own nodes only.
@@ -485,23 +485,23 @@ impl Discovery {
         if prefix != writer.prefix {
             return;
         }
-        let worth = self.participants.get(&prefix).map(|known| known.worth());
+        let priority = self.participants.get(&prefix).map(|known| known.priority());
         let guid = entities.participant;
-        let newcomer = worth.map(|worth| Newcomer { guid, worth });
+        let newcomer = priority.map(|priority| Newcomer { guid, priority });
         let wanted = entities.nodes.iter();
         let wanted = wanted.map(|node| node.writers.len() + node.readers.len());
         let wanted = wanted.sum::<usize>().min(PER_PARTICIPANT);
-        let (room, mut names) = loop {
-            let (room, names) = self.room_for_nodes(prefix);
-            let fits = entities.nodes.len() <= room && wanted <= names;
+        let (eviction, mut names) = loop {
+            let (eviction, names) = self.node_quota(prefix);
+            let fits = entities.nodes.len() <= eviction && wanted <= names;
             let newcomer = newcomer.filter(|_| !fits);
             let is_more =
-                newcomer.is_some_and(|newcomer| self.make_room(Table::Nodes, newcomer, origin.at));
+                newcomer.is_some_and(|newcomer| self.evict_for(Table::Nodes, newcomer, origin.at));
             if !is_more {
-                break (room, names.min(PER_PARTICIPANT));
+                break (eviction, names.min(PER_PARTICIPANT));
             }
         };
-        let mut nodes: Vec<Node> = entities.nodes.iter().take(room).map(Node::of).collect();
+        let mut nodes: Vec<Node> = entities.nodes.iter().take(eviction).map(Node::of).collect();
         self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
         for node in &mut nodes {
             self.evictions.nodes += u64::from(node.cut(&mut names));
@@ -526,22 +526,22 @@ impl Discovery {
         self.pending_nodes.remove(&prefix);
         let bytes = nodes.iter().map(Node::bytes).sum();
         let waiting = self.pending_endpoints.range(endpoints_of(prefix));
-        let worth = waiting.fold(evidence, |worth, (_, other)| worth.or(other));
+        let priority = waiting.fold(evidence, |priority, (_, other)| priority.or(other));
         while self.pending_nodes.len() >= PENDING_NODES
             || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
         {
             self.evictions.nodes += 1;
             let pending = self.pending_nodes.iter();
-            let oldest = pending.min_by_key(|(_, pending)| (pending.worth, pending.at));
-            match oldest.map(|(prefix, pending)| (*prefix, pending.worth)) {
-                Some((oldest, least)) if least <= worth => self.pending_nodes.remove(&oldest),
+            let oldest = pending.min_by_key(|(_, pending)| (pending.priority, pending.at));
+            match oldest.map(|(prefix, pending)| (*prefix, pending.priority)) {
+                Some((oldest, least)) if least <= priority => self.pending_nodes.remove(&oldest),
                 _ => return,
             };
         }
         let sequence_number = origin.sequence_number;
         let pending = PendingNodes {
             at: origin.at,
-            worth,
+            priority,
             writer,
             sequence_number,
             nodes,
@@ -556,7 +556,7 @@ impl Discovery {
             .participants
             .iter()
             .filter_map(|(prefix, participant)| {
-                let lease = match participant.portrait.lease {
+                let lease = match participant.proxy.lease {
                     Duration::Finite(lease) => lease,
                     // Who went while nobody looked is not believed in for ever.
                     Duration::Infinite if participant.restored.is_some() => FORSAKEN,
@@ -580,14 +580,14 @@ impl Discovery {
     }
 
     /// How many nodes this participant may have, and how many endpoints these may name.
-    fn room_for_nodes(&self, prefix: GuidPrefix) -> (usize, usize) {
+    fn node_quota(&self, prefix: GuidPrefix) -> (usize, usize) {
         let known: &[Node] = match self.participants.get(&prefix) {
             Some(known) => &known.nodes,
             None => &[],
         };
-        let room = self.caps.nodes.saturating_sub(self.node_count);
+        let eviction = self.caps.nodes.saturating_sub(self.node_count);
         let names = self.caps.endpoints.saturating_sub(self.named);
-        (room + known.len(), names + named(known))
+        (eviction + known.len(), names + named(known))
     }
 
     fn pending_node_bytes(&self) -> usize {
@@ -602,22 +602,22 @@ impl Discovery {
         &mut self,
         prefix: GuidPrefix,
         mut participant: Box<Participant>,
-        worth: Worth,
+        priority: Priority,
         at: Timestamp,
         journal: &mut Journal,
     ) -> bool {
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         let is_full = self.participants.len() >= self.caps.participants;
-        if is_full && !self.make_room(Table::Participants, Newcomer { guid, worth }, at) {
+        if is_full && !self.evict_for(Table::Participants, Newcomer { guid, priority }, at) {
             self.evictions.participants += 1;
-            self.applicants.put(prefix, worth, participant);
+            self.applicants.put(prefix, priority, participant);
             return false;
         }
-        (participant.local, participant.sends) = (worth.local, worth.sends);
-        let portrait = participant.portrait.clone();
-        let subject = Subject::participant(participant.domain_id, guid, &portrait);
+        (participant.local, participant.sends) = (priority.local, priority.sends);
+        let proxy = participant.proxy.clone();
+        let entity = DiscoveredEntity::participant(participant.domain_id, guid, &proxy);
         self.participants.insert(prefix, participant);
-        self.note(&subject, Event::Appeared, at, journal);
+        self.note(&entity, Event::Appeared, at, journal);
         self.adopt_pending(prefix, at, journal);
         true
     }
@@ -632,7 +632,7 @@ impl Discovery {
         let announcement = &pending.announcement;
         let guid = announcement.guid;
         let participant = self.participants.get_mut(&guid.prefix)?;
-        participant.readers_told |= pending.tells_readers;
+        participant.all_readers_announced |= pending.announces_readers;
         let domain_id = participant.domain_id;
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {
@@ -648,9 +648,9 @@ impl Discovery {
                     && before.1 == known.qos
                     && before.2 == known.message_type;
                 if !unchanged {
-                    let subject = Subject::endpoint(guid, known);
+                    let entity = DiscoveredEntity::endpoint(guid, known);
                     self.changes.push(Change::Changed(guid));
-                    self.note(&subject, Event::Changed, at, journal);
+                    self.note(&entity, Event::Changed, at, journal);
                 }
                 return None;
             }
@@ -660,15 +660,15 @@ impl Discovery {
         }
         let participant = self.participants.get(&guid.prefix)?;
         let watched = is_named(&self.watchlist, Some(domain_id), &announcement.topic);
-        let worth = Worth {
+        let priority = Priority {
             watched,
-            ..participant.worth()
+            ..participant.priority()
         };
         if participant.endpoints.len() >= PER_PARTICIPANT {
             return Some(pending);
         }
         let is_full = self.endpoints.len() >= self.caps.endpoints;
-        if is_full && !self.make_room(Table::Endpoints, Newcomer { guid, worth }, at) {
+        if is_full && !self.evict_for(Table::Endpoints, Newcomer { guid, priority }, at) {
             return Some(pending);
         }
         let announcement = pending.announcement;
@@ -687,14 +687,14 @@ impl Discovery {
             data_sharing: announcement.datasharing,
             watched,
         };
-        let subject = Subject::endpoint(guid, &endpoint);
+        let entity = DiscoveredEntity::endpoint(guid, &endpoint);
         self.endpoints.insert(guid, Box::new(endpoint));
         if let Some(participant) = self.participants.get_mut(&guid.prefix) {
             participant.endpoints.insert(guid);
             participant.watched += usize::from(watched);
         }
         self.changes.push(Change::Appeared(guid));
-        self.note(&subject, Event::Appeared, at, journal);
+        self.note(&entity, Event::Appeared, at, journal);
         None
     }
 
@@ -702,13 +702,13 @@ impl Discovery {
     fn adopt_pending(&mut self, prefix: GuidPrefix, at: Timestamp, journal: &mut Journal) {
         let waiting = self.pending_endpoints.range(endpoints_of(prefix));
         let mut waiting: Vec<_> = waiting.collect();
-        waiting.sort_by_key(|(_, worth)| Reverse(*worth));
-        for (guid, worth) in waiting {
+        waiting.sort_by_key(|(_, priority)| Reverse(*priority));
+        for (guid, priority) in waiting {
             let Some((_, pending)) = self.pending_endpoints.remove(&guid) else {
                 continue;
             };
             if let Some(pending) = self.admit(pending, at, journal) {
-                self.pending_endpoints.put(guid, worth, pending);
+                self.pending_endpoints.put(guid, priority, pending);
                 break;
             }
         }
@@ -752,12 +752,12 @@ impl Discovery {
         let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         for name in difference(&before, &after) {
-            let subject = Subject::node(domain_id, guid, &name);
-            self.note(&subject, Event::Disposed, at, journal);
+            let entity = DiscoveredEntity::node(domain_id, guid, &name);
+            self.note(&entity, Event::Disposed, at, journal);
         }
         for name in difference(&after, &before) {
-            let subject = Subject::node(domain_id, guid, &name);
-            self.note(&subject, Event::Appeared, at, journal);
+            let entity = DiscoveredEntity::node(domain_id, guid, &name);
+            self.note(&entity, Event::Appeared, at, journal);
         }
     }
 
@@ -781,8 +781,8 @@ impl Discovery {
         let domain_id = participant.domain_id;
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         if let Some(event) = event {
-            let subject = Subject::participant(domain_id, guid, &participant.portrait);
-            self.note(&subject, event, at, journal);
+            let entity = DiscoveredEntity::participant(domain_id, guid, &participant.proxy);
+            self.note(&entity, event, at, journal);
         }
         let cascade = event.map(|_| Event::Cascaded);
         for endpoint in participant.endpoints {
@@ -792,8 +792,8 @@ impl Discovery {
         self.named = self.named.saturating_sub(named(&participant.nodes));
         if let Some(event) = cascade {
             for node in participant.nodes {
-                let subject = Subject::node(domain_id, guid, &node.name);
-                self.note(&subject, event, at, journal);
+                let entity = DiscoveredEntity::node(domain_id, guid, &node.name);
+                self.note(&entity, event, at, journal);
             }
         }
     }
@@ -813,13 +813,18 @@ impl Discovery {
             participant.watched = participant.watched.saturating_sub(watched);
         }
         if let Some(event) = event {
-            self.note(&Subject::endpoint(guid, &endpoint), event, at, journal);
+            self.note(
+                &DiscoveredEntity::endpoint(guid, &endpoint),
+                event,
+                at,
+                journal,
+            );
         }
         self.changes.push(Change::Gone(guid, endpoint));
     }
 
     /// A participant's domain is told better than before: all it has moves along.
-    fn move_to(&mut self, prefix: GuidPrefix, domain_id: u32, source: DomainSource) {
+    fn move_to(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
         };
@@ -859,18 +864,24 @@ impl Discovery {
         }
     }
 
-    fn note(&mut self, subject: &Subject<'_>, event: Event, at: Timestamp, journal: &mut Journal) {
+    fn note(
+        &mut self,
+        entity: &DiscoveredEntity<'_>,
+        event: Event,
+        at: Timestamp,
+        journal: &mut Journal,
+    ) {
         self.revision += 1;
-        self.churn.count(subject.domain_id, subject.entity(), event);
+        self.churn.count(entity.domain_id, entity.entity(), event);
         journal.note(DiscoveryEvent {
             at,
-            domain_id: subject.domain_id,
-            entity: subject.entity().label(),
+            domain_id: entity.domain_id,
+            entity: entity.entity().label(),
             event: event.label(),
-            guid: subject.guid,
-            name: subject.name(),
+            guid: entity.guid,
+            name: entity.name(),
         });
-        journal.events.push(at, subject.happened(event));
+        journal.events.push(at, entity.event(event));
     }
 }
 
@@ -881,7 +892,7 @@ pub(super) const fn endpoints_of(prefix: GuidPrefix) -> RangeInclusive<Guid> {
 }
 
 /// Whether the DDS topic is watched by its exact name, in this domain or, with `None`, in any.
-fn is_named(watchlist: &Watchlist, domain_id: Option<u32>, topic: &DdsTopic) -> bool {
+fn is_named(watchlist: &Watchlist, domain_id: Option<DomainId>, topic: &DdsTopic) -> bool {
     watchlist.has_names() && Naming::of(topic).is_named_by(domain_id, watchlist)
 }
 

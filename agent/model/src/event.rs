@@ -11,7 +11,8 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::churn;
 use super::diagnosis::Diagnosis;
@@ -19,7 +20,6 @@ use super::journal::Loss;
 use super::size::Size;
 use super::snapshot::WatchState;
 
-const SECOND: u64 = 1_000_000_000;
 /// Events of one class in a second of the source's clock.
 const MOST: u16 = 512;
 /// So many wait that they should be taken before more comes.
@@ -48,7 +48,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// Which one.
         guid: Guid,
         /// Its implementation.
@@ -63,7 +63,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// Which one.
         guid: Guid,
         /// Writer or reader.
@@ -78,7 +78,7 @@ pub enum EventKind {
         /// How.
         change: churn::Event,
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// The participant it lives in.
         participant: Guid,
         /// Fully qualified name.
@@ -89,7 +89,7 @@ pub enum EventKind {
     /// A watched topic stands otherwise than before with its watchlist entry.
     Expectation {
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// ROS name.
         topic: Arc<str>,
         /// The entry's pattern.
@@ -104,7 +104,7 @@ pub enum EventKind {
     /// A watched topic is published and nothing came for longer than its entry allows.
     Silence {
         /// Its domain.
-        domain_id: u32,
+        domain_id: DomainId,
         /// ROS name.
         topic: Arc<str>,
         /// The entry's pattern.
@@ -127,7 +127,7 @@ pub struct LossBurst {
     /// Whose.
     pub writer: Guid,
     /// Domain and DDS topic, where the writer was announced.
-    pub topic: Option<(u32, Arc<str>)>,
+    pub topic: Option<(DomainId, Arc<str>)>,
     /// Its node, where that is known.
     pub node: Option<Arc<str>>,
     /// How many.
@@ -168,13 +168,13 @@ pub struct Taken {
 #[derive(Debug, Default)]
 pub struct Events {
     waiting: Vec<Event>,
-    classes: BTreeMap<Class, Room>,
+    classes: BTreeMap<Class, ClassQuota>,
     bursts: BTreeMap<Guid, Burst>,
 }
 
 /// What one class has.
 #[derive(Clone, Copy, Debug, Default)]
-struct Room {
+struct ClassQuota {
     second: u64,
     in_second: u16,
     overflow: u64,
@@ -184,7 +184,7 @@ struct Room {
 #[derive(Debug)]
 struct Burst {
     at: Timestamp,
-    told: LossBurst,
+    losses: LossBurst,
 }
 
 impl Class {
@@ -215,19 +215,19 @@ impl EventKind {
 }
 
 impl Events {
-    /// Adds one, if there is room.
+    /// Adds one, if there is quota.
     pub fn push(&mut self, at: Timestamp, kind: EventKind) {
-        let room = self.classes.entry(kind.class()).or_default();
+        let quota = self.classes.entry(kind.class()).or_default();
         let second = at.0 / SECOND;
         // What is settled late belongs to the second before; further back the clock was set.
-        if second != room.second && second.checked_add(1) != Some(room.second) {
-            (room.second, room.in_second) = (second, 0);
+        if second != quota.second && second.checked_add(1) != Some(quota.second) {
+            (quota.second, quota.in_second) = (second, 0);
         }
-        if room.in_second >= MOST {
-            room.overflow += 1;
+        if quota.in_second >= MOST {
+            quota.overflow += 1;
             return;
         }
-        room.in_second += 1;
+        quota.in_second += 1;
         self.waiting.push(Event { at, kind });
     }
 
@@ -260,16 +260,16 @@ impl Events {
         let count = loss.last.saturating_sub(loss.first).saturating_add(1);
         if let Some(burst) = self.bursts.get_mut(&loss.writer) {
             burst.at = burst.at.max(loss.at);
-            burst.told.count = burst.told.count.saturating_add(count);
-            burst.told.first = burst.told.first.min(loss.first);
-            burst.told.last = burst.told.last.max(loss.last);
+            burst.losses.count = burst.losses.count.saturating_add(count);
+            burst.losses.first = burst.losses.first.min(loss.first);
+            burst.losses.last = burst.losses.last.max(loss.last);
             return;
         }
         if self.bursts.len() >= BURSTS {
             self.classes.entry(Class::Loss).or_default().overflow += 1;
             return;
         }
-        let told = LossBurst {
+        let losses = LossBurst {
             writer: loss.writer,
             topic: None,
             node: None,
@@ -277,28 +277,34 @@ impl Events {
             first: loss.first,
             last: loss.last,
         };
-        self.bursts.insert(loss.writer, Burst { at: loss.at, told });
+        self.bursts.insert(
+            loss.writer,
+            Burst {
+                at: loss.at,
+                losses,
+            },
+        );
     }
 
     /// This writer is no more: its burst, if there is one, was on this topic.
-    pub fn name(&mut self, writer: Guid, domain_id: u32, topic: &Arc<str>) {
+    pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &Arc<str>) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
-            burst.told.topic = Some((domain_id, Arc::clone(topic)));
+            burst.losses.topic = Some((domain_id, Arc::clone(topic)));
         }
     }
 
     /// Ends all bursts; `complete` adds what is known of their writers.
     pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
-        for (_, Burst { at, mut told }) in std::mem::take(&mut self.bursts) {
-            complete(&mut told);
-            self.push(at, EventKind::Loss(told));
+        for (_, Burst { at, mut losses }) in std::mem::take(&mut self.bursts) {
+            complete(&mut losses);
+            self.push(at, EventKind::Loss(losses));
         }
     }
 
     /// Everything since the last call.
     pub fn take(&mut self) -> Taken {
         let classes = self.classes.iter_mut();
-        let overflow = classes.map(|(class, room)| (*class, std::mem::take(&mut room.overflow)));
+        let overflow = classes.map(|(class, quota)| (*class, std::mem::take(&mut quota.overflow)));
         Taken {
             overflow: overflow.filter(|(_, count)| *count > 0).collect(),
             events: std::mem::take(&mut self.waiting),
@@ -360,7 +366,7 @@ mod tests {
     fn node(name: &str) -> EventKind {
         EventKind::Node {
             change: churn::Event::Appeared,
-            domain_id: 0,
+            domain_id: DomainId(0),
             participant: guid(1),
             name: name.into(),
         }
@@ -373,22 +379,22 @@ mod tests {
         events.lose(&loss(guid(2), 11, 1, 1));
         events.lose(&loss(guid(1), 12, 9, 9));
         assert!(events.take().events.is_empty());
-        events.name(guid(2), 3, &"rt/points".into());
+        events.name(guid(2), DomainId(3), &"rt/points".into());
         events.end_bursts(|burst| {
             if burst.topic.is_none() {
-                burst.topic = Some((0, "rt/imu".into()));
+                burst.topic = Some((DomainId(0), "rt/imu".into()));
             }
         });
-        let told: Vec<_> = events
+        let losses: Vec<_> = events
             .take()
             .events
             .into_iter()
             .map(|event| event.kind)
             .collect();
-        let burst = |writer, topic: (u32, &str), count, first, last| {
+        let burst = |writer, (domain_id, name): (u32, &str), count, first, last| {
             EventKind::Loss(LossBurst {
                 writer,
-                topic: Some((topic.0, topic.1.into())),
+                topic: Some((DomainId(domain_id), name.into())),
                 node: None,
                 count,
                 first,
@@ -396,7 +402,7 @@ mod tests {
             })
         };
         assert_eq!(
-            told,
+            losses,
             [
                 burst(guid(1), (0, "rt/imu"), 4, 5, 9),
                 burst(guid(2), (3, "rt/points"), 1, 1, 1)

@@ -183,8 +183,7 @@ fn window(rate: f64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
 
     struct Bench {
         judgement: Judgement,

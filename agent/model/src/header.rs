@@ -5,9 +5,10 @@
 //! latency; a stamp that is implausible (simulated time, an unset header) is left out.
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 /// Stamps further than this from the capture time are not the same clock.
-pub const PLAUSIBLE: u64 = 3_600_000_000_000;
+pub const PLAUSIBLE: u64 = 3600 * SECOND;
 
 /// Types outside `sensor_msgs` and `geometry_msgs`.
 const OTHERS: [&str; 37] = [

@@ -68,16 +68,16 @@ impl Histogram {
     /// known.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
-        let mut news = *self;
+        let mut difference = *self;
         // Begun anew meanwhile: all of it is new.
         if self.count() < earlier.count() {
-            return news;
+            return difference;
         }
-        for (count, before) in news.counts.iter_mut().zip(earlier.counts) {
+        for (count, before) in difference.counts.iter_mut().zip(earlier.counts) {
             *count = count.saturating_sub(before);
         }
-        news.sum -= earlier.sum;
-        news
+        difference.sum -= earlier.sum;
+        difference
     }
 
     /// The value below which this part of the values lies, as Prometheus estimates it: evenly
@@ -171,9 +171,12 @@ mod tests {
         for _ in 0..3 {
             histogram.observe(0.15);
         }
-        let news = histogram.since(&earlier);
-        assert_eq!(news.count(), 3);
-        assert!((0.1..=0.2).contains(&news.quantile(0.5)), "{news:?}");
+        let difference = histogram.since(&earlier);
+        assert_eq!(difference.count(), 3);
+        assert!(
+            (0.1..=0.2).contains(&difference.quantile(0.5)),
+            "{difference:?}"
+        );
         assert_eq!(earlier.since(&histogram), earlier, "it began anew");
     }
 

@@ -4,10 +4,12 @@
 //! A second is immutable once it is taken: readers share it with the ring and never hold the
 //! capture up. Rows are bounded in number; seconds of many topics reach back less far.
 
+use ros2probe_wire::DomainId;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::histogram::Histogram;
 use super::rate::SECONDS as WINDOW;
@@ -19,7 +21,6 @@ const ROWS: usize = 262_144;
 /// Names that are known, for each topic that may be measured: one that is measured no more is kept
 /// until there are twice as many.
 const NAMES: usize = 2;
-const SECOND: u64 = 1_000_000_000;
 
 /// The ring.
 #[derive(Debug)]
@@ -31,7 +32,7 @@ pub struct History {
     seconds: VecDeque<Arc<Second>>,
     rows: usize,
     names: Arc<Names>,
-    before: HashMap<u32, Before>,
+    before: HashMap<u32, PreviousTotals>,
     /// The last id that was given away.
     last: u32,
     /// Topics whose past was given up for want of room.
@@ -64,8 +65,8 @@ pub struct Row {
     pub lost: u32,
     /// Payload bytes.
     pub bytes: f32,
-    latency: [Short; 2],
-    interarrival: [Short; 2],
+    latency: [Bfloat16; 2],
+    interarrival: [Bfloat16; 2],
 }
 
 /// A row with what it takes to read it among its neighbours.
@@ -81,17 +82,17 @@ pub struct Reading {
 
 /// The upper half of an `f32`: 8 bits of precision, more than a percentile of a histogram has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Short(u16);
+struct Bfloat16(u16);
 
 /// Ids of topics by domain and DDS name.
 #[derive(Clone, Debug, Default)]
 struct Names {
-    by_domain: BTreeMap<u32, BTreeMap<Arc<str>, u32>>,
+    by_domain: BTreeMap<DomainId, BTreeMap<Arc<str>, u32>>,
 }
 
 /// What had been counted of a topic by the end of the second before.
 #[derive(Debug)]
-struct Before {
+struct PreviousTotals {
     messages: u64,
     bytes: u64,
     lost: u64,
@@ -135,7 +136,7 @@ impl History {
     pub fn take<'a>(
         &mut self,
         now: Timestamp,
-        topics: impl Iterator<Item = (u32, &'a Arc<str>, Measurement)>,
+        topics: impl Iterator<Item = (DomainId, &'a Arc<str>, Measurement)>,
     ) {
         if self.seconds.back().is_some_and(|last| now < last.at) {
             // Times would run backwards within a chart.
@@ -209,7 +210,7 @@ impl History {
     }
 
     /// An id for a topic that has none; `None` where as many are named as may be.
-    fn name(&mut self, domain_id: u32, dds_name: &Arc<str>) -> Option<u32> {
+    fn name(&mut self, domain_id: DomainId, dds_name: &Arc<str>) -> Option<u32> {
         if self.names.len() >= self.most {
             self.evictions += 1;
             return None;
@@ -237,14 +238,14 @@ impl History {
     }
 
     fn row(&mut self, topic: u32, counted: &Measurement) -> Row {
-        let after = Before {
+        let after = PreviousTotals {
             messages: counted.messages,
             bytes: counted.bytes,
             lost: counted.lost,
             latency: counted.source_latency,
             interarrival: counted.interarrival,
         };
-        let nothing = || Before {
+        let nothing = || PreviousTotals {
             messages: 0,
             bytes: 0,
             lost: 0,
@@ -262,7 +263,7 @@ impl Past {
     /// Every second of one topic, the oldest first; `None` while it was not measured.
     pub fn topic(
         &self,
-        domain_id: u32,
+        domain_id: DomainId,
         dds_name: &str,
     ) -> Option<impl Iterator<Item = (Timestamp, Option<Reading>)> + '_> {
         let id = self.names.find(domain_id, dds_name)?;
@@ -275,7 +276,7 @@ impl Past {
 
     /// The id by which [`Second::row`] knows a topic.
     #[must_use]
-    pub fn id(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+    pub fn id(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.names.find(domain_id, dds_name)
     }
 
@@ -353,11 +354,11 @@ impl Row {
     }
 }
 
-fn pair([median, high]: [Short; 2]) -> Option<[f32; 2]> {
+fn pair([median, high]: [Bfloat16; 2]) -> Option<[f32; 2]> {
     Some([median.value()?, high.value()?])
 }
 
-impl Short {
+impl Bfloat16 {
     const NONE: Self = Self(0xffff);
 
     fn new(value: f64) -> Self {
@@ -373,7 +374,7 @@ impl Short {
 }
 
 impl Names {
-    fn find(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+    fn find(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.by_domain.get(&domain_id)?.get(dds_name).copied()
     }
 
@@ -383,18 +384,18 @@ impl Names {
     }
 }
 
-impl Before {
+impl PreviousTotals {
     /// What was counted between `before` and this. A count that fell belongs to a topic that was
     /// forgotten meanwhile: all of it is new.
     fn since(&self, topic: u32, before: &Self) -> Row {
         let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
         let count = |now, before| u32::try_from(more(now, before)).unwrap_or(u32::MAX);
         let percentiles = |now: &Histogram, before: &Histogram| {
-            let news = now.since(before);
-            let Some((minimum, maximum)) = now.range().filter(|_| news.count() > 0) else {
-                return [Short::NONE; 2];
+            let difference = now.since(before);
+            let Some((minimum, maximum)) = now.range().filter(|_| difference.count() > 0) else {
+                return [Bfloat16::NONE; 2];
             };
-            [0.5, 0.99].map(|part| Short::new(news.quantile(part).clamp(minimum, maximum)))
+            [0.5, 0.99].map(|part| Bfloat16::new(difference.quantile(part).clamp(minimum, maximum)))
         };
         #[expect(
             clippy::cast_precision_loss,
@@ -436,7 +437,7 @@ mod tests {
     fn take(history: &mut History, second: u64, topics: &[(&Arc<str>, Measurement)]) {
         let topics = topics
             .iter()
-            .map(|(name, counted)| (0, *name, counted.clone()));
+            .map(|(name, counted)| (DomainId(0), *name, counted.clone()));
         history.take(Timestamp(second * SECOND), topics);
         for size in history.sizes() {
             assert!(size.entries <= size.cap, "{size:?}");
@@ -463,7 +464,7 @@ mod tests {
             &[(&points, counted(20, 3, &[0.001, 0.04]))],
         );
         let past = history.past();
-        let seen: Vec<_> = past.topic(0, "rt/points").unwrap().collect();
+        let seen: Vec<_> = past.topic(DomainId(0), "rt/points").unwrap().collect();
         let rows: Vec<_> = seen
             .iter()
             .map(|(_, reading)| reading.unwrap().row)
@@ -477,7 +478,7 @@ mod tests {
         assert_eq!(seen[1].1.unwrap().rate_hz, Some(10.0));
         assert_eq!(seen[2].1.unwrap().rate_hz, Some(5.0));
         assert_eq!(seen[2].1.unwrap().bandwidth, Some(500.0));
-        assert!(past.topic(1, "rt/points").is_none());
+        assert!(past.topic(DomainId(1), "rt/points").is_none());
     }
 
     #[test]
@@ -496,7 +497,7 @@ mod tests {
             &[(&one, counted(7, 0, &[])), (&other, counted(3, 0, &[]))],
         );
         let past = history.past();
-        let seen: Vec<_> = past.topic(0, "rt/a").unwrap().collect();
+        let seen: Vec<_> = past.topic(DomainId(0), "rt/a").unwrap().collect();
         let messages: Vec<_> = seen
             .iter()
             .map(|(_, reading)| reading.map(|reading| reading.row.messages))
@@ -524,7 +525,9 @@ mod tests {
             .map(|number| name(&number.to_string()))
             .collect();
         for second in 1..=20 {
-            let topics = names.iter().map(|name| (0, name, Measurement::default()));
+            let topics = names
+                .iter()
+                .map(|name| (DomainId(0), name, Measurement::default()));
             history.take(Timestamp(second * SECOND), topics);
         }
         assert_eq!(history.past().seconds().len(), 13);
@@ -545,7 +548,7 @@ mod tests {
         let table = history.table();
         assert!(table.size <= 4 && table.limit == 4, "{table:?}");
         assert_eq!(table.size + table.evictions, 9);
-        assert!(past.topic(0, "8").is_some() && past.topic(0, "0").is_none());
+        assert!(past.topic(DomainId(0), "8").is_some() && past.topic(DomainId(0), "0").is_none());
         assert!(history.before.len() <= 4);
         // More at once than can be named.
         let all: Vec<_> = names
@@ -572,10 +575,10 @@ mod tests {
     #[test]
     fn short_numbers_keep_two_digits() {
         for value in [1e-6, 0.00123, 0.5, 9.99, 86_400.0] {
-            let short = f64::from(Short::new(value).value().unwrap());
-            assert!((short / value - 1.0).abs() < 0.004, "{value} {short}");
+            let rounded = f64::from(Bfloat16::new(value).value().unwrap());
+            assert!((rounded / value - 1.0).abs() < 0.004, "{value} {rounded}");
         }
-        assert_eq!(Short::NONE.value(), None);
-        assert!(Short::new(f64::MAX).value().is_some());
+        assert_eq!(Bfloat16::NONE.value(), None);
+        assert!(Bfloat16::new(f64::MAX).value().is_some());
     }
 }

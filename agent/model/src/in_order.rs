@@ -11,11 +11,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
-use super::payloads::{EARLIER, Given, Sample};
+use super::payloads::{Dispatch, MAX_UNANNOUNCED, Sample};
 use super::size::Size;
 
-const SECOND: u64 = 1_000_000_000;
 /// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three seconds
 /// at the latest.
 const PATIENCE: u64 = 4 * SECOND;
@@ -51,7 +51,7 @@ pub struct Due {
     /// The sample.
     pub sample: Sample,
     /// What those are given who miss its bytes.
-    pub missed: Option<Given>,
+    pub missed: Option<Dispatch>,
 }
 
 /// The samples that wait for lower numbers.
@@ -97,7 +97,7 @@ impl InOrder {
         } = self;
         [
             Size::new("in_order.waiting", waiting.len(), WAITING),
-            Size::new("in_order.earlier", earlier.len(), EARLIER),
+            Size::new("in_order.earlier", earlier.len(), MAX_UNANNOUNCED),
         ]
     }
 

@@ -8,8 +8,8 @@ use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp};
 
 use crate::discovery::Memory;
 use crate::event::Taken;
-use crate::payloads::Given;
-use crate::selection::Wish;
+use crate::payloads::Dispatch;
+use crate::selection::SampleRequest;
 use crate::snapshot::SocketFacts;
 use crate::trace::Spans;
 use crate::watch::Watchlist;
@@ -79,7 +79,7 @@ pub enum Input<'a> {
     /// What to measure from now on.
     Watchlist(Arc<Watchlist>),
     /// Samples to give from now on. Their topics are measured meanwhile.
-    Wishes(Arc<Vec<Wish>>),
+    SampleRequests(Arc<Vec<SampleRequest>>),
     /// What was known before a restart, valid for at most one lease from `now` on.
     Restored {
         /// What was known.
@@ -99,7 +99,7 @@ pub struct Output {
     /// Events, and how many were left out.
     pub events: Taken,
     /// Samples that were asked for, and those that are missing.
-    pub samples: Vec<Given>,
+    pub samples: Vec<Dispatch>,
     /// Spans of traced samples that ended.
     pub spans: Spans,
 }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
 
 use super::cause::LossCause;
 use super::event::Events;
@@ -24,7 +24,7 @@ pub struct DiscoveryEvent {
     /// When.
     pub at: Timestamp,
     /// In which domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// `participant`, `writer`, `reader`, `node`.
     pub entity: &'static str,
     /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.

@@ -12,35 +12,36 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::{Body, Handover, Sample, Verdict, flag};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Reason, Record, Timestamp, WireError};
 
-use super::calendar::Calendar;
 use super::diagnosis::{self, Examiner};
-use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Worth, endpoints_of};
+use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Origin, Priority, endpoints_of};
+use super::discovery_fragments::DiscoveryFragments;
 use super::event::{EventKind, bounded, bounded_finding, bounded_shared};
 use super::expectation::Evidence;
 use super::header::begins_with_header;
 use super::input::{Input, Output};
 use super::interest::Interest;
 use super::journal::Journal;
-use super::passage::{lacks_names, may_share_memory};
 use super::payloads::{self, Offered, Payloads};
-use super::pieces::Pieces;
-use super::profiler::{Measured, Profiler, Sighting, UNDELIVERED};
+use super::profiler::{Measured, Profiler, RecordOutcome, UNDELIVERED};
 use super::rate::Slot;
-use super::receivers::{Around, Receivers};
-use super::selection::Wish;
+use super::receivers::{GraphView, Receivers};
+use super::route::Destination;
+use super::selection::SampleRequest;
 use super::size::Size;
 use super::snapshot::{Measurement, Snapshot, WatchState};
 use super::topic::{Naming, Topic, TopicId, Topics, Watched};
-use super::trace::{Subject, Tracer};
-use super::way::Place;
+use super::topic_kind::TopicKind;
+use super::trace::{Tracer, WriterDescription};
+use super::transport::{lacks_names, may_share_memory};
+use super::wall_clock::WallClock;
 use super::writer::{Counted, Traits};
 use crate::limits::Limits;
 use crate::watch::{Watch, Watchlist};
 
-const SECOND: u64 = 1_000_000_000;
 /// How often leases, windows and gaps are looked at.
 const TICK: u64 = SECOND / 10;
 /// A clock that jumps further than this is set, not followed tick by tick.
@@ -72,7 +73,7 @@ pub struct Settings {
     /// Nanoseconds for which a topic without endpoints is still reported.
     pub topic_grace: u64,
     /// Nanoseconds after which the bytes of samples come at the latest once they are wanted.
-    pub telling: u64,
+    pub payload_delay: u64,
     /// Records say who sent: not so those of a capture file.
     pub directed: bool,
 }
@@ -103,7 +104,7 @@ impl Default for Settings {
             sample_bytes: 1 << 20,
             payload_bytes: 20 << 20,
             topic_grace: 600 * SECOND,
-            telling: payloads::TELLING,
+            payload_delay: payloads::PAYLOAD_DELAY,
             directed: true,
         }
     }
@@ -127,13 +128,13 @@ impl Settings {
 }
 
 /// What deliveries are seen against. Borrows these fields alone, which a method could not.
-macro_rules! around {
+macro_rules! graph {
     ($observer:expr) => {
-        Around {
+        GraphView {
             receivers: &$observer.receivers,
             discovery: &$observer.discovery,
             topics: &$observer.topics,
-            calendar: $observer.calendar,
+            wall_clock: $observer.wall_clock,
         }
     };
 }
@@ -146,12 +147,12 @@ pub struct Observer {
     pub(super) discovery: Discovery,
     pub(super) topics: Topics,
     /// Topics about which the lists are still to be asked, the next one last.
-    unasked: Vec<TopicId>,
+    pending_topics: Vec<TopicId>,
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
-    pub(super) pieces: Pieces,
+    pub(super) discovery_fragments: DiscoveryFragments,
     pub(super) payloads: Payloads,
-    wishes: Arc<Vec<Wish>>,
+    sample_requests: Arc<Vec<SampleRequest>>,
     pub(super) receivers: Receivers,
     pub(super) tracer: Tracer,
     pub(super) examiner: Examiner,
@@ -161,7 +162,7 @@ pub struct Observer {
     journal: Journal,
     /// Time up to which everything is settled.
     clock: Timestamp,
-    calendar: Calendar,
+    wall_clock: WallClock,
 }
 
 impl Observer {
@@ -178,16 +179,16 @@ impl Observer {
             watchlist: Arc::default(),
             discovery: Discovery::new(caps),
             topics: Topics::default(),
-            unasked: Vec::new(),
+            pending_topics: Vec::new(),
             interest: Interest::new(settings.interest),
             profiler: Profiler::new(
                 settings.unknown_writers,
                 settings.sample_bytes,
                 settings.deliveries,
             ),
-            pieces: Pieces::default(),
-            payloads: Payloads::new(settings.payload_bytes, settings.telling),
-            wishes: Arc::default(),
+            discovery_fragments: DiscoveryFragments::default(),
+            payloads: Payloads::new(settings.payload_bytes, settings.payload_delay),
+            sample_requests: Arc::default(),
             receivers: Receivers::new(settings.deliveries, settings.participants),
             tracer: Tracer::new(settings.directed),
             examiner: Examiner::default(),
@@ -196,7 +197,7 @@ impl Observer {
             records: 0,
             journal: Journal::default(),
             clock: Timestamp(0),
-            calendar: Calendar::default(),
+            wall_clock: WallClock::default(),
         }
     }
 
@@ -204,7 +205,7 @@ impl Observer {
     pub fn input(&mut self, input: Input<'_>) {
         match input {
             Input::Time(now) => self.advance(now),
-            Input::ClockSet(step) => self.calendar.set(step),
+            Input::ClockSet(step) => self.wall_clock.set(step),
             Input::Datagram {
                 envelope,
                 payload,
@@ -229,19 +230,19 @@ impl Observer {
             Input::SharedMemory { envelope, payload } => {
                 self.walk(envelope, payload, None, flag::SHM, Self::count);
             }
-            Input::SharedMemoryGap(now) => self.profiler.uncertain(self.calendar.even(now)),
-            Input::ProbesDetached => self.profiler.seen_exactly_no_longer(),
+            Input::SharedMemoryGap(now) => self.profiler.uncertain(self.wall_clock.model_time(now)),
+            Input::ProbesDetached => self.profiler.end_exact_view(),
             Input::Record(record) => self.count(record),
             Input::ParticipantAlive(prefix, at) => {
-                let at = self.calendar.even(at);
-                self.discovery.seen(prefix, at, Worth::NOTHING);
+                let at = self.wall_clock.model_time(at);
+                self.discovery.seen(prefix, at, Priority::NOTHING);
             }
             Input::Socket(facts) => self.receivers.socket(facts),
             Input::SocketClosed(cookie) => self.receivers.socket_closed(cookie),
             Input::SocketForgotten(cookie) => self.receivers.socket_forgotten(cookie),
             Input::DecodeError { stage, reason } => self.decode_error(stage, reason),
             Input::Watchlist(watchlist) => self.set_watchlist(watchlist),
-            Input::Wishes(wishes) => self.set_wishes(wishes),
+            Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
             Input::Restored { memory, now } => self.restore(memory, now),
             Input::End => self.settle(),
         }
@@ -255,13 +256,13 @@ impl Observer {
             samples: self.payloads.take(),
             spans: self.tracer.take(),
         };
-        self.calendar.show_events(&mut output.events);
-        self.calendar.show_given(&mut output.samples);
-        self.calendar.show_spans(&mut output.spans);
+        self.wall_clock.convert_events(&mut output.events);
+        self.wall_clock.convert_dispatches(&mut output.samples);
+        self.wall_clock.convert_spans(&mut output.spans);
         output
     }
 
-    /// Watches these from now on, once [`Self::ask_more`] has come to all topics. What was counted of
+    /// Watches these from now on, once [`Self::apply_more_lists`] has come to all topics. What was counted of
     /// a topic that is no more watched stays, and so does how a topic stands with an entry that is in
     /// the new list as it was.
     fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
@@ -277,27 +278,29 @@ impl Observer {
         let watches = self.watchlist.watches();
         self.tracer
             .restart(watches.iter().any(|watch| watch.trace > 0.0));
-        self.consult_all();
+        self.apply_lists_to_all();
     }
 
-    /// Gives the samples that these wish for, and no others, once [`Self::ask_more`] has come to all
+    /// Gives the samples that these wish for, and no others, once [`Self::apply_more_lists`] has come to all
     /// topics. Their topics are measured
     /// meanwhile, whether they are watched or not; what was counted stays.
-    fn set_wishes(&mut self, wishes: Arc<Vec<Wish>>) {
-        self.wishes = wishes;
-        if self.wishes.is_empty() {
-            self.payloads.retain_strangers(|_| false);
+    fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
+        self.sample_requests = sample_requests;
+        if self.sample_requests.is_empty() {
+            self.payloads.retain_unknown_writers(|_| false);
         }
-        self.consult_all();
+        self.apply_lists_to_all();
     }
 
     /// The time up to which all samples were given, or told as missing, that have come by `now`.
     #[must_use]
-    pub fn given_until(&self, now: Timestamp) -> Timestamp {
+    pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
         let writers = self.payloads.wanted();
         let writers = writers.filter_map(|writer| self.profiler.get(*writer));
         let unseen = writers.filter_map(|measured| measured.writer.unseen_since());
-        unseen.fold(now, |until, since| until.min(self.calendar.shown(since)))
+        unseen.fold(now, |until, since| {
+            until.min(self.wall_clock.wall_time(since))
+        })
     }
 
     /// Whether somebody wants samples whole.
@@ -308,7 +311,7 @@ impl Observer {
 
     /// So much waits to be given that it should be taken before more comes.
     #[must_use]
-    pub const fn has_much_to_give(&self) -> bool {
+    pub const fn has_much_output(&self) -> bool {
         self.payloads.is_full() || self.journal.events.are_many()
     }
 
@@ -321,12 +324,12 @@ impl Observer {
             watchlist,
             discovery,
             topics,
-            unasked,
+            pending_topics,
             interest,
             profiler,
-            pieces,
+            discovery_fragments,
             payloads,
-            wishes,
+            sample_requests,
             receivers,
             tracer,
             examiner,
@@ -335,12 +338,12 @@ impl Observer {
             records: _,
             journal,
             clock: _,
-            calendar: _,
+            wall_clock: _,
         } = self;
         let mut sizes = discovery.sizes();
         sizes.push(Size::new(
-            "observer.unasked",
-            unasked.len(),
+            "observer.pending_topics",
+            pending_topics.len(),
             settings.endpoints,
         ));
         sizes.extend(topics.sizes(
@@ -350,8 +353,12 @@ impl Observer {
         ));
         sizes.extend(interest.sizes());
         sizes.extend(profiler.sizes(settings.endpoints));
-        sizes.extend(pieces.sizes());
-        sizes.extend(payloads.sizes(settings.endpoints, settings.unknown_writers, wishes.len()));
+        sizes.extend(discovery_fragments.sizes());
+        sizes.extend(payloads.sizes(
+            settings.endpoints,
+            settings.unknown_writers,
+            sample_requests.len(),
+        ));
         sizes.extend(receivers.sizes());
         sizes.extend(tracer.sizes());
         sizes.extend(examiner.sizes(settings.endpoints));
@@ -390,7 +397,7 @@ impl Observer {
 
     /// Says what time it is: ends leases, settles gaps, judges expectations.
     fn advance(&mut self, now: Timestamp) {
-        let now = self.calendar.even(now);
+        let now = self.wall_clock.model_time(now);
         if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
             self.clock = Timestamp(now.0 - now.0 % TICK);
             self.tick(self.clock);
@@ -403,19 +410,19 @@ impl Observer {
 
     /// Nothing more will come: decides what is still open, without letting time pass.
     fn settle(&mut self) {
-        let around = around!(self);
-        self.profiler.settle(self.clock, &mut self.journal, around);
-        self.tell_missing();
+        let graph = graph!(self);
+        self.profiler.settle(self.clock, &mut self.journal, graph);
+        self.report_missing();
         for writer in self.payloads.unsettled() {
             self.payloads.give_all(writer, self.clock);
         }
-        self.tell_losses();
+        self.report_losses();
         self.examine(self.clock);
     }
 
     /// Takes over what was known before the start, until one lease from `now` on at most.
     fn restore(&mut self, memory: &Memory, now: Timestamp) {
-        let now = self.calendar.even(now);
+        let now = self.wall_clock.model_time(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
         let prefixes: Vec<_> = self.discovery.participants().keys().copied().collect();
@@ -446,14 +453,17 @@ impl Observer {
     /// All facts at this moment.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
-        let mut snapshot = super::report::snapshot(self, self.calendar.even(now));
-        self.calendar.show_snapshot(&mut snapshot);
+        let mut snapshot = super::report::snapshot(self, self.wall_clock.model_time(now));
+        self.wall_clock.convert_snapshot(&mut snapshot);
         snapshot
     }
 
     /// All that was counted by `now` of each topic that is measured: domain, DDS name and counts.
-    pub fn measured(&self, now: Timestamp) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
-        super::report::measured(self, self.calendar.even(now))
+    pub fn measured(
+        &self,
+        now: Timestamp,
+    ) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
+        super::report::measured(self, self.wall_clock.model_time(now))
     }
 
     /// Counts a parse failure, also of those outside who parse for the core.
@@ -466,15 +476,15 @@ impl Observer {
 
     fn count(&mut self, record: &Record) {
         self.records += 1;
-        let moved = self.calendar.even_record(record);
+        let moved = self.wall_clock.model_record(record);
         let record = moved.as_ref().unwrap_or(record);
         let (writer, at) = (record.writer(), Timestamp(record.time));
         let sender = record.sender();
         if matches!(record.body(), Body::Handover | Body::Undelivered) {
-            self.discovery.seen(sender, at, Worth::NOTHING);
+            self.discovery.seen(sender, at, Priority::NOTHING);
             return;
         }
-        let evidence = Worth {
+        let evidence = Priority {
             watched: false,
             local: self.receivers.learn(record),
             sends: record.is_sample()
@@ -494,29 +504,29 @@ impl Observer {
         if self.tracer.is_wanted() {
             self.trace(record);
         }
-        let around = around!(self);
+        let graph = graph!(self);
         let journal = &mut self.journal;
-        match self.profiler.record(writer, record, journal, around) {
-            Sighting::Unmeasured => {}
-            Sighting::Measured => {
+        match self.profiler.record(writer, record, journal, graph) {
+            RecordOutcome::Unmeasured => {}
+            RecordOutcome::Measured => {
                 if self.payloads.is_unsettled(writer) {
                     self.came_again(writer, record);
                     self.turn(writer, at);
                 }
                 return;
             }
-            Sighting::Counted(counted) => {
-                self.tell_missing();
+            RecordOutcome::Counted(counted) => {
+                self.report_missing();
                 self.counted(writer, &counted);
                 return;
             }
         }
         let is_strange = writer.entity.is_writer()
             && !self.discovery.endpoints().contains_key(&writer)
-            && !self.discovery.was_buried(writer, at);
+            && !self.discovery.was_disposed(writer, at);
         if is_strange {
-            let sighting = self.profiler.stranger(writer, record, journal, around);
-            if let Sighting::Counted(counted) = sighting {
+            let outcome = self.profiler.unknown_writer(writer, record, journal, graph);
+            if let RecordOutcome::Counted(counted) = outcome {
                 self.counted(writer, &counted);
             }
         }
@@ -524,27 +534,28 @@ impl Observer {
 
     /// Gives a sample, when it is its turn, or remembers that it was of a stranger.
     fn counted(&mut self, writer: Guid, counted: &Counted) {
-        if self.wishes.is_empty() {
+        if self.sample_requests.is_empty() {
             return;
         }
         if !self.payloads.wants(writer) {
             let known = self.profiler.get(writer);
             if known.is_some_and(|known| known.topic.is_none()) {
-                let wishes = self.wishes.iter().map(|wish| wish.id);
+                let sample_requests = self.sample_requests.iter().map(|request| request.id);
                 let number = counted.number;
                 // Those that the profiler gave up since the last second make room.
-                if self.payloads.strangers() >= self.settings.unknown_writers {
+                if self.payloads.unknown_writers() >= self.settings.unknown_writers {
                     let profiler = &self.profiler;
-                    self.payloads.retain_strangers(|writer| {
+                    self.payloads.retain_unknown_writers(|writer| {
                         let known = profiler.get(writer);
                         known.is_some_and(|known| known.topic.is_none())
                     });
                 }
-                self.payloads.counted_of_stranger(writer, number, wishes);
+                self.payloads
+                    .counted_of_unknown_writer(writer, number, sample_requests);
             }
             return;
         }
-        let progress = self.profiler.progress(writer, counted.at, around!(self));
+        let progress = self.profiler.progress(writer, counted.at, graph!(self));
         if let Some(progress) = progress {
             let skip = self.payloads.counted(writer, counted, &progress);
             self.skip(writer, skip);
@@ -573,9 +584,9 @@ impl Observer {
             at,
             began: at,
             sampled: false,
-            doubted: false,
+            unconfirmed: false,
         };
-        let progress = self.profiler.progress(writer, at, around!(self));
+        let progress = self.profiler.progress(writer, at, graph!(self));
         if let Some(progress) =
             progress.filter(|_| sample.is_end() || self.payloads.wants_bytes(writer))
         {
@@ -586,7 +597,7 @@ impl Observer {
 
     /// Gives the samples of this writer whose turn it is.
     fn turn(&mut self, writer: Guid, now: Timestamp) {
-        let progress = self.profiler.progress(writer, now, around!(self));
+        let progress = self.profiler.progress(writer, now, graph!(self));
         if let Some(progress) = progress {
             let skip = self.payloads.turn(writer, &progress, now);
             self.skip(writer, skip);
@@ -614,7 +625,7 @@ impl Observer {
             let covering = topic.judgements.iter();
             let ratios =
                 covering.filter_map(|(index, _)| Some(watchlist.watches().get(*index)?.trace));
-            let subject = Subject {
+            let subject = WriterDescription {
                 domain_id: topic.domain_id,
                 topic: bounded_shared(&topic.naming.name),
                 message_type: bounded_shared(&endpoint.message_type),
@@ -654,7 +665,7 @@ impl Observer {
             let [first, second, ..] = prefix.0;
             let vendor = vendor.unwrap_or(VendorId([first, second]));
             let origin = Origin {
-                at: self.calendar.even(Timestamp(envelope.time)),
+                at: self.wall_clock.model_time(Timestamp(envelope.time)),
                 sender: prefix,
                 sequence_number: sample.sequence_number(),
                 destination: envelope.destination,
@@ -670,7 +681,7 @@ impl Observer {
     fn keep(&mut self, found: &Found<'_>) {
         let writer = found.record.writer();
         if self.payloads.wants_bytes(writer) {
-            let moved = self.calendar.even_record(&found.record);
+            let moved = self.wall_clock.model_record(&found.record);
             let record = moved.as_ref().unwrap_or(&found.record);
             let known = self.profiler.get(writer);
             let Some(sample) = record.sample() else {
@@ -684,7 +695,7 @@ impl Observer {
     }
 
     /// Tells the subscriptions which samples will not come.
-    fn tell_missing(&mut self) {
+    fn report_missing(&mut self) {
         for missing in self.journal.take_missing() {
             self.payloads.missing(&missing);
         }
@@ -699,12 +710,12 @@ impl Observer {
             | EntityId::SEDP_SUBSCRIPTIONS_WRITER
             | EntityId::SEDP_PUBLICATIONS_SECURE_WRITER
             | EntityId::SEDP_SUBSCRIPTIONS_SECURE_WRITER => "sedp",
-            entity if !entity.is_builtin() && self.may_tell_entities(found, sample) => "entities",
+            entity if !entity.is_builtin() && self.may_be_entities(found, sample) => "entities",
             _ => return,
         };
         let whole;
         let (payload, inline_qos) = if let Sample::DataFrag(fragments) = sample {
-            let Some(bytes) = self.pieces.put(fragments, found.payload) else {
+            let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
                 return;
             };
             whole = bytes;
@@ -731,7 +742,7 @@ impl Observer {
 
     /// Announced on `ros_discovery_info`, or not announced yet and of its form: the sample is sent
     /// once, perhaps before the announcement is understood.
-    fn may_tell_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
+    fn may_be_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
         let writer = found.record.writer();
         if sample.status_info() != StatusInfo::ALIVE {
             return false;
@@ -744,7 +755,7 @@ impl Observer {
         match sample {
             Sample::Data(_) => begins,
             Sample::DataFrag(fragments) => {
-                sample.is_start() && begins || self.pieces.holds(fragments)
+                sample.is_start() && begins || self.discovery_fragments.holds(fragments)
             }
         }
     }
@@ -822,11 +833,11 @@ impl Observer {
     }
 
     /// What is known in favour of a participant of which something is announced.
-    fn evidence(&self, prefix: GuidPrefix) -> Worth {
-        Worth {
+    fn evidence(&self, prefix: GuidPrefix) -> Priority {
+        Priority {
             watched: false,
             local: self.receivers.is_local(&prefix),
-            sends: self.profiler.has_stranger(endpoints_of(prefix)),
+            sends: self.profiler.has_unknown_writer(endpoints_of(prefix)),
         }
     }
 
@@ -834,9 +845,9 @@ impl Observer {
     fn announce(&mut self, prefix: GuidPrefix) {
         if let Some(participant) = self.discovery.participants().get(&prefix) {
             let addresses = &participant.addresses;
-            let places = addresses.default.iter().chain(&addresses.metatraffic);
+            let addresses = addresses.default.iter().chain(&addresses.metatraffic);
             self.receivers
-                .announce(prefix, places.copied().map(Place::from));
+                .announce(prefix, addresses.copied().map(Destination::from));
         }
     }
 
@@ -877,7 +888,7 @@ impl Observer {
         }
         if is_new {
             self.topics.shrink(self.settings.endpoints);
-            self.consult(id, now);
+            self.apply_lists(id, now);
         }
         self.apply(id, guid, now);
         let opened = self
@@ -885,7 +896,7 @@ impl Observer {
             .get(id)
             .filter(|topic| topic.watched == Watched::Yes);
         if let Some(topic) = opened.filter(|_| role == Role::Reader) {
-            for writer in topic.writers.iter().chain(&topic.beside) {
+            for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
                 self.profiler.open(*writer, now);
             }
         }
@@ -905,7 +916,7 @@ impl Observer {
     }
 
     /// Tells the losses of the last second.
-    fn tell_losses(&mut self) {
+    fn report_losses(&mut self) {
         let discovery = &self.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
@@ -919,7 +930,7 @@ impl Observer {
     }
 
     /// Asks about every topic.
-    fn consult_all(&mut self) {
+    fn apply_lists_to_all(&mut self) {
         let is_watched = |id: &TopicId| {
             let topic = self.topics.get(*id);
             topic.is_some_and(|topic| topic.watched == Watched::Yes)
@@ -927,38 +938,47 @@ impl Observer {
         let (watched, others): (Vec<_>, Vec<_>) =
             self.topics.ids().into_iter().partition(is_watched);
         // First give places back, then hand them out.
-        self.unasked = others.into_iter().rev().collect();
-        self.unasked.extend(watched.into_iter().rev());
-        self.ask_more();
+        self.pending_topics = others.into_iter().rev().collect();
+        self.pending_topics.extend(watched.into_iter().rev());
+        self.apply_more_lists();
     }
 
     /// Asks the watchlist and the wishes about further topics, as many as take some milliseconds.
     /// Until a topic's turn comes, what was decided by the lists before holds. Returns whether all
     /// topics had their turn.
-    pub fn ask_more(&mut self) -> bool {
-        if self.has_asked_all() {
+    pub fn apply_more_lists(&mut self) -> bool {
+        if self.has_applied_lists() {
             return true;
         }
-        let wished = |wish: &Wish| wish.selection.globs().count() + wish.selection.regexes();
-        let patterns = self.watchlist.globs() + self.wishes.iter().map(wished).sum::<usize>();
+        let requested = |request: &SampleRequest| {
+            request.selection.globs().count() + request.selection.regexes()
+        };
+        let patterns =
+            self.watchlist.globs() + self.sample_requests.iter().map(requested).sum::<usize>();
         for _ in 0..(MATCHES_AT_ONCE / patterns.max(1)).max(1) {
-            let Some(id) = self.unasked.pop() else { break };
-            self.consult(id, self.clock);
+            let Some(id) = self.pending_topics.pop() else {
+                break;
+            };
+            self.apply_lists(id, self.clock);
         }
-        self.has_asked_all()
+        self.has_applied_lists()
     }
 
     /// Whether the lists were asked about all topics since they last changed.
     #[must_use]
-    pub const fn has_asked_all(&self) -> bool {
-        self.unasked.is_empty()
+    pub const fn has_applied_lists(&self) -> bool {
+        self.pending_topics.is_empty()
     }
 
     /// Asks the watchlist and the wishes about a topic and lets its endpoints follow.
-    fn consult(&mut self, id: TopicId, now: Timestamp) {
-        let displaced =
-            self.topics
-                .consult(id, &self.watchlist, &self.wishes, self.settings.topics, now);
+    fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
+        let displaced = self.topics.apply_lists(
+            id,
+            &self.watchlist,
+            &self.sample_requests,
+            self.settings.topics,
+            now,
+        );
         if let Some(id) = displaced {
             self.apply_all(id, now);
             self.topics.forget_measurement(id);
@@ -971,7 +991,7 @@ impl Observer {
         let Some(topic) = self.topics.get(id) else {
             return;
         };
-        let lists = [&topic.writers, &topic.readers, &topic.beside];
+        let lists = [&topic.writers, &topic.readers, &topic.buffer_endpoints];
         let guids: Vec<_> = lists.into_iter().flatten().copied().collect();
         for guid in guids {
             self.apply(id, guid, now);
@@ -994,14 +1014,14 @@ impl Observer {
                 let counts = naming(endpoint).is_some_and(|naming| naming.counts);
                 let measured = is_watched && counts;
                 let verdict = match topic.naming.kind {
-                    "discovery" => Verdict::Capture,
+                    TopicKind::Discovery => Verdict::Capture,
                     _ if measured && wants_bytes(topic) => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => Verdict::Ignore,
                 };
                 self.interest.set(guid, verdict);
-                match &topic.wished {
-                    Some(wished) if measured => {
+                match &topic.requested {
+                    Some(requested) if measured => {
                         let topic = payloads::Topic {
                             domain_id: topic.domain_id,
                             name: Arc::clone(&topic.naming.name),
@@ -1014,7 +1034,7 @@ impl Observer {
                         };
                         let known = self.profiler.get(guid);
                         let next = known.map_or(0, |known| known.writer.next());
-                        self.payloads.want(guid, topic, wished, (next, now));
+                        self.payloads.want(guid, topic, requested, (next, now));
                     }
                     _ => self.payloads.release(guid, now),
                 }
@@ -1030,11 +1050,11 @@ impl Observer {
 
     /// Measures this writer no more; its topic keeps what it had counted.
     fn retire(&mut self, guid: Guid, now: Timestamp) {
-        let around = around!(self);
-        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, around) else {
+        let graph = graph!(self);
+        let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
             return;
         };
-        self.tell_missing();
+        self.report_missing();
         if let Some(topic) = self.topics.get_mut(retired.topic) {
             topic.retire(&retired.measurement, retired.totals.as_ref());
         }
@@ -1043,22 +1063,22 @@ impl Observer {
     fn tick(&mut self, now: Timestamp) {
         self.discovery.advance(now, &mut self.journal);
         self.follow_up(now);
-        let around = around!(self);
-        let strangers = self.profiler.advance(now, &mut self.journal, around);
-        for guid in strangers.metered {
+        let graph = graph!(self);
+        let unknown_writers = self.profiler.advance(now, &mut self.journal, graph);
+        for guid in unknown_writers.metered {
             self.interest.set(guid, Verdict::Meter);
         }
-        for guid in strangers.forgotten {
+        for guid in unknown_writers.forgotten {
             self.interest.remove(guid);
         }
-        self.tell_missing();
+        self.report_missing();
         for writer in self.payloads.unsettled() {
             self.turn(writer, now);
         }
         if now.0.is_multiple_of(SECOND) {
             self.payloads.expire(now);
             let profiler = &self.profiler;
-            self.payloads.retain_strangers(|writer| {
+            self.payloads.retain_unknown_writers(|writer| {
                 let known = profiler.get(writer);
                 known.is_some_and(|known| known.topic.is_none())
             });
@@ -1068,7 +1088,7 @@ impl Observer {
                 .locate(|prefix| self.receivers.is_local(prefix));
             self.promote();
             self.judge(now);
-            self.tell_losses();
+            self.report_losses();
             self.examine(now);
             self.tracer.advance(now);
         }
@@ -1108,7 +1128,7 @@ impl Observer {
             if !self.topics.has_place(self.settings.topics) {
                 return;
             }
-            self.consult(id, self.clock);
+            self.apply_lists(id, self.clock);
         }
     }
 
@@ -1124,7 +1144,7 @@ impl Observer {
             let writers: Vec<_> = topic
                 .writers
                 .iter()
-                .chain(&topic.beside)
+                .chain(&topic.buffer_endpoints)
                 .filter_map(|guid| self.profiler.get(*guid))
                 .collect();
             let last_message = writers
@@ -1189,8 +1209,8 @@ impl Observer {
 
 /// Whether somebody wants its samples whole.
 fn wants_bytes(topic: &Topic) -> bool {
-    let wished = topic.wished.as_ref();
-    wished.is_some_and(|wished| !wished.payloads.is_empty())
+    let requested = topic.requested.as_ref();
+    requested.is_some_and(|requested| !requested.payloads.is_empty())
 }
 
 pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {

@@ -11,28 +11,29 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::{Guid, Timestamp, record};
+use ros2probe_wire::time::MILLISECOND;
+use ros2probe_wire::{DomainId, Guid, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::in_order::{Due, InOrder, Progress};
 use super::journal::Missing;
 use super::size::{Size, largest};
-use super::topic::Wished;
+use super::topic::RequestIds;
 use super::writer::Counted;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
 /// Numbers of one unannounced writer that are remembered.
-pub(super) const EARLIER: usize = 1024;
+pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
-pub const TELLING: u64 = 400_000_000;
+pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
 
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Topic {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name, or the DDS name where it follows no ROS convention.
     pub name: Arc<str>,
     /// DDS name.
@@ -111,16 +112,16 @@ pub enum MissedReason {
 
 /// What is to be given, and to which subscriptions.
 #[derive(Clone, Debug)]
-pub struct Given {
+pub struct Dispatch {
     /// Ids of the wishes.
     pub to: Arc<[u64]>,
     /// What.
-    pub news: News,
+    pub outcome: SampleOutcome,
 }
 
 /// A sample, or that there is none.
 #[derive(Clone, Debug)]
-pub enum News {
+pub enum SampleOutcome {
     /// It was counted.
     Sample(Arc<Sample>),
     /// It will not come.
@@ -129,7 +130,7 @@ pub enum News {
 
 /// What somebody wants of one writer.
 #[derive(Debug)]
-struct Interested {
+struct WantedWriter {
     topic: Arc<Topic>,
     /// Ids of the wishes, and of those for bytes, and of the others.
     to: Arc<[u64]>,
@@ -146,7 +147,7 @@ struct Interested {
 
 /// Numbers of a writer that is not announced yet.
 #[derive(Debug, Default)]
-struct Earlier {
+struct UnannouncedSamples {
     numbers: BTreeSet<u64>,
     /// Ids of the wishes, and the first number that was counted while each was there.
     begins: Vec<(u64, u64)>,
@@ -157,15 +158,15 @@ struct Earlier {
 /// The wanted writers and what waits to be taken.
 #[derive(Debug)]
 pub struct Payloads {
-    writers: HashMap<Guid, Interested>,
-    telling: u64,
+    writers: HashMap<Guid, WantedWriter>,
+    payload_delay: u64,
     /// How many of them are wanted with bytes.
     deep: usize,
     assembly: Assembly,
     /// Of writers that nobody announced yet, what was counted while samples were wished for.
-    strangers: HashMap<Guid, Earlier>,
-    given: Vec<Given>,
-    given_bytes: usize,
+    unknown_writers: HashMap<Guid, UnannouncedSamples>,
+    dispatches: Vec<Dispatch>,
+    dispatch_bytes: usize,
     /// Bytes that wait for lower numbers.
     waiting_bytes: usize,
     refused: u64,
@@ -195,18 +196,18 @@ impl MissedReason {
 }
 
 impl Payloads {
-    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest `telling`
+    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest `payload_delay`
     /// nanoseconds after they are wanted.
     #[must_use]
-    pub fn new(limit: usize, telling: u64) -> Self {
+    pub fn new(limit: usize, payload_delay: u64) -> Self {
         Self {
             writers: HashMap::new(),
-            telling,
+            payload_delay,
             deep: 0,
             assembly: Assembly::new(limit),
-            strangers: HashMap::new(),
-            given: Vec::new(),
-            given_bytes: 0,
+            unknown_writers: HashMap::new(),
+            dispatches: Vec::new(),
+            dispatch_bytes: 0,
             waiting_bytes: 0,
             refused: 0,
         }
@@ -215,22 +216,27 @@ impl Payloads {
     /// Entries, or bytes, and cap of every table: so many writers may be wished for, so many be
     /// strangers, and there are so many wishes.
     #[must_use]
-    pub fn sizes(&self, endpoints: usize, strangers: usize, wishes: usize) -> Vec<Size> {
+    pub fn sizes(
+        &self,
+        endpoints: usize,
+        unknown_writers: usize,
+        sample_requests: usize,
+    ) -> Vec<Size> {
         // A new table does not compile before it has a place here.
         let Self {
             writers,
-            telling: _,
+            payload_delay: _,
             deep: _,
             assembly,
-            strangers: known,
-            given,
-            given_bytes,
+            unknown_writers: known,
+            dispatches,
+            dispatch_bytes,
             waiting_bytes,
             refused: _,
         } = self;
         let (bytes, limit, _) = assembly.size();
-        let interested = |interested: &Interested| {
-            let Interested {
+        let interested = |interested: &WantedWriter| {
+            let WantedWriter {
                 topic: _,
                 to: _,
                 payloads: _,
@@ -240,18 +246,26 @@ impl Payloads {
                 first_whole: _,
                 order,
             } = interested;
-            let begins = Size::new("payloads.writers.begins", begins.len(), wishes);
+            let begins = Size::new("payloads.writers.begins", begins.len(), sample_requests);
             order.sizes().into_iter().chain([begins])
         };
-        let earlier = |earlier: &Earlier| {
-            let Earlier {
+        let earlier = |earlier: &UnannouncedSamples| {
+            let UnannouncedSamples {
                 numbers,
                 begins,
                 before: _,
             } = earlier;
             [
-                Size::new("payloads.strangers.numbers", numbers.len(), EARLIER),
-                Size::new("payloads.strangers.begins", begins.len(), wishes),
+                Size::new(
+                    "payloads.unknown_writers.numbers",
+                    numbers.len(),
+                    MAX_UNANNOUNCED,
+                ),
+                Size::new(
+                    "payloads.unknown_writers.begins",
+                    begins.len(),
+                    sample_requests,
+                ),
             ]
         };
         let mut sizes = largest(writers.values().flat_map(interested));
@@ -259,9 +273,13 @@ impl Payloads {
         sizes.extend(assembly.sizes());
         sizes.extend([
             Size::new("payloads.writers", writers.len(), endpoints),
-            Size::new("payloads.strangers", known.len(), strangers),
-            Size::new("payloads.given", given.len(), 2 * WAITING),
-            Size::new("payloads.bytes", bytes + given_bytes + waiting_bytes, limit),
+            Size::new("payloads.unknown_writers", known.len(), unknown_writers),
+            Size::new("payloads.dispatches", dispatches.len(), 2 * WAITING),
+            Size::new(
+                "payloads.bytes",
+                bytes + dispatch_bytes + waiting_bytes,
+                limit,
+            ),
         ]);
         sizes
     }
@@ -270,7 +288,7 @@ impl Payloads {
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         let (bytes, limit, evictions) = self.assembly.size();
-        let bytes = bytes + self.given_bytes + self.waiting_bytes;
+        let bytes = bytes + self.dispatch_bytes + self.waiting_bytes;
         (bytes, limit, evictions + self.refused)
     }
 
@@ -283,7 +301,7 @@ impl Payloads {
     /// Whether the bytes of this writer's samples are wanted.
     #[must_use]
     pub fn wants_bytes(&self, writer: Guid) -> bool {
-        let is_deep = |interested: &Interested| !interested.payloads.is_empty();
+        let is_deep = |interested: &WantedWriter| !interested.payloads.is_empty();
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
 
@@ -297,34 +315,37 @@ impl Payloads {
         &mut self,
         writer: Guid,
         topic: Topic,
-        wished: &Wished,
+        requested: &RequestIds,
         (next, now): (u64, Timestamp),
     ) {
         let before = self.writers.remove(&writer);
         let known = before.as_ref().filter(|known| *known.topic == topic);
         let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
         let begins = |id: &u64| {
-            let earlier = self.strangers.get(&writer).map(|earlier| &earlier.begins);
+            let earlier = self
+                .unknown_writers
+                .get(&writer)
+                .map(|earlier| &earlier.begins);
             let known = before.iter().map(|before| &before.begins);
             let known = known.chain(earlier).flatten();
             let known = known.copied().find(|(known, _)| known == id);
             known.unwrap_or((*id, next))
         };
-        let begins = wished.ids.iter().map(begins).collect();
+        let begins = requested.ids.iter().map(begins).collect();
         let was_deep = before.as_ref().filter(|before| !before.payloads.is_empty());
         self.deep -= usize::from(was_deep.is_some());
-        self.deep += usize::from(!wished.payloads.is_empty());
+        self.deep += usize::from(!requested.payloads.is_empty());
         let since = was_deep.map_or(now, |before| before.since);
         let first_whole = was_deep.and_then(|before| before.first_whole);
-        if was_deep.is_some() && wished.payloads.is_empty() {
+        if was_deep.is_some() && requested.payloads.is_empty() {
             self.assembly.release(writer);
         }
-        let arrivals = wished.ids.iter();
-        let arrivals = arrivals.filter(|id| !wished.payloads.contains(id));
-        let interested = Interested {
+        let arrivals = requested.ids.iter();
+        let arrivals = arrivals.filter(|id| !requested.payloads.contains(id));
+        let interested = WantedWriter {
             topic,
-            to: Arc::clone(&wished.ids),
-            payloads: Arc::clone(&wished.payloads),
+            to: Arc::clone(&requested.ids),
+            payloads: Arc::clone(&requested.payloads),
             arrivals: arrivals.copied().collect(),
             begins,
             since,
@@ -337,7 +358,7 @@ impl Payloads {
 
     /// No longer, after what waits of it.
     pub fn release(&mut self, writer: Guid, now: Timestamp) {
-        self.strangers.remove(&writer);
+        self.unknown_writers.remove(&writer);
         self.give_all(writer, now);
         let before = self.writers.remove(&writer);
         if before.is_some_and(|before| !before.payloads.is_empty()) {
@@ -348,8 +369,8 @@ impl Payloads {
 
     /// Keeps what a DATA or DATA_FRAG brings of a sample that has not been counted yet.
     pub fn keep(&mut self, sample: record::Sample<'_>, payload: &[u8]) {
-        let beside = self.given_bytes + self.waiting_bytes;
-        self.assembly.put(sample, payload, beside);
+        let other_bytes = self.dispatch_bytes + self.waiting_bytes;
+        self.assembly.put(sample, payload, other_bytes);
     }
 
     /// Whether samples of this writer are given.
@@ -366,7 +387,7 @@ impl Payloads {
             false => self.assembly.take(writer, counted.number),
         };
         // What was under way when bytes were first wanted has not come whole.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.telling)
+        let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.payload_delay)
             || interested
                 .first_whole
                 .is_some_and(|first| first < counted.number);
@@ -401,7 +422,7 @@ impl Payloads {
             before.push(due);
         });
         self.waiting_bytes += due.cost();
-        if counted.doubted || order.is_idle() && counted.number < progress.complete {
+        if counted.unconfirmed || order.is_idle() && counted.number < progress.complete {
             let due = order.pass(due, counted.at);
             before.push(due);
             before.into_iter().for_each(|due| self.give_due(due));
@@ -435,14 +456,14 @@ impl Payloads {
     }
 
     /// A sample of a writer that nobody announced yet was counted, while there were these wishes.
-    pub fn counted_of_stranger(
+    pub fn counted_of_unknown_writer(
         &mut self,
         writer: Guid,
         number: u64,
-        wishes: impl Iterator<Item = u64>,
+        sample_requests: impl Iterator<Item = u64>,
     ) {
-        let earlier = self.strangers.entry(writer).or_default();
-        let ids: Vec<_> = wishes.collect();
+        let earlier = self.unknown_writers.entry(writer).or_default();
+        let ids: Vec<_> = sample_requests.collect();
         earlier.begins.retain(|(known, _)| ids.contains(known));
         for id in ids {
             if !earlier.begins.iter().any(|(known, _)| *known == id) {
@@ -450,7 +471,7 @@ impl Payloads {
             }
         }
         earlier.numbers.insert(number);
-        if earlier.numbers.len() > EARLIER
+        if earlier.numbers.len() > MAX_UNANNOUNCED
             && let Some(lowest) = earlier.numbers.pop_first()
         {
             let (first, _, count) = earlier.before.unwrap_or((lowest, lowest, 0));
@@ -460,19 +481,19 @@ impl Payloads {
 
     /// Strangers remembered.
     #[must_use]
-    pub fn strangers(&self) -> usize {
-        self.strangers.len()
+    pub fn unknown_writers(&self) -> usize {
+        self.unknown_writers.len()
     }
 
     /// Forgets unannounced writers that are no more.
-    pub fn retain_strangers(&mut self, is_there: impl Fn(Guid) -> bool) {
-        self.strangers.retain(|writer, _| is_there(*writer));
+    pub fn retain_unknown_writers(&mut self, is_there: impl Fn(Guid) -> bool) {
+        self.unknown_writers.retain(|writer, _| is_there(*writer));
     }
 
     /// Writers of which something waits, or may come again, in the order of their GUIDs.
     #[must_use]
     pub fn unsettled(&self) -> Vec<Guid> {
-        let is_unsettled = |interested: &Interested| !interested.order.is_idle();
+        let is_unsettled = |interested: &WantedWriter| !interested.order.is_idle();
         let writers = self.writers.iter();
         let mut writers: Vec<_> = writers
             .filter(|(_, interested)| is_unsettled(interested))
@@ -543,21 +564,21 @@ impl Payloads {
     }
 
     /// Takes what is to be given.
-    pub fn take(&mut self) -> Vec<Given> {
-        self.given_bytes = 0;
-        std::mem::take(&mut self.given)
+    pub fn take(&mut self) -> Vec<Dispatch> {
+        self.dispatch_bytes = 0;
+        std::mem::take(&mut self.dispatches)
     }
 
     /// So much waits that whoever feeds the model should let it be taken first.
     #[must_use]
     pub const fn is_full(&self) -> bool {
         let (_, limit, _) = self.assembly.size();
-        self.given.len() >= WAITING / 2 || self.given_bytes > limit / 4
+        self.dispatches.len() >= WAITING / 2 || self.dispatch_bytes > limit / 4
     }
 
     /// What was counted of this writer while it was a stranger is to be given if it comes again.
     fn announced(&mut self, writer: Guid, now: Timestamp) {
-        let Some(earlier) = self.strangers.remove(&writer) else {
+        let Some(earlier) = self.unknown_writers.remove(&writer) else {
             return;
         };
         let Some(interested) = self.writers.get_mut(&writer) else {
@@ -567,8 +588,8 @@ impl Payloads {
         if let Some((first, last, samples)) = earlier.before {
             let reason = MissedReason::Unannounced;
             let mut missed = interested.missed(writer, (first, last), reason);
-            for given in &mut missed {
-                if let News::Missed(missed) = &mut given.news {
+            for dispatches in &mut missed {
+                if let SampleOutcome::Missed(missed) = &mut dispatches.outcome {
                     missed.samples = missed.samples.min(samples);
                 }
             }
@@ -593,9 +614,9 @@ impl Payloads {
         let bytes = due.bytes();
         self.waiting_bytes -= due.cost();
         if !due.to.is_empty() {
-            let sample = Given {
+            let sample = Dispatch {
                 to: due.to,
-                news: News::Sample(Arc::new(due.sample)),
+                outcome: SampleOutcome::Sample(Arc::new(due.sample)),
             };
             self.give(sample, bytes);
         }
@@ -604,41 +625,46 @@ impl Payloads {
         }
     }
 
-    fn give(&mut self, given: Given, bytes: usize) {
+    fn give(&mut self, dispatches: Dispatch, bytes: usize) {
         let (used, limit, _) = self.size();
-        if self.given.len() < WAITING && (bytes == 0 || used + bytes <= limit) {
-            self.given_bytes += bytes;
-            self.given.push(given);
+        if self.dispatches.len() < WAITING && (bytes == 0 || used + bytes <= limit) {
+            self.dispatch_bytes += bytes;
+            self.dispatches.push(dispatches);
             return;
         }
         self.refused += 1;
-        if let News::Sample(sample) = &given.news
+        if let SampleOutcome::Sample(sample) = &dispatches.outcome
             && let Some(interested) = self.writers.get(&sample.writer)
-            && self.given.len() < 2 * WAITING
+            && self.dispatches.len() < 2 * WAITING
         {
             let (writer, number) = (sample.writer, sample.sequence_number);
             let mut missed = interested.not_captured(writer, number);
-            missed.to = given.to;
-            self.given.push(missed);
+            missed.to = dispatches.to;
+            self.dispatches.push(missed);
         }
     }
 }
 
-impl Interested {
+impl WantedWriter {
     /// That these samples will not come, to each subscription those that are for it.
-    fn missed(&self, writer: Guid, (first, last): (u64, u64), reason: MissedReason) -> Vec<Given> {
-        let mut told: Vec<(u64, Vec<u64>)> = Vec::new();
+    fn missed(
+        &self,
+        writer: Guid,
+        (first, last): (u64, u64),
+        reason: MissedReason,
+    ) -> Vec<Dispatch> {
+        let mut missed: Vec<(u64, Vec<u64>)> = Vec::new();
         for (id, begin) in &self.begins {
             let first = first.max(*begin);
-            match told.iter_mut().find(|(known, _)| *known == first) {
+            match missed.iter_mut().find(|(known, _)| *known == first) {
                 Some((_, to)) => to.push(*id),
-                None if first <= last => told.push((first, vec![*id])),
+                None if first <= last => missed.push((first, vec![*id])),
                 None => {}
             }
         }
-        let given = |(first, to): (u64, Vec<u64>)| Given {
+        let dispatches = |(first, to): (u64, Vec<u64>)| Dispatch {
             to: to.into(),
-            news: News::Missed(Missed {
+            outcome: SampleOutcome::Missed(Missed {
                 topic: Arc::clone(&self.topic),
                 writer,
                 first,
@@ -647,14 +673,14 @@ impl Interested {
                 reason,
             }),
         };
-        told.into_iter().map(given).collect()
+        missed.into_iter().map(dispatches).collect()
     }
 
     /// That a counted sample is missed by the subscriptions that want its bytes.
-    fn not_captured(&self, writer: Guid, number: u64) -> Given {
-        Given {
+    fn not_captured(&self, writer: Guid, number: u64) -> Dispatch {
+        Dispatch {
             to: Arc::clone(&self.payloads),
-            news: News::Missed(Missed {
+            outcome: SampleOutcome::Missed(Missed {
                 topic: Arc::clone(&self.topic),
                 writer,
                 first: number,

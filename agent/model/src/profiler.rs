@@ -9,33 +9,33 @@ use std::ops::RangeInclusive;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
-use super::calendar::Calendar;
 use super::delivery::Totals;
 use super::in_order::Progress;
 use super::journal::Journal;
-use super::receivers::Around;
+use super::receivers::GraphView;
 use super::samples::Budget;
 use super::size::{Size, largest};
 use super::snapshot::Measurement;
-use super::subscribers::{Room, Sight, Stage, Subscribers};
+use super::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContext};
 use super::topic::TopicId;
-use super::writer::{Counted, Scene, Traits, Writer};
+use super::wall_clock::WallClock;
+use super::writer::{Counted, MeasurementContext, Traits, Writer};
 
-const SECOND: u64 = 1_000_000_000;
 /// A stranger is shown and metered after this long: announcements come within a second or so.
-const STRANGE: u64 = 3 * SECOND;
+const UNKNOWN_AFTER: u64 = 3 * SECOND;
 /// A stranger that is silent this long is forgotten; one that sent little makes room sooner.
 const FORGET: u64 = 30 * SECOND;
-const DOUBTFUL: u64 = 3 * SECOND;
+const EVICTABLE_AFTER: u64 = 3 * SECOND;
 /// Messages after which a stranger is somebody.
-const SOMEBODY: u64 = 10;
+const ESTABLISHED_MESSAGES: u64 = 10;
 /// How long the kernel may take to be told of a writer: a round of the capture thread on a busy
 /// machine. Until then it hands over as much as of a stranger, which a point cloud exceeds.
-const TELLING: u64 = SECOND / 5;
+const KERNEL_UPDATE_TIME: u64 = SECOND / 5;
 /// Strangers may use this part of the memory for fragmented samples.
-const STRANGERS_SHARE: usize = 4;
+const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that make room for new ones: silent for so long, so many at once.
 const SILENT: u64 = 10 * SECOND;
 const GIVEN_UP: usize = 64;
@@ -70,25 +70,25 @@ pub struct Measured {
 #[derive(Debug)]
 pub struct Profiler {
     writers: HashMap<Guid, Measured>,
-    strangers: BTreeSet<Guid>,
-    stranger_limit: usize,
-    stranger_evictions: u64,
-    shared: Shared,
+    unknown_writers: BTreeSet<Guid>,
+    unknown_writer_limit: usize,
+    unknown_writer_evictions: u64,
+    shared: SharedBudgets,
     search_after: Timestamp,
 }
 
 /// What all writers draw on.
 #[derive(Debug)]
-struct Shared {
+struct SharedBudgets {
     budget: Budget,
-    strangers_budget: Budget,
+    unknown_writers_budget: Budget,
     deliveries_budget: Budget,
-    room: Room,
+    quota: DeliveryQuota,
 }
 
 /// Whose samples something is about.
 #[derive(Clone, Copy)]
-struct Subject {
+struct WriterRef {
     writer: Guid,
     reliable: bool,
     topic: Option<TopicId>,
@@ -107,7 +107,7 @@ pub struct Retired {
 
 /// What a record was to the profiler.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sighting {
+pub enum RecordOutcome {
     /// Of a writer that is not measured.
     Unmeasured,
     /// Of one that is.
@@ -118,7 +118,7 @@ pub enum Sighting {
 
 /// What became of the strangers.
 #[derive(Debug, Default)]
-pub struct Strangers {
+pub struct UnknownWriters {
     /// To be metered from now on.
     pub metered: Vec<Guid>,
     /// Forgotten.
@@ -148,17 +148,17 @@ impl Measured {
 impl Profiler {
     /// Nobody measured.
     #[must_use]
-    pub fn new(stranger_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
+    pub fn new(unknown_writer_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
             writers: HashMap::new(),
-            strangers: BTreeSet::new(),
-            stranger_limit,
-            stranger_evictions: 0,
-            shared: Shared {
+            unknown_writers: BTreeSet::new(),
+            unknown_writer_limit,
+            unknown_writer_evictions: 0,
+            shared: SharedBudgets {
                 budget: Budget::new(sample_bytes),
-                strangers_budget: Budget::new(sample_bytes / STRANGERS_SHARE),
+                unknown_writers_budget: Budget::new(sample_bytes / UNKNOWN_WRITERS_SHARE),
                 deliveries_budget: Budget::new(sample_bytes),
-                room: Room {
+                quota: DeliveryQuota {
                     used: 0,
                     limit: deliveries,
                     evictions: 0,
@@ -175,34 +175,38 @@ impl Profiler {
         // A new table does not compile before it has a place here.
         let Self {
             writers,
-            strangers,
-            stranger_limit,
-            stranger_evictions: _,
+            unknown_writers,
+            unknown_writer_limit,
+            unknown_writer_evictions: _,
             shared,
             search_after: _,
         } = self;
-        let Shared {
+        let SharedBudgets {
             budget,
-            strangers_budget,
+            unknown_writers_budget,
             deliveries_budget,
-            room,
+            quota,
         } = shared;
-        let own = writers.len() - strangers.len();
+        let own = writers.len() - unknown_writers.len();
         let mut sizes = vec![
             Size::new("profiler.writers", own, endpoints),
-            Size::new("profiler.strangers", strangers.len(), *stranger_limit),
+            Size::new(
+                "profiler.unknown_writers",
+                unknown_writers.len(),
+                *unknown_writer_limit,
+            ),
             Size::new("profiler.samples.bytes", budget.bytes, budget.limit),
             Size::new(
-                "profiler.strangers.samples.bytes",
-                strangers_budget.bytes,
-                strangers_budget.limit,
+                "profiler.unknown_writers.samples.bytes",
+                unknown_writers_budget.bytes,
+                unknown_writers_budget.limit,
             ),
             Size::new(
                 "profiler.deliveries.samples.bytes",
                 deliveries_budget.bytes,
                 deliveries_budget.limit,
             ),
-            Size::new("profiler.deliveries", room.used, room.limit),
+            Size::new("profiler.deliveries", quota.used, quota.limit),
         ];
         sizes.extend(largest(writers.values().flat_map(Measured::sizes)));
         sizes
@@ -220,10 +224,15 @@ impl Profiler {
     }
 
     /// How far the samples of this writer are decided.
-    pub fn progress(&mut self, guid: Guid, now: Timestamp, around: Around<'_>) -> Option<Progress> {
+    pub fn progress(
+        &mut self,
+        guid: Guid,
+        now: Timestamp,
+        graph: GraphView<'_>,
+    ) -> Option<Progress> {
         let measured = self.writers.get_mut(&guid)?;
         let acknowledged = measured.is_acknowledged()
-            || !measured.unacknowledged && measured.has_reliable_reader(around);
+            || !measured.unacknowledged && measured.has_reliable_reader(graph);
         Some(measured.writer.progress(acknowledged, now))
     }
 
@@ -238,12 +247,12 @@ impl Profiler {
     /// Writers of topics, strangers, the strangers' cap, and strangers refused or forgotten for it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
-        let known = self.writers.len() - self.strangers.len();
+        let known = self.writers.len() - self.unknown_writers.len();
         (
             known,
-            self.strangers.len(),
-            self.stranger_limit,
-            self.stranger_evictions,
+            self.unknown_writers.len(),
+            self.unknown_writer_limit,
+            self.unknown_writer_evictions,
         )
     }
 
@@ -252,15 +261,15 @@ impl Profiler {
     pub const fn budgets(&self) -> [&Budget; 3] {
         [
             &self.shared.budget,
-            &self.shared.strangers_budget,
+            &self.shared.unknown_writers_budget,
             &self.shared.deliveries_budget,
         ]
     }
 
     /// Room for deliveries.
     #[must_use]
-    pub const fn room(&self) -> &Room {
-        &self.shared.room
+    pub const fn quota(&self) -> &DeliveryQuota {
+        &self.shared.quota
     }
 
     /// Takes in a record, if it is of a measured writer.
@@ -269,10 +278,10 @@ impl Profiler {
         guid: Guid,
         record: &Record,
         journal: &mut Journal,
-        around: Around<'_>,
-    ) -> Sighting {
+        graph: GraphView<'_>,
+    ) -> RecordOutcome {
         let Some(measured) = self.writers.get_mut(&guid) else {
-            return Sighting::Unmeasured;
+            return RecordOutcome::Unmeasured;
         };
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
@@ -287,33 +296,35 @@ impl Profiler {
         if let Body::AckNack(acknack) = record.body()
             && measured.writer.refuses(acknack)
         {
-            return Sighting::Measured;
+            return RecordOutcome::Measured;
         }
-        let subject = measured.subject(guid);
-        let mut sight = Sight::New;
+        let writer_ref = measured.writer_ref(guid);
+        let mut novelty = RecordNovelty::New;
         // What is announced in shared memory is read by whom it concerns or not: nobody sees that.
         if measured.topic.is_some() && record.flags & flag::SHM == 0 {
-            let mut stage = self.shared.stage(subject, now, journal, around);
+            let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
                 .subscribers
                 .get_or_insert_with(|| Box::new(Subscribers::new(measured.sure_from)));
-            sight = subscribers.record(record, &mut stage);
+            novelty = subscribers.record(record, &mut context);
             if record.is_acknack()
                 && let Some(below) = subscribers.acknowledged_below()
             {
                 measured.writer.acknowledged(below);
             }
         }
-        if record.flags & UNDELIVERED != 0 || sight == Sight::Covered {
-            return Sighting::Measured;
+        if record.flags & UNDELIVERED != 0 || novelty == RecordNovelty::SeenAtSocket {
+            return RecordOutcome::Measured;
         }
         let next = measured.writer.next();
         let counted = measured.writer.record(
             record,
             measured.opened,
-            &mut self.shared.scene(subject, now, journal, around.calendar),
+            &mut self
+                .shared
+                .measurement_context(writer_ref, now, journal, graph.wall_clock),
         );
-        if sight == Sight::Again && record.flags & flag::HOST != 0 {
+        if novelty == RecordNovelty::Duplicate && record.flags & flag::HOST != 0 {
             measured.writer.came_again();
         }
         if let Some(subscribers) = &mut measured.subscribers
@@ -321,7 +332,7 @@ impl Profiler {
         {
             subscribers.wrote(measured.writer.next() - 1, now);
         }
-        counted.map_or(Sighting::Measured, Sighting::Counted)
+        counted.map_or(RecordOutcome::Measured, RecordOutcome::Counted)
     }
 
     /// The tap on shared memory cannot tell what passed before `now`.
@@ -332,40 +343,42 @@ impl Profiler {
     }
 
     /// Writers are no longer seen in the processes that they belong to.
-    pub fn seen_exactly_no_longer(&mut self) {
+    pub fn end_exact_view(&mut self) {
         for measured in self.writers.values_mut() {
-            measured.writer.seen_exactly_no_longer();
+            measured.writer.end_exact_view();
         }
     }
 
     /// Whether one of these writers sends without being announced.
     #[must_use]
-    pub fn has_stranger(&self, writers: RangeInclusive<Guid>) -> bool {
-        self.strangers.range(writers).next().is_some()
+    pub fn has_unknown_writer(&self, writers: RangeInclusive<Guid>) -> bool {
+        self.unknown_writers.range(writers).next().is_some()
     }
 
     /// Takes in a record of a writer nobody announced.
-    pub fn stranger(
+    pub fn unknown_writer(
         &mut self,
         guid: Guid,
         record: &Record,
         journal: &mut Journal,
-        around: Around<'_>,
-    ) -> Sighting {
+        graph: GraphView<'_>,
+    ) -> RecordOutcome {
         if !record.is_sample() || record.flags & UNDELIVERED != 0 {
-            return Sighting::Unmeasured;
+            return RecordOutcome::Unmeasured;
         }
         let now = Timestamp(record.time);
-        if self.strangers.len() >= self.stranger_limit && !self.make_room(now, around) {
-            self.stranger_evictions += 1;
-            return Sighting::Unmeasured;
+        if self.unknown_writers.len() >= self.unknown_writer_limit
+            && !self.evict_unknown_writer(now, graph)
+        {
+            self.unknown_writer_evictions += 1;
+            return RecordOutcome::Unmeasured;
         }
-        self.strangers.insert(guid);
+        self.unknown_writers.insert(guid);
         self.writers.insert(
             guid,
             Measured::new(Writer::new(guid, Traits::default()), None, now),
         );
-        self.record(guid, record, journal, around)
+        self.record(guid, record, journal, graph)
     }
 
     /// Measures this writer of a topic from now on; what it was measured as a stranger comes along.
@@ -383,18 +396,19 @@ impl Profiler {
             if known.topic.is_none() {
                 known.opened = opened.max(now);
                 // Its unfinished samples are paid for by the other budget from now on.
-                known
-                    .writer
-                    .transfer(&mut self.shared.strangers_budget, &mut self.shared.budget);
-                self.strangers.remove(&guid);
-                known.doubt(now);
+                known.writer.transfer(
+                    &mut self.shared.unknown_writers_budget,
+                    &mut self.shared.budget,
+                );
+                self.unknown_writers.remove(&guid);
+                known.allow_incomplete(now);
             }
             known.topic = Some(topic);
             return;
         }
         let mut measured = Measured::new(Writer::new(guid, traits), Some(topic), now);
         measured.opened = opened;
-        measured.doubt(now);
+        measured.allow_incomplete(now);
         self.writers.insert(guid, measured);
     }
 
@@ -418,20 +432,23 @@ impl Profiler {
         guid: Guid,
         now: Timestamp,
         journal: &mut Journal,
-        around: Around<'_>,
+        graph: GraphView<'_>,
     ) -> Option<Retired> {
         let mut measured = self.writers.remove(&guid)?;
-        let subject = measured.subject(guid);
-        measured
-            .writer
-            .settle(&mut self.shared.scene(subject, now, journal, around.calendar));
-        self.strangers.remove(&guid);
+        let writer_ref = measured.writer_ref(guid);
+        measured.writer.settle(&mut self.shared.measurement_context(
+            writer_ref,
+            now,
+            journal,
+            graph.wall_clock,
+        ));
+        self.unknown_writers.remove(&guid);
         let subscribers = measured.subscribers.take();
         let totals = subscribers.map(|subscribers| {
-            subscribers.stop(&mut self.shared.stage(subject, now, journal, around))
+            subscribers.stop(&mut self.shared.writer_context(writer_ref, now, journal, graph))
         });
         Some(Retired {
-            topic: subject.topic?,
+            topic: writer_ref.topic?,
             measurement: measured.writer.measurement(now),
             totals,
         })
@@ -442,52 +459,64 @@ impl Profiler {
         &mut self,
         now: Timestamp,
         journal: &mut Journal,
-        around: Around<'_>,
-    ) -> Strangers {
-        let mut strangers = Strangers::default();
+        graph: GraphView<'_>,
+    ) -> UnknownWriters {
+        let mut unknown_writers = UnknownWriters::default();
         for (guid, measured) in &mut self.writers {
-            let subject = measured.subject(*guid);
+            let writer_ref = measured.writer_ref(*guid);
             measured
                 .writer
-                .advance(&mut self.shared.scene(subject, now, journal, around.calendar));
+                .advance(&mut self.shared.measurement_context(
+                    writer_ref,
+                    now,
+                    journal,
+                    graph.wall_clock,
+                ));
             if measured.topic.is_some() {
                 if let Some(subscribers) = &mut measured.subscribers {
-                    subscribers.advance(&mut self.shared.stage(subject, now, journal, around));
+                    subscribers
+                        .advance(&mut self.shared.writer_context(writer_ref, now, journal, graph));
                 }
                 continue;
             }
             if measured.last_seen.0.saturating_add(FORGET) <= now.0 {
-                strangers.forgotten.push(*guid);
-            } else if !measured.metered && measured.first_seen.0.saturating_add(STRANGE) <= now.0 {
+                unknown_writers.forgotten.push(*guid);
+            } else if !measured.metered
+                && measured.first_seen.0.saturating_add(UNKNOWN_AFTER) <= now.0
+            {
                 (measured.metered, measured.opened) = (true, now);
-                strangers.metered.push(*guid);
+                unknown_writers.metered.push(*guid);
             }
         }
-        strangers.metered.sort_unstable();
-        strangers.forgotten.sort_unstable();
-        for guid in &strangers.forgotten {
-            self.stop(*guid, now, journal, around);
+        unknown_writers.metered.sort_unstable();
+        unknown_writers.forgotten.sort_unstable();
+        for guid in &unknown_writers.forgotten {
+            self.stop(*guid, now, journal, graph);
         }
-        if std::mem::take(&mut self.shared.room.wanted) {
-            self.give_up_silent(now, journal, around);
+        if std::mem::take(&mut self.shared.quota.wanted) {
+            self.give_up_silent(now, journal, graph);
         }
-        strangers
+        unknown_writers
     }
 
     /// Settles everything: nothing more will come.
-    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, around: Around<'_>) {
+    pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
         for guid in guids {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
-            let subject = measured.subject(guid);
-            measured
-                .writer
-                .settle(&mut self.shared.scene(subject, now, journal, around.calendar));
+            let writer_ref = measured.writer_ref(guid);
+            measured.writer.settle(&mut self.shared.measurement_context(
+                writer_ref,
+                now,
+                journal,
+                graph.wall_clock,
+            ));
             if let Some(subscribers) = &mut measured.subscribers {
-                subscribers.settle(&mut self.shared.stage(subject, now, journal, around));
+                subscribers
+                    .settle(&mut self.shared.writer_context(writer_ref, now, journal, graph));
             }
             // Who sent twice and was not announced until the end is a stranger.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
@@ -495,7 +524,7 @@ impl Profiler {
     }
 
     /// Gives up the deliveries that have been silent longest: somebody found no room.
-    fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, around: Around<'_>) {
+    fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
         let mut silent: Vec<_> = self
             .writers
             .iter()
@@ -508,78 +537,78 @@ impl Profiler {
             let Some(measured) = self.writers.get_mut(&guid) else {
                 continue;
             };
-            let subject = measured.subject(guid);
+            let writer_ref = measured.writer_ref(guid);
             if let Some(subscribers) = &mut measured.subscribers {
-                let mut stage = self.shared.stage(subject, now, journal, around);
-                subscribers.give_up(at, 1, &mut stage);
+                let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
+                subscribers.give_up(at, 1, &mut context);
             }
         }
     }
 
     /// Forgets the stranger that has been silent longest, if it never was anybody.
-    fn make_room(&mut self, now: Timestamp, around: Around<'_>) -> bool {
+    fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
         if now < self.search_after {
             return false;
         }
-        let doubtful = self.writers.iter().filter(|(_, measured)| {
+        let evictable = self.writers.iter().filter(|(_, measured)| {
             measured.topic.is_none()
-                && measured.writer.messages() < SOMEBODY
-                && measured.last_seen.0.saturating_add(DOUBTFUL) <= now.0
+                && measured.writer.messages() < ESTABLISHED_MESSAGES
+                && measured.last_seen.0.saturating_add(EVICTABLE_AFTER) <= now.0
         });
-        let oldest = doubtful.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
+        let oldest = evictable.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
         let Some(guid) = oldest.map(|(guid, _)| *guid) else {
             self.search_after = Timestamp(now.0.saturating_add(SECOND / 10));
             return false;
         };
-        self.stranger_evictions += 1;
-        self.stop(guid, now, &mut Journal::default(), around);
+        self.unknown_writer_evictions += 1;
+        self.stop(guid, now, &mut Journal::default(), graph);
         true
     }
 }
 
-impl Shared {
-    fn scene<'a>(
+impl SharedBudgets {
+    fn measurement_context<'a>(
         &'a mut self,
-        subject: Subject,
+        writer_ref: WriterRef,
         now: Timestamp,
         journal: &'a mut Journal,
-        calendar: Calendar,
-    ) -> Scene<'a> {
-        let budget = match subject.topic {
+        wall_clock: WallClock,
+    ) -> MeasurementContext<'a> {
+        let budget = match writer_ref.topic {
             Some(_) => &mut self.budget,
-            None => &mut self.strangers_budget,
+            None => &mut self.unknown_writers_budget,
         };
-        Scene {
+        MeasurementContext {
             now,
             budget,
             journal,
-            calendar,
+            wall_clock,
         }
     }
 
-    fn stage<'a>(
+    fn writer_context<'a>(
         &'a mut self,
-        subject: Subject,
+        writer_ref: WriterRef,
         now: Timestamp,
         journal: &'a mut Journal,
-        around: Around<'a>,
-    ) -> Stage<'a> {
-        Stage {
+        graph: GraphView<'a>,
+    ) -> WriterContext<'a> {
+        WriterContext {
             now,
-            writer: subject.writer,
-            reliable: subject.reliable,
-            topic: subject.topic,
+            writer: writer_ref.writer,
+            reliable: writer_ref.reliable,
+            topic: writer_ref.topic,
             budget: &mut self.deliveries_budget,
             journal,
-            room: &mut self.room,
-            around,
+            quota: &mut self.quota,
+            graph,
         }
     }
 }
 
 impl Measured {
-    fn subject(&self, writer: Guid) -> Subject {
-        Subject {
+    fn writer_ref(&self, writer: Guid) -> WriterRef {
+        WriterRef {
             writer,
             reliable: self.writer.traits().reliable,
             topic: self.topic,
@@ -592,10 +621,10 @@ impl Measured {
     }
 
     /// Whether a reader of its topic asks for repairs, as far as discovery knows.
-    fn has_reliable_reader(&self, around: Around<'_>) -> bool {
-        let topic = self.topic.and_then(|topic| around.topics.get(topic));
+    fn has_reliable_reader(&self, graph: GraphView<'_>) -> bool {
+        let topic = self.topic.and_then(|topic| graph.topics.get(topic));
         let readers = topic.into_iter().flat_map(|topic| &topic.readers);
-        let mut known = readers.filter_map(|guid| around.discovery.endpoints().get(guid));
+        let mut known = readers.filter_map(|guid| graph.discovery.endpoints().get(guid));
         known.any(|reader| reader.qos.reliability == Reliability::RELIABLE)
     }
 
@@ -615,8 +644,8 @@ impl Measured {
     }
 
     /// It is metered once the kernel has been told.
-    const fn doubt(&mut self, now: Timestamp) {
-        self.sure_from = Timestamp(now.0.saturating_add(TELLING));
-        self.writer.doubt(self.sure_from);
+    const fn allow_incomplete(&mut self, now: Timestamp) {
+        self.sure_from = Timestamp(now.0.saturating_add(KERNEL_UPDATE_TIME));
+        self.writer.allow_incomplete(self.sure_from);
     }
 }

@@ -4,11 +4,11 @@
 //! start. Counters for rules are elsewhere and exact; this forgets after [`SECONDS`].
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 /// Length of the window.
 pub const SECONDS: u64 = 10;
 const SLOTS: usize = SECONDS as usize + 1;
-const SECOND: u64 = 1_000_000_000;
 
 /// Counts by whole second.
 #[derive(Clone, Debug, Default)]

@@ -9,39 +9,39 @@
 //! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
 //! share a socket, the answer is "unknown", never a guess.
 
-mod places;
+mod addresses;
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
 use ros2probe_wire::record::flag;
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
-use places::Places;
+use addresses::AnnouncedAddresses;
 
-use super::calendar::Calendar;
 use super::discovery::Discovery;
+use super::route::{Destination, Route};
 use super::size::Size;
 use super::snapshot::SocketFacts;
 use super::sockets::Sockets;
 use super::topic::{Topic, Topics};
-use super::way::{Place, Way};
+use super::wall_clock::WallClock;
 
 /// Participants remembered of one socket or process.
-const OWNERS: usize = 8;
+const MAX_CANDIDATES: usize = 8;
 /// Closed sockets remembered, for those who still hold something of them.
 const CLOSED: usize = 1024;
 /// Addresses kept of one participant.
-const PLACES: usize = 16;
+const MAX_ADDRESSES: usize = 16;
 
 /// All that is known of receivers.
 #[derive(Debug)]
 pub struct Receivers {
     sockets: Sockets,
-    learned: HashMap<u64, Learned>,
-    processes: HashMap<u32, Owners>,
+    users: HashMap<u64, SocketUsers>,
+    processes: HashMap<u32, Candidates>,
     /// Participants for which a socket of this host sends, since the last [`Self::tidy`] at most.
     local: HashSet<GuidPrefix>,
-    places: Places,
+    addresses: AnnouncedAddresses,
     closed: HashSet<u64>,
     closings: VecDeque<u64>,
     limit: usize,
@@ -50,7 +50,7 @@ pub struct Receivers {
 
 /// What the samples of a writer are seen in front of.
 #[derive(Clone, Copy, Debug)]
-pub struct Around<'a> {
+pub struct GraphView<'a> {
     /// Who receives where.
     pub receivers: &'a Receivers,
     /// Who is there.
@@ -58,7 +58,7 @@ pub struct Around<'a> {
     /// Who reads what.
     pub topics: &'a Topics,
     /// What the clocks of writers are held against.
-    pub calendar: Calendar,
+    pub wall_clock: WallClock,
 }
 
 /// Whether a receiver has a reader of the topic.
@@ -74,17 +74,17 @@ pub enum Matched {
 
 /// To whom a socket may belong.
 #[derive(Debug, Default)]
-struct Learned {
+struct SocketUsers {
     /// They send by it.
-    senders: Owners,
+    senders: Candidates,
     /// Something directed to them came to it.
-    addressed: Owners,
+    addressed: Candidates,
     /// It sent for more participants than are remembered: who forges does that.
     is_crowded: bool,
 }
 
 #[derive(Debug, Default)]
-struct Owners(Vec<GuidPrefix>);
+struct Candidates(Vec<GuidPrefix>);
 
 impl Receivers {
     /// Nothing known; at most `limit` sockets, and the addresses of so many participants.
@@ -92,10 +92,13 @@ impl Receivers {
     pub fn new(limit: usize, participants: usize) -> Self {
         Self {
             sockets: Sockets::new(limit),
-            learned: HashMap::new(),
+            users: HashMap::new(),
             processes: HashMap::new(),
             local: HashSet::new(),
-            places: Places::new(participants.saturating_mul(PLACES / 2), PLACES),
+            addresses: AnnouncedAddresses::new(
+                participants.saturating_mul(MAX_ADDRESSES / 2),
+                MAX_ADDRESSES,
+            ),
             closed: HashSet::new(),
             closings: VecDeque::new(),
             limit,
@@ -124,11 +127,11 @@ impl Receivers {
     #[must_use]
     pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
         let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
-        for (cookie, learned) in &self.learned {
+        for (cookie, users) in &self.users {
             let Some(facts) = self.sockets.get(*cookie) else {
                 continue;
             };
-            for sender in &learned.senders.0 {
+            for sender in &users.senders.0 {
                 // Of several sockets always the same one.
                 let holder = holders.entry(*sender).or_insert(facts);
                 let better = |facts: &SocketFacts| (facts.process_id.is_none(), facts.cookie);
@@ -155,11 +158,11 @@ impl Receivers {
         if !is_new || process == before {
             return;
         }
-        if let (Some(process), Some(learned)) = (process, self.learned.get(&cookie))
+        if let (Some(process), Some(users)) = (process, self.users.get(&cookie))
             && (self.processes.len() < self.limit || self.processes.contains_key(&process))
         {
             let known = self.processes.entry(process).or_default();
-            let senders = learned.senders.0.iter();
+            let senders = users.senders.0.iter();
             senders.for_each(|owner| known.add(*owner));
         }
         self.generation += 1;
@@ -174,7 +177,7 @@ impl Receivers {
     /// This socket is no more.
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);
-        self.learned.remove(&cookie);
+        self.users.remove(&cookie);
         if self.closings.len() >= CLOSED
             && let Some(oldest) = self.closings.pop_front()
         {
@@ -203,11 +206,11 @@ impl Receivers {
         }
         let (sender, directed) = (record.sender(), record.addressee());
         let is_sent = record.flags & flag::OUTGOING != 0;
-        if !is_sent && (directed == GuidPrefix::UNKNOWN || Place::of(record).is_multicast()) {
+        if !is_sent && (directed == GuidPrefix::UNKNOWN || Destination::of(record).is_multicast()) {
             return false;
         }
         let owner = if is_sent { sender } else { directed };
-        let known = self.learned.get(&record.socket);
+        let known = self.users.get(&record.socket);
         let list = known.map(|known| {
             if is_sent {
                 &known.senders
@@ -218,15 +221,15 @@ impl Receivers {
         if list.is_some_and(|list| list.0.contains(&owner)) {
             return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
-        if known.is_none() && self.learned.len() >= self.limit {
+        if known.is_none() && self.users.len() >= self.limit {
             return false;
         }
-        let known = self.learned.entry(record.socket).or_default();
+        let known = self.users.entry(record.socket).or_default();
         let mut is_local = false;
         if is_sent {
-            known.is_crowded |= known.senders.0.len() >= OWNERS;
+            known.is_crowded |= known.senders.0.len() >= MAX_CANDIDATES;
             known.senders.add(owner);
-            is_local = !known.is_crowded && self.local.len() < self.limit * OWNERS;
+            is_local = !known.is_crowded && self.local.len() < self.limit * MAX_CANDIDATES;
             if is_local {
                 self.local.insert(owner);
             }
@@ -244,16 +247,16 @@ impl Receivers {
     }
 
     /// A participant announces where it is reached by unicast.
-    pub fn announce(&mut self, prefix: GuidPrefix, places: impl Iterator<Item = Place>) {
-        for place in places.take(PLACES) {
-            self.generation += u64::from(self.places.put(prefix, place));
+    pub fn announce(&mut self, prefix: GuidPrefix, addresses: impl Iterator<Item = Destination>) {
+        for destination in addresses.take(MAX_ADDRESSES) {
+            self.generation += u64::from(self.addresses.put(prefix, destination));
         }
     }
 
     /// Addresses, their cap, and those given up because of it.
     #[must_use]
     pub fn addresses(&self) -> (usize, usize, u64) {
-        self.places.size()
+        self.addresses.size()
     }
 
     /// Entries and cap of every table.
@@ -262,32 +265,34 @@ impl Receivers {
         // A new table does not compile before it has a place here.
         let Self {
             sockets,
-            learned,
+            users,
             processes,
             local,
-            places,
+            addresses,
             closed,
             closings,
             limit,
             generation: _,
         } = self;
-        let owners = |Owners(owners): &Owners| owners.len();
-        let learned_owners = learned.values().map(|learned| {
-            let Learned {
+        let candidates = |Candidates(candidates): &Candidates| candidates.len();
+        let learned_owners = users.values().map(|users| {
+            let SocketUsers {
                 senders,
                 addressed,
                 is_crowded: _,
-            } = learned;
-            owners(senders).max(owners(addressed))
+            } = users;
+            candidates(senders).max(candidates(addressed))
         });
-        let of_one = learned_owners.chain(processes.values().map(owners)).max();
+        let of_one = learned_owners
+            .chain(processes.values().map(candidates))
+            .max();
         let mut sizes = Vec::from(sockets.sizes());
-        sizes.extend(places.sizes());
+        sizes.extend(addresses.sizes());
         sizes.extend([
-            Size::new("receivers.learned", learned.len(), *limit),
+            Size::new("receivers.users", users.len(), *limit),
             Size::new("receivers.processes", processes.len(), *limit),
-            Size::new("receivers.local", local.len(), *limit * OWNERS),
-            Size::new("receivers.owners", of_one.unwrap_or(0), OWNERS),
+            Size::new("receivers.local", local.len(), *limit * MAX_CANDIDATES),
+            Size::new("receivers.owners", of_one.unwrap_or(0), MAX_CANDIDATES),
             Size::new("receivers.closed", closed.len(), CLOSED),
             Size::new("receivers.closings", closings.len(), CLOSED),
         ]);
@@ -297,40 +302,41 @@ impl Receivers {
     /// Forgets what participants said that are no more and do not wait for room.
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
-        self.places.retain(is_there);
-        for learned in self.learned.values_mut() {
-            learned.senders.0.retain(is_there);
-            learned.addressed.0.retain(is_there);
+        self.addresses.retain(is_there);
+        for users in self.users.values_mut() {
+            users.senders.0.retain(is_there);
+            users.addressed.0.retain(is_there);
         }
-        self.learned
-            .retain(|_, learned| !learned.senders.0.is_empty() || !learned.addressed.0.is_empty());
-        for owners in self.processes.values_mut() {
-            owners.0.retain(is_there);
+        self.users
+            .retain(|_, users| !users.senders.0.is_empty() || !users.addressed.0.is_empty());
+        for candidates in self.processes.values_mut() {
+            candidates.0.retain(is_there);
         }
-        self.processes.retain(|_, owners| !owners.0.is_empty());
-        let sockets = self.learned.values().filter(|learned| !learned.is_crowded);
+        self.processes
+            .retain(|_, candidates| !candidates.0.is_empty());
+        let sockets = self.users.values().filter(|users| !users.is_crowded);
         self.local = sockets
-            .flat_map(|learned| learned.senders.0.iter().copied())
+            .flat_map(|users| users.senders.0.iter().copied())
             .collect();
     }
 
     /// The participant that receives what comes this way.
     #[must_use]
-    pub fn owner(&self, way: &Way, discovery: &Discovery) -> Option<GuidPrefix> {
-        if way.socket != 0 {
-            let learned = self.learned.get(&way.socket);
-            let facts = self.sockets.get(way.socket);
+    pub fn owner(&self, route: &Route, discovery: &Discovery) -> Option<GuidPrefix> {
+        if route.socket != 0 {
+            let users = self.users.get(&route.socket);
+            let facts = self.sockets.get(route.socket);
             let process = facts.and_then(|facts| facts.process_id);
             let lists = [
-                learned.map(|learned| &learned.senders),
+                users.map(|users| &users.senders),
                 process.and_then(|process| self.processes.get(&process)),
-                learned.map(|learned| &learned.addressed),
+                users.map(|users| &users.addressed),
             ];
             // Each list is asked only about those that the ones before leave open.
             let mut open: Vec<GuidPrefix> = Vec::new();
-            for owners in lists.into_iter().flatten() {
+            for candidates in lists.into_iter().flatten() {
                 let alive = |owner: &&GuidPrefix| discovery.participants().contains_key(*owner);
-                let alive: Vec<_> = owners.0.iter().filter(alive).copied().collect();
+                let alive: Vec<_> = candidates.0.iter().filter(alive).copied().collect();
                 let is_open = |owner: &GuidPrefix| open.is_empty() || open.contains(owner);
                 let left: Vec<_> = alive.into_iter().filter(is_open).collect();
                 if !left.is_empty() {
@@ -348,13 +354,13 @@ impl Receivers {
                 return Some(owner);
             }
         }
-        let prefix = self.places.owner(&way.place)?;
+        let prefix = self.addresses.owner(&route.destination)?;
         let is_known = discovery.participants().contains_key(&prefix);
-        (is_known && !way.place.is_multicast()).then_some(prefix)
+        (is_known && !route.destination.is_multicast()).then_some(prefix)
     }
 }
 
-impl Around<'_> {
+impl GraphView<'_> {
     /// Whether this participant reads the topic.
     #[must_use]
     pub fn matched(&self, topic: Option<&Topic>, prefix: GuidPrefix) -> Matched {
@@ -365,7 +371,7 @@ impl Around<'_> {
             return Matched::Yes;
         }
         match self.discovery.participants().get(&prefix) {
-            Some(participant) if participant.readers_told => Matched::No,
+            Some(participant) if participant.all_readers_announced => Matched::No,
             _ => Matched::Unknown,
         }
     }
@@ -373,7 +379,7 @@ impl Around<'_> {
 
 /// This participant's readers of the topic, sorted but for those beside it.
 pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
-    [&topic.readers, &topic.beside]
+    [&topic.readers, &topic.buffer_endpoints]
         .into_iter()
         .flat_map(move |list| {
             let start = list.partition_point(|guid| guid.prefix < prefix);
@@ -388,7 +394,7 @@ pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> 
 fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     let mut announced = discovery.participants().iter().filter(|(_, participant)| {
         participant
-            .portrait
+            .proxy
             .process_id
             .is_some_and(|id| id == process || id == process & 0xffff)
     });
@@ -396,12 +402,12 @@ fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     announced.next().is_none().then_some(*prefix)
 }
 
-impl Owners {
+impl Candidates {
     fn add(&mut self, owner: GuidPrefix) {
         if self.0.contains(&owner) {
             return;
         }
-        if self.0.len() >= OWNERS {
+        if self.0.len() >= MAX_CANDIDATES {
             self.0.remove(0);
         }
         self.0.push(owner);

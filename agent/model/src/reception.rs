@@ -8,7 +8,7 @@ use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
 use ros2probe_wire::{RtpsTime, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
-use super::sequence::{Arrival, Belief, Manner, REACH, Sequence, Settled};
+use super::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
 use super::size::Size;
 
 /// A fragment that completes its sample this late after the sample's last one was retransmitted.
@@ -37,7 +37,7 @@ pub struct Whole {
     /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
     pub newest: bool,
     /// Its number is not believed to be the writer's.
-    pub doubted: bool,
+    pub unconfirmed: bool,
     /// INFO_TS.
     pub source: RtpsTime,
     /// What lies where a header's stamp would.
@@ -54,7 +54,7 @@ pub enum Outcome {
     /// It completed a sample.
     Whole(Whole),
     /// It brought nothing that had not come before.
-    Again,
+    Duplicate,
     /// Something is missing still, or it was of no use.
     Open,
 }
@@ -101,14 +101,14 @@ impl Reception {
     }
 
     /// Takes in a DATA_FRAG of a view in which samples may be missing: whether it completes its
-    /// sample. Samples far below it are waited for no longer, unless it is `doubted`.
+    /// sample. Samples far below it are waited for no longer, unless it is `unconfirmed`.
     pub fn assemble(
         &mut self,
         fragments: DataFrag<'_>,
-        doubted: bool,
+        unconfirmed: bool,
         budget: &mut Budget,
     ) -> bool {
-        if !doubted {
+        if !unconfirmed {
             let oldest = fragments.sequence_number().saturating_sub(UNDER_WAY);
             self.samples.forget_below(oldest, budget);
         }
@@ -124,8 +124,8 @@ impl Reception {
 
     /// Samples in fragments that begin before this are no loss when they stay incomplete: the kernel
     /// did not know the writer yet, and what it hands over of strangers is limited.
-    pub const fn doubt(&mut self, until: Timestamp) {
-        self.samples.doubt(until);
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.samples.allow_incomplete(until);
     }
 
     /// Takes in a DATA or DATA_FRAG of a writer that retransmits, or does not.
@@ -137,7 +137,7 @@ impl Reception {
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
         if !self.recognise(sample, budget, decide) {
-            return self.doubted(sample, budget);
+            return self.unconfirmed(sample, budget);
         }
         match sample {
             record::Sample::Data(_) => self.data(sample, reliable, budget, decide),
@@ -159,9 +159,9 @@ impl Reception {
         let source = sample.source_timestamp().timestamp();
         let Self { sequence, samples } = self;
         match sequence.recognise(number, source, REACH, now) {
-            Belief::Live => true,
-            Belief::Doubted { .. } => false,
-            Belief::Believed(run) => {
+            RunMembership::Live => true,
+            RunMembership::Unconfirmed { .. } => false,
+            RunMembership::Confirmed(run) => {
                 sequence.accept(&run, now, &mut |settled| {
                     decide(decision(settled, samples, budget));
                 });
@@ -280,19 +280,19 @@ impl Reception {
         decide: &mut impl FnMut(Decision),
     ) -> Outcome {
         let number = sample.sequence_number();
-        let manner = if reliable {
-            Manner::Reliable
+        let repair_mode = if reliable {
+            RepairMode::Reliable
         } else {
-            Manner::BestEffort
+            RepairMode::BestEffort
         };
         let now = Timestamp(sample.record().time);
         let Self { sequence, samples } = self;
-        let arrival = sequence.receive(number, manner, now, &mut |settled| {
+        let arrival = sequence.receive(number, repair_mode, now, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
         samples.forget(number, budget);
         let Arrival::New { recovered, newest } = arrival else {
-            return Outcome::Again;
+            return Outcome::Duplicate;
         };
         Outcome::Whole(Whole {
             recovered,
@@ -302,26 +302,26 @@ impl Reception {
     }
 
     /// Takes in a DATA or DATA_FRAG whose number is not believed.
-    fn doubted(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
+    fn unconfirmed(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
         let number = sample.sequence_number();
         let now = Timestamp(sample.record().time);
-        if self.sequence.has_doubted(number) {
-            return Outcome::Again;
+        if self.sequence.has_unconfirmed(number) {
+            return Outcome::Duplicate;
         }
         let whole = match sample {
             record::Sample::DataFrag(fragments) => {
                 match self.samples.fragment(fragments, now, budget) {
                     Progress::Complete(facts) => whole_fragments(sample, &facts),
-                    Progress::Duplicate => return Outcome::Again,
+                    Progress::Duplicate => return Outcome::Duplicate,
                     _ => return Outcome::Open,
                 }
             }
             record::Sample::Data(_) => whole_data(sample),
         };
-        self.sequence.complete_doubted(number);
+        self.sequence.complete_unconfirmed(number);
         Outcome::Whole(Whole {
             newest: false,
-            doubted: true,
+            unconfirmed: true,
             ..whole
         })
     }
@@ -337,12 +337,12 @@ impl Reception {
         let now = Timestamp(fragments.record().time);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2): beyond is none.
         if self.sequence.has(number) || number > u64::MAX >> 1 {
-            return Outcome::Again;
+            return Outcome::Duplicate;
         }
         let progress = self.samples.fragment(fragments, now, budget);
         match progress {
             Progress::Rejected => return Outcome::Open,
-            Progress::Duplicate => return Outcome::Again,
+            Progress::Duplicate => return Outcome::Duplicate,
             Progress::TooMany => {
                 self.sequence.begin(number);
                 self.exists(number, now, budget, decide);
@@ -359,13 +359,13 @@ impl Reception {
         let Progress::Complete(facts) = progress else {
             return Outcome::Open;
         };
-        let manner = if reliable {
-            Manner::ReliableFragments
+        let repair_mode = if reliable {
+            RepairMode::ReliableFragments
         } else {
-            Manner::BestEffort
+            RepairMode::BestEffort
         };
         let Self { sequence, samples } = self;
-        let arrival = sequence.receive(number, manner, now, &mut |settled| {
+        let arrival = sequence.receive(number, repair_mode, now, &mut |settled| {
             decide(decision(settled, samples, budget));
         });
         let Arrival::New { recovered, .. } = arrival else {
@@ -386,7 +386,7 @@ const fn whole_data(sample: record::Sample<'_>) -> Whole {
         is_message: sample.is_message(),
         recovered: false,
         newest: true,
-        doubted: false,
+        unconfirmed: false,
         source: sample.source_timestamp(),
         stamp: sample.header_stamp(),
         began: Timestamp(sample.record().time),

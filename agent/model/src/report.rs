@@ -8,17 +8,17 @@ use std::sync::Arc;
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Duration, EntityId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, Timestamp};
 
-use super::discovery::{Discovery, Endpoint, Portrait};
+use super::discovery::{Discovery, Endpoint, ParticipantProxy};
 use super::observer::Observer;
-use super::passage::passages;
 use super::snapshot::{
     DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts,
     Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
     WatchedTopicFacts,
 };
 use super::topic::{Topic, Watched};
+use super::transport::transports;
 
 pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
     let nodes = nodes_of_endpoints(&observer.discovery);
@@ -53,17 +53,17 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
         .participants()
         .iter()
         .map(|(prefix, participant)| {
-            let portrait = &participant.portrait;
+            let proxy = &participant.proxy;
             ParticipantFacts {
                 guid: Guid::new(*prefix, EntityId::PARTICIPANT),
                 domain_id: participant.domain_id,
-                vendor: portrait.vendor.to_string(),
-                enclave: portrait.enclave.as_deref().map(Into::into),
-                process: process(Some(portrait), holders.get(prefix).copied()),
+                vendor: proxy.vendor.to_string(),
+                enclave: proxy.enclave.as_deref().map(Into::into),
+                process: process(Some(proxy), holders.get(prefix).copied()),
                 first_seen: participant.first_seen,
                 last_seen: participant.last_seen,
-                lease_nanoseconds: nanoseconds(portrait.lease),
-                secured: portrait.secured,
+                lease_nanoseconds: nanoseconds(proxy.lease),
+                secured: proxy.secured,
                 restored: participant.restored.is_some(),
                 addresses: participant.addresses.clone(),
             }
@@ -137,7 +137,7 @@ fn topic(
         topic.readers.len(),
         topic.readers.iter().filter_map(endpoint),
     );
-    let passages = passages(&observer.discovery, &mut publishers, &mut subscriptions);
+    let transports = transports(&observer.discovery, &mut publishers, &mut subscriptions);
     let all = || publishers.iter().chain(&subscriptions);
     let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
     if topic.is_vanished() {
@@ -169,8 +169,8 @@ fn topic(
         deliveries: deliveries::deliveries(observer, topic, nodes),
         acknowledgements: deliveries::acknowledgements(observer, topic, nodes, now),
         vanished: topic.is_vanished(),
-        passages,
-        is_read: topic.wished.is_some(),
+        transports,
+        is_read: topic.requested.is_some(),
     }
 }
 
@@ -178,7 +178,7 @@ fn topic(
 pub(super) fn measured(
     observer: &Observer,
     now: Timestamp,
-) -> impl Iterator<Item = (u32, &Arc<str>, Measurement)> {
+) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
     let topics = observer.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
     topics.filter_map(move |topic| {
@@ -197,9 +197,9 @@ pub(super) fn measured(
 /// measured.
 fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measurement>> {
     let mut sum = topic.retired.clone()?;
-    for guid in &topic.beside {
-        if let Some(beside) = observer.profiler.get(*guid) {
-            sum.add(&beside.writer.measurement(now));
+    for guid in &topic.buffer_endpoints {
+        if let Some(buffer_endpoints) = observer.profiler.get(*guid) {
+            sum.add(&buffer_endpoints.writer.measurement(now));
         }
     }
     Some(sum)
@@ -236,24 +236,24 @@ fn endpoint_facts(
         type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
         first_seen: endpoint.first_seen,
         measurement,
-        passages: 0,
+        transports: 0,
     }
 }
 
 fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFacts> {
-    let strangers = observer
+    let unknown_writers = observer
         .profiler
         .iter()
         .filter(|(_, measured)| measured.metered && measured.topic.is_none());
-    let mut facts: Vec<_> = strangers
+    let mut facts: Vec<_> = unknown_writers
         .map(|(guid, measured)| {
             let participant = observer.discovery.participants().get(&guid.prefix);
-            let portrait = participant.map(|participant| &participant.portrait);
+            let proxy = participant.map(|participant| &participant.proxy);
             let holder = observer.receivers.sockets().get(measured.sent_from);
             UnknownWriterFacts {
                 guid: *guid,
-                vendor: vendor(*guid, portrait),
-                process: process(portrait, holder),
+                vendor: vendor(*guid, proxy),
+                process: process(proxy, holder),
                 first_seen: measured.first_seen,
                 measurement: measured.writer.measurement(now),
             }
@@ -264,29 +264,29 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
 }
 
 /// What a participant says of where it lives, and who holds the socket it sends by.
-fn process(portrait: Option<&Portrait>, holder: Option<&SocketFacts>) -> ProcessFacts {
-    let said = |text: fn(&Portrait) -> &Option<Box<str>>| {
-        portrait
-            .and_then(|portrait| text(portrait).as_deref())
+fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
+    let said = |text: fn(&ParticipantProxy) -> &Option<Box<str>>| {
+        proxy
+            .and_then(|proxy| text(proxy).as_deref())
             .map(str::to_owned)
     };
     let held = |text: fn(&SocketFacts) -> &Option<String>| holder.and_then(|it| text(it).clone());
     let id = holder.and_then(|holder| holder.process_id);
     ProcessFacts {
-        host: said(|portrait| &portrait.host),
-        id: id.or_else(|| portrait.and_then(|portrait| portrait.process_id)),
-        name: said(|portrait| &portrait.process_name).or_else(|| held(|holder| &holder.process)),
+        host: said(|proxy| &proxy.host),
+        id: id.or_else(|| proxy.and_then(|proxy| proxy.process_id)),
+        name: said(|proxy| &proxy.process_name).or_else(|| held(|holder| &holder.process)),
         cgroup: held(|holder| &holder.cgroup),
     }
 }
 
 /// The vendor in words; without an announcement the GUID tells where it begins with a known one's
 /// mark, as RTPS 2.5, 9.3.1.5 asks for and Fast DDS and Cyclone DDS 0.10 do.
-fn vendor(guid: Guid, portrait: Option<&Portrait>) -> String {
+fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> String {
     let [first, second, ..] = guid.prefix.0;
     let marked = VendorId([first, second]);
-    match portrait {
-        Some(portrait) => portrait.vendor.to_string(),
+    match proxy {
+        Some(proxy) => proxy.vendor.to_string(),
         None => marked.name().unwrap_or_default().to_owned(),
     }
 }
@@ -324,7 +324,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
     for (watch, fact) in observer.watchlist.watches().iter().zip(&mut facts) {
         if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
             fact.topics.push(WatchedTopicFacts {
-                domain_id: watch.domain_id.unwrap_or(0),
+                domain_id: watch.domain_id.unwrap_or(DomainId(0)),
                 topic: watch.pattern.clone(),
                 state: WatchState::NotPublished,
                 violations: Vec::new(),
@@ -365,7 +365,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let (spans, spans_limit, spans_evictions) = observer.tracer.size();
     let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
-    let room = profiler.room();
+    let quota = profiler.quota();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
         Some(subscribers.refused())
@@ -404,14 +404,14 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             "samples",
             samples,
             samples_limit,
-            samples_evictions + observer.pieces.evictions(),
+            samples_evictions + observer.discovery_fragments.evictions(),
         ),
         table("interest", interest, interest_limit, interest_evictions),
         table(
             "deliveries",
-            room.used,
-            room.limit,
-            room.evictions + refused,
+            quota.used,
+            quota.limit,
+            quota.evictions + refused,
         ),
         table("sockets", sockets, sockets_limit, sockets_evictions),
         table("addresses", addresses, addresses_limit, addresses_evictions),

@@ -7,15 +7,16 @@
 //! network counts here too: it adds to what was seen.
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 
-use super::sequence::{Belief, MAX_WINDOW, Run, Sequence};
+use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
 use super::snapshot::SampledFacts;
 
 /// A writer that was not seen in shared memory for so long is not sampled any more.
-const HOLD: u64 = 10_000_000_000;
+const HOLD: u64 = 10 * SECOND;
 /// How long a sample that was not seen may still come by another way before it is left out.
-const PATIENCE: u64 = 200_000_000;
+const PATIENCE: u64 = 200 * MILLISECOND;
 /// Numbers below the next one of which it is known one by one whether they were seen.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -39,8 +40,8 @@ pub struct Sampled {
     next: u64,
     /// Nothing below this is waited for.
     settled: u64,
-    /// When [`Self::look`] last settled, and the next number at that time.
-    looked: (Timestamp, u64),
+    /// When [`Self::tick`] last settled, and the next number at that time.
+    last_settled: (Timestamp, u64),
     /// Runs of numbers that were settled without being seen.
     unseen: Vec<(u64, u64)>,
     /// The latest number that arrived whole as far as can be told, and when.
@@ -51,7 +52,7 @@ pub struct Sampled {
 
 /// What a record changed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
-pub struct News {
+pub struct SampledUpdate {
     /// Numbers that are now known to be used, the record's own included.
     pub samples: u64,
     /// Samples that may be taken for as large as this one: those, and others that were told of.
@@ -63,7 +64,7 @@ pub struct News {
     /// Nothing more of it is waited for, for the first time.
     pub finished: bool,
     /// Its number is not believed to be the writer's.
-    pub doubted: bool,
+    pub unconfirmed: bool,
 }
 
 /// What was seen of a sample, its latest record included.
@@ -92,7 +93,7 @@ impl Sampled {
             finished: u128::MAX,
             next: 0,
             settled: 0,
-            looked: (now, 0),
+            last_settled: (now, 0),
             unseen: Vec::new(),
             arrived: None,
             head: None,
@@ -114,7 +115,7 @@ impl Sampled {
             finished: _,
             next: _,
             settled: _,
-            looked: _,
+            last_settled: _,
             unseen,
             arrived: _,
             head: _,
@@ -142,7 +143,7 @@ impl Sampled {
         takes
     }
 
-    /// It is seen otherwise from now on. Samples under way may still come, until [`Self::look`]
+    /// It is seen otherwise from now on. Samples under way may still come, until [`Self::tick`]
     /// settles them.
     pub const fn end(&mut self) {
         (self.last, self.left) = (Timestamp(0), true);
@@ -156,10 +157,10 @@ impl Sampled {
     }
 
     /// Takes in a sample that [`Self::awaits`], or a fragment of one, after [`Self::end`].
-    pub fn catch_up(&mut self, number: u64, seen: Seen) -> News {
-        News {
+    pub fn catch_up(&mut self, number: u64, seen: Seen) -> SampledUpdate {
+        SampledUpdate {
             finished: self.sight(number, seen),
-            ..News::default()
+            ..SampledUpdate::default()
         }
     }
 
@@ -179,11 +180,11 @@ impl Sampled {
     }
 
     /// Waits no longer for what was missing at the last look and is still.
-    pub fn look(&mut self, now: Timestamp) {
-        let (then, next) = self.looked;
+    pub fn tick(&mut self, now: Timestamp) {
+        let (then, next) = self.last_settled;
         if now.0.saturating_sub(then.0) >= PATIENCE {
             self.settle(next.min(self.next));
-            self.looked = (now, self.next);
+            self.last_settled = (now, self.next);
         }
     }
 
@@ -195,7 +196,7 @@ impl Sampled {
     /// Since when a sample is waited for.
     #[must_use]
     pub fn unseen_since(&self) -> Option<Timestamp> {
-        self.unseen().map(|_| self.looked.0)
+        self.unseen().map(|_| self.last_settled.0)
     }
 
     /// The lowest number of a sample that is waited for.
@@ -245,9 +246,9 @@ impl Sampled {
         reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
-    ) -> News {
+    ) -> SampledUpdate {
         if number == 0 || number > u64::MAX >> 1 {
-            return News::default();
+            return SampledUpdate::default();
         }
         let before = sequence.next();
         self.follow(before, now);
@@ -258,14 +259,16 @@ impl Sampled {
             // It is late and not of a writer that begins anew.
             Some(source) if is_told_only => {
                 sequence.sourced(number, source);
-                Belief::Live
+                RunMembership::Live
             }
             source => sequence.recognise(number, source, reach, now),
         };
         let run = match belief {
-            Belief::Live => Run::default(),
-            Belief::Doubted { new } => return self.doubted((number, seen), new, sequence),
-            Belief::Believed(run) => run,
+            RunMembership::Live => Run::default(),
+            RunMembership::Unconfirmed { new } => {
+                return self.unconfirmed((number, seen), new, sequence);
+            }
+            RunMembership::Confirmed(run) => run,
         };
         sequence.begin(number);
         if sequence.next() != before {
@@ -281,22 +284,22 @@ impl Sampled {
         self.span += samples;
         let below = sequence.next().saturating_sub(number).saturating_sub(1);
         let finished = self.sight(number, seen);
-        let mut news = News {
+        let mut update = SampledUpdate {
             samples,
             alike: samples.saturating_add(std::mem::take(&mut self.unmeasured)),
             finished,
-            ..News::default()
+            ..SampledUpdate::default()
         };
         let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
         if seen != Seen::Part && below == 0 && is_later {
-            news.arrived = true;
-            news.interval = self
+            update.arrived = true;
+            update.interval = self
                 .arrived
                 .filter(|(arrived, _)| arrived.saturating_add(1) == number)
                 .map(|(_, at)| now.nanoseconds_since(at).max(0));
             self.arrived = Some((number, now));
         }
-        news
+        update
     }
 
     /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known of.
@@ -305,9 +308,9 @@ impl Sampled {
         if !sequence.started() {
             return 0;
         }
-        let (is_believed, run) = sequence.claim(end, reach, now);
+        let (is_confirmed, run) = sequence.claim(end, reach, now);
         self.follow(sequence.next(), now);
-        if !is_believed {
+        if !is_confirmed {
             return 0;
         }
         let samples = self.advance(end, true, now, sequence);
@@ -358,16 +361,21 @@ impl Sampled {
     }
 
     /// Takes in a sample whose number is not believed.
-    fn doubted(&mut self, (number, seen): (u64, Seen), new: bool, sequence: &mut Sequence) -> News {
+    fn unconfirmed(
+        &mut self,
+        (number, seen): (u64, Seen),
+        new: bool,
+        sequence: &mut Sequence,
+    ) -> SampledUpdate {
         let samples = u64::from(new);
         self.span += samples;
         self.seen += samples;
-        News {
+        SampledUpdate {
             samples,
             alike: samples,
-            finished: seen != Seen::Part && sequence.complete_doubted(number),
-            doubted: true,
-            ..News::default()
+            finished: seen != Seen::Part && sequence.complete_unconfirmed(number),
+            unconfirmed: true,
+            ..SampledUpdate::default()
         }
     }
 
@@ -442,7 +450,7 @@ impl Sampled {
     /// All below `next` was seen, or needs not be.
     const fn begin(&mut self, next: u64, now: Timestamp) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
-        (self.next, self.settled, self.looked) = (next, next, (now, next));
+        (self.next, self.settled, self.last_settled) = (next, next, (now, next));
     }
 
     /// Nothing below `end` is waited for any longer: what was not seen of it is left out.
@@ -469,8 +477,7 @@ impl Sampled {
 mod tests {
     use super::super::sequence::{FAR, REACH, Settled};
     use super::*;
-
-    const SECOND: u64 = 1_000_000_000;
+    use ros2probe_wire::time::SECOND;
 
     struct View {
         sampled: Sampled,
@@ -487,11 +494,11 @@ mod tests {
             }
         }
 
-        fn see(&mut self, number: u64) -> News {
+        fn see(&mut self, number: u64) -> SampledUpdate {
             self.part(number, Seen::Whole)
         }
 
-        fn part(&mut self, number: u64, seen: Seen) -> News {
+        fn part(&mut self, number: u64, seen: Seen) -> SampledUpdate {
             self.now += SECOND / 100;
             let now = Timestamp(self.now);
             self.sampled
@@ -525,18 +532,24 @@ mod tests {
     fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
         let mut view = View::new();
         let parts = [Seen::Part, Seen::Part, Seen::Whole, Seen::Whole];
-        let news = parts.map(|seen| view.part(1, seen));
-        assert_eq!(news.map(|news| news.samples), [1, 0, 0, 0]);
-        assert_eq!(news.map(|news| news.arrived), [false, false, true, false]);
-        assert_eq!(news.map(|news| news.finished), [false, false, true, false]);
+        let update = parts.map(|seen| view.part(1, seen));
+        assert_eq!(update.map(|update| update.samples), [1, 0, 0, 0]);
+        assert_eq!(
+            update.map(|update| update.arrived),
+            [false, false, true, false]
+        );
+        assert_eq!(
+            update.map(|update| update.finished),
+            [false, false, true, false]
+        );
         view.see(3);
         // Late, but seen after all.
-        let late = News {
+        let late = SampledUpdate {
             finished: true,
-            ..News::default()
+            ..SampledUpdate::default()
         };
         assert_eq!(view.see(2), late);
-        assert_eq!(view.see(2), News::default());
+        assert_eq!(view.see(2), SampledUpdate::default());
         assert_eq!(view.counts(), (3, 3));
     }
 
@@ -584,9 +597,9 @@ mod tests {
         // 8 was sent, 9 to 11 were not.
         assert_eq!(view.sampled.skip((9, 12), FAR, now, &mut view.sequence), 1);
         assert_eq!(view.counts(), (1, 4));
-        let news = view.see(12);
+        let update = view.see(12);
         // With 6 and 7 and 8, whose size is not known either.
-        assert_eq!((news.samples, news.alike), (1, 4));
+        assert_eq!((update.samples, update.alike), (1, 4));
         view.see(7);
         assert_eq!(view.counts(), (3, 5));
         let forged = view.sampled.exist(1 << 40, FAR, now, &mut view.sequence);
@@ -621,19 +634,19 @@ mod tests {
     #[test]
     fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
         let mut view = View::new();
-        let look = |view: &mut View| {
+        let settle = |view: &mut View| {
             view.now += PATIENCE;
-            view.sampled.look(Timestamp(view.now));
+            view.sampled.tick(Timestamp(view.now));
             view.sampled.take_unseen()
         };
         view.see(1);
-        assert_eq!(look(&mut view), []);
+        assert_eq!(settle(&mut view), []);
         view.see(5);
         assert!(view.sampled.unseen_since().is_some());
         // It may still come until the next look.
-        assert_eq!(look(&mut view), []);
+        assert_eq!(settle(&mut view), []);
         assert!(view.see(3).finished);
-        assert_eq!(look(&mut view), [(2, 2), (4, 4)]);
+        assert_eq!(settle(&mut view), [(2, 2), (4, 4)]);
         assert_eq!(view.sampled.unseen_since(), None);
         assert!(!view.see(4).finished, "given after it was left out");
         // A part is nothing, and neither is what a HEARTBEAT says was sent.
@@ -642,8 +655,8 @@ mod tests {
         view.sampled.exist(8, FAR, now, &mut view.sequence);
         // What a GAP says was never sent is not missing.
         view.sampled.skip((9, 200), FAR, now, &mut view.sequence);
-        assert_eq!(look(&mut view), [(6, 8)]);
-        assert_eq!(look(&mut view), []);
+        assert_eq!(settle(&mut view), [(6, 8)]);
+        assert_eq!(settle(&mut view), []);
         assert_eq!(
             (view.see(200).finished, view.see(1000).finished),
             (true, true)
@@ -701,11 +714,11 @@ mod tests {
         assert!(view.part(6, Seen::Whole).finished);
         assert_eq!(view.see(7).samples, 1);
         let now = Timestamp(view.now);
-        let told = view.sampled.exist(3000, REACH, now, &mut view.sequence);
+        let messages = view.sampled.exist(3000, REACH, now, &mut view.sequence);
         let passed = view
             .sampled
             .skip((2000, 3000), REACH, now, &mut view.sequence);
-        assert_eq!((told, passed, view.counts()), (0, 0, (8, 8)));
+        assert_eq!((messages, passed, view.counts()), (0, 0, (8, 8)));
     }
 
     #[test]

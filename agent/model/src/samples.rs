@@ -51,7 +51,7 @@ pub struct Samples {
     /// Of samples that begin earlier, fragments may have been left out.
     sure_from: Timestamp,
     /// The last one that did.
-    last_doubtful: u64,
+    last_uncertain: u64,
 }
 
 /// One unfinished sample.
@@ -106,7 +106,7 @@ impl Samples {
         let Self {
             partial,
             sure_from: _,
-            last_doubtful: _,
+            last_uncertain: _,
         } = self;
         let bitmap = |partial: &Partial| {
             let Partial {
@@ -198,14 +198,14 @@ impl Samples {
     }
 
     /// Of samples that begin before this, the kernel may have left fragments out.
-    pub const fn doubt(&mut self, until: Timestamp) {
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.sure_from = until;
     }
 
     /// Whether this one is under way and may lack fragments that nobody lost.
     #[must_use]
     pub fn is_doubtful(&self, number: u64) -> bool {
-        number <= self.last_doubtful && self.is_partial(number)
+        number <= self.last_uncertain && self.is_partial(number)
     }
 
     /// The oldest sample from `first` on that still gets fragments: it and what follows is not decided
@@ -278,7 +278,7 @@ impl Samples {
         let elapsed = fragments.record().elapsed;
         let began = Timestamp(now.0.saturating_sub(elapsed.into()));
         if began < self.sure_from {
-            self.last_doubtful = self.last_doubtful.max(number);
+            self.last_uncertain = self.last_uncertain.max(number);
         }
         self.partial.push(Partial {
             number,

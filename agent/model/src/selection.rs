@@ -3,12 +3,14 @@
 //! A subscription's choice, matched against topics as they appear. It decides nothing about
 //! measuring beyond that: the watchlist has its own patterns.
 
+use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
 use regex::bytes::{Regex, RegexBuilder};
 
 use super::glob;
 use super::topic::Naming;
+use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
 /// Largest compiled form of one regular expression, in bytes, and as much again while it is matched.
@@ -70,13 +72,13 @@ pub struct Selection {
 
 /// A subscription as the model sees it.
 #[derive(Clone, Debug)]
-pub struct Wish {
+pub struct SampleRequest {
     /// Names the subscription.
     pub id: u64,
     /// Which topics.
     pub selection: Arc<Selection>,
     /// Only of this domain; `None` = every domain.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// How much of them.
     pub depth: Depth,
 }
@@ -177,14 +179,11 @@ impl Selection {
             .count()
     }
 
-    /// Whether this topic is wanted. `kind` as in [`super::snapshot::TopicFacts`]: requests and
-    /// replies of services, and what follows no ROS convention, go by their exact names alone.
+    /// Whether this topic is wanted. Requests and replies of services, and what follows no ROS
+    /// convention, go by their exact names alone.
     #[must_use]
-    pub fn covers(&self, kind: &str, name: &str, dds_name: &str, hidden: bool) -> bool {
-        let is_ros = !matches!(
-            kind,
-            "service_request" | "service_reply" | "discovery" | "dds"
-        );
+    pub fn covers(&self, kind: TopicKind, name: &str, dds_name: &str, hidden: bool) -> bool {
+        let is_ros = kind.is_ros_topic();
         // The ROS name of a request is the service's, which may be a topic's as well.
         let name = if is_ros { name } else { dds_name };
         let shown = self.hidden || !hidden;
@@ -194,10 +193,10 @@ impl Selection {
     }
 }
 
-impl Wish {
+impl SampleRequest {
     /// Whether it is for this topic.
     #[must_use]
-    pub fn covers(&self, domain_id: u32, naming: &Naming) -> bool {
+    pub fn covers(&self, domain_id: DomainId, naming: &Naming) -> bool {
         self.domain_id.is_none_or(|wanted| wanted == domain_id)
             && self
                 .selection
@@ -213,14 +212,14 @@ mod tests {
 
     fn covers(selection: &Selection, dds_name: &str) -> bool {
         let naming = Naming::of(&DdsTopic::parse(dds_name).unwrap());
-        let wish = Wish {
+        let request = SampleRequest {
             id: 1,
             selection: Arc::new(selection.clone()),
-            domain_id: Some(3),
+            domain_id: Some(DomainId(3)),
             depth: Depth::Arrivals,
         };
-        assert!(!wish.covers(4, &naming));
-        wish.covers(3, &naming)
+        assert!(!request.covers(DomainId(4), &naming));
+        request.covers(DomainId(3), &naming)
     }
 
     #[test]

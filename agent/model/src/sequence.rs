@@ -7,15 +7,16 @@
 //! with the number of undecided sequence numbers, up to [`MAX_WINDOW`]. It knows no payloads and no
 //! time but the one it is given.
 
-mod doubt;
+mod unconfirmed;
 
 use std::collections::VecDeque;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::MILLISECOND;
 
 use super::size::Size;
-pub use doubt::Run;
-use doubt::{Doubted, HANDFUL};
+pub use unconfirmed::Run;
+use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
 
 /// Undecided and recently decided sequence numbers remembered at the start.
 const MIN_WINDOW: u64 = 512;
@@ -34,7 +35,7 @@ const REORDERING: i64 = 5_000_000;
 /// Gaps remembered for telling reordering from retransmission.
 const GAPS: usize = 32;
 /// A lower sequence number with a source time newer by this is a new incarnation of the writer.
-const INCARNATION: u64 = 100_000_000;
+const INCARNATION: u64 = 100 * MILLISECOND;
 /// So many consecutive samples below the window are one too, whatever their source time says.
 const STALE: u32 = 1024;
 /// Settling advances in this many steps per window.
@@ -78,23 +79,23 @@ pub struct Sequence {
     last_advance: Timestamp,
     /// Samples that continued this incarnation, up to a handful.
     followed: u8,
-    doubted: Option<Box<Doubted>>,
+    unconfirmed: Option<Box<UnconfirmedRun>>,
     /// Runs, HEARTBEATs, GAPs and ACKNACKs that were doubted.
     jumps: u64,
 }
 
 /// Whether a sample's number is its writer's.
 #[derive(Debug)]
-pub enum Belief {
+pub enum RunMembership {
     /// It belongs to the live run.
     Live,
     /// It counts as a message and moves no other number.
-    Doubted {
+    Unconfirmed {
         /// Nothing of this sample was seen before.
         new: bool,
     },
     /// It continues a run that is believed from here on, with the samples that came before it.
-    Believed(Run),
+    Confirmed(Run),
 }
 
 /// One run of missing numbers, for telling reordering from retransmission.
@@ -122,7 +123,7 @@ pub enum Arrival {
 
 /// How a sample was delivered, for telling a retransmission.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Manner {
+pub enum RepairMode {
     /// The writer never retransmits.
     BestEffort,
     /// The writer retransmits what a reader misses.
@@ -166,17 +167,19 @@ impl Sequence {
             stale: _,
             last_advance: _,
             followed: _,
-            doubted,
+            unconfirmed,
             jumps: _,
         } = self;
         let length = |Bitmap { words }: &Bitmap| words.len();
-        let doubted = doubted.as_ref().map_or(0, |doubted| doubted.len());
+        let unconfirmed = unconfirmed
+            .as_ref()
+            .map_or(0, |unconfirmed| unconfirmed.len());
         [
             Size::new("sequence.received", length(received), WORDS),
             Size::new("sequence.excused", length(excused), WORDS),
             Size::new("sequence.checkpoints", checkpoints.len(), CHECKPOINTS),
             Size::new("sequence.gaps", gaps.len(), GAPS),
-            Size::new("sequence.doubted", doubted, Doubted::CAP),
+            Size::new("sequence.unconfirmed", unconfirmed, UnconfirmedRun::CAP),
         ]
     }
 
@@ -208,7 +211,7 @@ impl Sequence {
     pub fn receive(
         &mut self,
         number: u64,
-        manner: Manner,
+        repair_mode: RepairMode,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
@@ -236,7 +239,7 @@ impl Sequence {
             return Arrival::Duplicate;
         }
         self.received.set(number);
-        let recovered = number >= self.first && self.was_retransmitted(number, manner, now);
+        let recovered = number >= self.first && self.was_retransmitted(number, repair_mode, now);
         Arrival::New {
             recovered,
             newest: false,
@@ -252,23 +255,23 @@ impl Sequence {
         source: Option<Timestamp>,
         reach: u64,
         now: Timestamp,
-    ) -> Belief {
+    ) -> RunMembership {
         if !is_number(number) {
-            return Belief::Live;
+            return RunMembership::Live;
         }
-        if self.doubts(number, source, reach) {
-            let doubted = self.doubted.get_or_insert_default();
-            let (opens, new) = doubted.note(number, now);
+        if self.is_unconfirmed(number, source, reach) {
+            let unconfirmed = self.unconfirmed.get_or_insert_default();
+            let (opens, new) = unconfirmed.note(number, now);
             self.jumps += u64::from(opens);
-            if !doubted.is_believed() {
-                return Belief::Doubted { new };
+            if !unconfirmed.is_confirmed() {
+                return RunMembership::Unconfirmed { new };
             }
-            let mut run = self.believe();
+            let mut run = self.confirm();
             run.numbers.retain(|(known, _)| *known != number);
             if let Some(source) = source {
                 self.sourced(number, source);
             }
-            return Belief::Believed(run);
+            return RunMembership::Confirmed(run);
         }
         if self.stale >= STALE && number < self.floor() {
             self.restart(number);
@@ -280,12 +283,12 @@ impl Sequence {
         if let Some(source) = source {
             self.sourced(number, source);
         }
-        Belief::Live
+        RunMembership::Live
     }
 
     /// Whether a sample of this number and source time does not belong to the live run.
     #[must_use]
-    pub fn doubts(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
+    pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
         if !self.started() || !is_number(number) {
             return false;
         }
@@ -296,25 +299,26 @@ impl Sequence {
             self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
         });
         // A writer that begins anew fills no gaps of the run before.
-        let doubted = self.doubted.as_ref();
-        let continues = || doubted.is_some_and(|doubted| doubted.is_continued(number, self.next));
+        let unconfirmed = self.unconfirmed.as_ref();
+        let continues =
+            || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
         // What came first may have been forged just as well; what lies less far below it is
         // history.
-        let is_young = self.followed < HANDFUL;
+        let is_young = self.followed < CONFIRMATIONS;
         newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
     }
 
     /// Marks a doubted sample as whole. Returns whether that is new.
-    pub fn complete_doubted(&mut self, number: u64) -> bool {
-        let doubted = self.doubted.as_mut();
-        doubted.is_some_and(|doubted| doubted.complete(number))
+    pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
+        let unconfirmed = self.unconfirmed.as_mut();
+        unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
     }
 
     /// Whether a doubted sample came whole.
     #[must_use]
-    pub fn has_doubted(&self, number: u64) -> bool {
-        let doubted = self.doubted.as_ref();
-        doubted.is_some_and(|doubted| doubted.is_whole(number))
+    pub fn has_unconfirmed(&self, number: u64) -> bool {
+        let unconfirmed = self.unconfirmed.as_ref();
+        unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
     }
 
     /// Takes in the samples of a run that is believed.
@@ -342,7 +346,7 @@ impl Sequence {
         }
         self.older += 1;
         // Many that are older: the newest was forged, or the writer's clock was set back.
-        if source >= self.newest_source || self.older >= HANDFUL {
+        if source >= self.newest_source || self.older >= CONFIRMATIONS {
             (self.newest_source, self.newest, self.older) = (source, number, 0);
         }
     }
@@ -418,11 +422,11 @@ impl Sequence {
             return;
         }
         let next = last.saturating_add(1);
-        let (is_believed, run) = self.claim(next, REACH, now);
+        let (is_confirmed, run) = self.claim(next, REACH, now);
         if let Some(run) = run {
             self.accept(&run, now, settled);
         }
-        if !is_believed {
+        if !is_confirmed {
             return;
         }
         if next > self.next {
@@ -440,9 +444,9 @@ impl Sequence {
     /// run that it confirms.
     pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
         let live = self.next;
-        let doubted = self.doubted.as_mut();
-        if doubted.is_some_and(|doubted| doubted.agrees(next, live, now)) {
-            return (true, Some(self.believe()));
+        let unconfirmed = self.unconfirmed.as_mut();
+        if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
+            return (true, Some(self.confirm()));
         }
         let ahead = next.saturating_sub(live);
         if ahead <= reach {
@@ -451,8 +455,8 @@ impl Sequence {
             }
             return (true, None);
         }
-        let doubted = self.doubted.get_or_insert_default();
-        if ahead <= FAR && doubted.is_claimed(next, reach, now) {
+        let unconfirmed = self.unconfirmed.get_or_insert_default();
+        if ahead <= FAR && unconfirmed.is_claimed(next, reach, now) {
             return (true, None);
         }
         self.jumps += 1;
@@ -521,7 +525,9 @@ impl Sequence {
         if ahead > REACH {
             self.jumps += 1;
             if ahead <= MAX_JUMP {
-                self.doubted.get_or_insert_default().pass_over(start, base);
+                self.unconfirmed
+                    .get_or_insert_default()
+                    .pass_over(start, base);
             }
             return;
         }
@@ -614,15 +620,15 @@ impl Sequence {
     }
 
     /// The doubted run is the writer's: the numbers jump there, or begin anew.
-    fn believe(&mut self) -> Run {
-        let doubted = self.doubted.take();
-        let run = doubted.map_or_else(Run::default, |doubted| doubted.into_run());
+    fn confirm(&mut self) -> Run {
+        let unconfirmed = self.unconfirmed.take();
+        let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
         let Some((first, _)) = run.numbers.first() else {
             return run;
         };
         let jump = first.checked_sub(self.next);
         // What was hardly seen before lost nothing that is far from it.
-        let most = match self.followed < HANDFUL {
+        let most = match self.followed < CONFIRMATIONS {
             true => FAR,
             false => MAX_JUMP,
         };
@@ -634,8 +640,8 @@ impl Sequence {
 
     /// The live run went on.
     fn contradict(&mut self) {
-        if let Some(doubted) = &mut self.doubted {
-            doubted.contradict();
+        if let Some(unconfirmed) = &mut self.unconfirmed {
+            unconfirmed.contradict();
         }
     }
 
@@ -693,18 +699,18 @@ impl Sequence {
         });
     }
 
-    fn was_retransmitted(&self, number: u64, manner: Manner, now: Timestamp) -> bool {
+    fn was_retransmitted(&self, number: u64, repair_mode: RepairMode, now: Timestamp) -> bool {
         let gap = self
             .gaps
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
         let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
-        match manner {
-            Manner::BestEffort => false,
+        match repair_mode {
+            RepairMode::BestEffort => false,
             // A gap that was forgotten is an old one.
-            Manner::Reliable => gap.is_none_or(late),
-            Manner::ReliableFragments => gap.is_some_and(late),
+            RepairMode::Reliable => gap.is_none_or(late),
+            RepairMode::ReliableFragments => gap.is_some_and(late),
         }
     }
 

@@ -7,7 +7,7 @@ mod delivery;
 
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 pub use delivery::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts,
@@ -16,6 +16,7 @@ pub use delivery::{
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 use super::histogram::Histogram;
+use super::topic_kind::TopicKind;
 
 /// All facts at `at`. Lists are sorted by their identity.
 #[derive(Clone, Debug, Default)]
@@ -60,7 +61,7 @@ pub struct ParticipantFacts {
     /// Its GUID (entity 000001c1).
     pub guid: Guid,
     /// Domain, when announced or derivable from the discovery port.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// Vendor in words, or the two bytes in hex.
     pub vendor: String,
     /// ROS enclave; `None` means it is no ROS participant.
@@ -99,7 +100,7 @@ pub struct ProcessFacts {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeFacts {
     /// Domain of its participant.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// Fully qualified name, `/robot1/lidar`.
     pub name: String,
     /// Its participant.
@@ -114,14 +115,13 @@ pub struct NodeFacts {
 #[derive(Clone, Debug)]
 pub struct TopicFacts {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name for topics, the DDS name where it follows no ROS convention.
     pub name: String,
     /// DDS name.
     pub dds_name: String,
-    /// What kind of ROS channel: `topic`, `service_request`, `service_reply`, `service_event`,
-    /// `action_feedback`, `action_status`, `discovery`, `dds`.
-    pub kind: &'static str,
+    /// What kind of ROS channel.
+    pub kind: TopicKind,
     /// Hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
     /// Message types announced on it, ROS form, sorted; more than one is a fault.
@@ -151,14 +151,14 @@ pub struct TopicFacts {
     pub vanished: bool,
     /// Pairs of its live writers and readers by how messages pass between them; those that there
     /// are.
-    pub passages: Vec<PassageCount>,
+    pub transports: Vec<TransportCount>,
     /// Its samples are given one by one.
     pub is_read: bool,
 }
 
 /// How messages pass between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Passage {
+pub enum Transport {
     /// By the network, where all of them can be seen.
     Network,
     /// Through Fast DDS's shared memory, which is looked at now and then.
@@ -173,14 +173,14 @@ pub enum Passage {
 
 /// Pairs of writer and reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PassageCount {
+pub struct TransportCount {
     /// How messages pass between them.
-    pub passage: Passage,
+    pub transport: Transport,
     /// How many pairs.
     pub pairs: usize,
 }
 
-impl Passage {
+impl Transport {
     /// All of them.
     pub const ALL: [Self; 5] = [
         Self::Network,
@@ -242,8 +242,8 @@ pub struct EndpointFacts {
     pub first_seen: Timestamp,
     /// What was measured of this writer while its topic was watched.
     pub measurement: Option<Box<Measurement>>,
-    /// How messages pass between it and its counterparts: [`Passage::bit`] of each way.
-    pub passages: u8,
+    /// How messages pass between it and its counterparts: [`Transport::bit`] of each way.
+    pub transports: u8,
 }
 
 /// What was counted while the topic was watched. Counters never go down while the topic lives.
@@ -398,7 +398,7 @@ pub struct WatchFacts {
     /// The name or glob as configured.
     pub pattern: String,
     /// Domain restriction.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// Covered topics with their state; a literal name that does not exist yet is listed with
     /// [`WatchState::NotPublished`].
     pub topics: Vec<WatchedTopicFacts>,
@@ -408,7 +408,7 @@ pub struct WatchFacts {
 #[derive(Clone, Debug)]
 pub struct WatchedTopicFacts {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name.
     pub topic: String,
     /// Where it stands.
@@ -421,7 +421,7 @@ pub struct WatchedTopicFacts {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChurnCount {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// `participant`, `writer`, `reader`, `node`.
     pub entity: &'static str,
     /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.

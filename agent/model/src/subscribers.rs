@@ -12,26 +12,26 @@
 //! What is directed (INFO_DST) at a participant is for nobody else at the same socket. Where the
 //! participant is known and reads nothing of the topic, samples are unmatched and nothing is kept.
 
-mod said;
-mod upkeep;
+mod lifecycle;
+mod submessages;
 
 use ros2probe_wire::record::{Body, Sample, flag};
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use super::acknowledgement::Acknowledgements;
-use super::delivery::{Delivery, Receiver, Scene, Totals, seconds};
+use super::delivery::{Delivery, DeliveryContext, Receiver, Totals, seconds};
 use super::departures::Departures;
 use super::header::PLAUSIBLE;
 use super::journal::Journal;
-use super::receivers::{Around, Matched};
+use super::receivers::{GraphView, Matched};
 use super::reception::Whole;
+use super::route::Route;
+use super::routes::{KnownRoute, Routes};
 use super::samples::Budget;
 use super::size::Size;
 use super::snapshot::{AcknowledgementFacts, Breakdown, Direction};
 use super::topic::{Topic, TopicId};
-use super::way::Way;
-use super::ways::{Known, Ways};
-use upkeep::is_best_effort;
+use lifecycle::is_best_effort;
 
 /// Numbers looked up in a sibling at once.
 const LOOK_BACK: u64 = 4096;
@@ -42,7 +42,7 @@ const ONE_FRAME: u16 = 1472;
 /// All receivers and destinations of one writer.
 #[derive(Debug, Default)]
 pub struct Subscribers {
-    ways: Ways,
+    routes: Routes,
     deliveries: Vec<Delivery>,
     /// Deliveries of multicast ways that lead to nobody known.
     open: usize,
@@ -53,27 +53,27 @@ pub struct Subscribers {
     reassembled: bool,
     /// Some ways are seen at sockets.
     at_socket: bool,
-    /// Of the answers in `ways`.
+    /// Of the answers in `routes`.
     generation: u64,
-    /// See [`Delivery::doubt`].
+    /// See [`Delivery::allow_incomplete`].
     sure_from: Timestamp,
 }
 
 /// What a record was to the deliveries.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Sight {
+pub enum RecordNovelty {
     /// It may have brought something.
     New,
     /// It brought nothing that had not come to the same receiver before, or left for the same
     /// destination.
-    Again,
+    Duplicate,
     /// On a wire, of what is seen at sockets anyway.
-    Covered,
+    SeenAtSocket,
 }
 
 /// Room for the deliveries of all writers.
 #[derive(Clone, Copy, Debug)]
-pub struct Room {
+pub struct DeliveryQuota {
     /// Deliveries.
     pub used: usize,
     /// Cap.
@@ -86,7 +86,7 @@ pub struct Room {
 
 /// What a record changes besides the deliveries of its writer, and what it is seen against.
 #[derive(Debug)]
-pub struct Stage<'a> {
+pub struct WriterContext<'a> {
     /// The time of the record, or of the look at the clock.
     pub now: Timestamp,
     /// The writer.
@@ -100,18 +100,18 @@ pub struct Stage<'a> {
     /// Where losses are told.
     pub journal: &'a mut Journal,
     /// Room for deliveries.
-    pub room: &'a mut Room,
+    pub quota: &'a mut DeliveryQuota,
     /// Who is there.
-    pub around: Around<'a>,
+    pub graph: GraphView<'a>,
 }
 
 impl Subscribers {
     /// Entries, or bytes, and cap of every list; of what deliveries have each, one after the other.
-    /// How many deliveries there may be is in [`Room`].
+    /// How many deliveries there may be is in [`DeliveryQuota`].
     pub fn sizes(&self) -> impl Iterator<Item = Size> {
         // A new list does not compile before it has a place here.
         let Self {
-            ways,
+            routes,
             deliveries,
             open: _,
             totals: _,
@@ -122,7 +122,7 @@ impl Subscribers {
             generation: _,
             sure_from: _,
         } = self;
-        let own = ways.sizes().into_iter().chain(departures.sizes());
+        let own = routes.sizes().into_iter().chain(departures.sizes());
         let own = own.chain(acknowledgements.sizes());
         own.chain(deliveries.iter().flat_map(Delivery::sizes))
     }
@@ -137,15 +137,15 @@ impl Subscribers {
     }
 
     /// Every delivery with the ways that lead to it.
-    pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&Known>)> {
+    pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&KnownRoute>)> {
         self.deliveries.iter().map(|delivery| {
-            let leads_there = |known: &&Known| match delivery.receiver() {
-                Receiver::Way(way) => known.way == way,
+            let leads_there = |known: &&KnownRoute| match delivery.receiver() {
+                Receiver::Route(route) => known.route == route,
                 Receiver::Participant(prefix) => {
-                    known.way.direction == Direction::Received && known.owner == Some(prefix)
+                    known.route.direction == Direction::Received && known.owner == Some(prefix)
                 }
             };
-            (delivery, self.ways.iter().filter(leads_there).collect())
+            (delivery, self.routes.iter().filter(leads_there).collect())
         })
     }
 
@@ -158,7 +158,7 @@ impl Subscribers {
     /// Ways and readers for which there was no room.
     #[must_use]
     pub const fn refused(&self) -> u64 {
-        self.ways.evictions() + self.acknowledgements.refused
+        self.routes.evictions() + self.acknowledgements.refused
     }
 
     /// What the readers acknowledged of `writer`, whose next sample will be `next`.
@@ -172,50 +172,56 @@ impl Subscribers {
     }
 
     /// Takes in a record of the writer, or an ACKNACK for it.
-    pub fn record(&mut self, record: &Record, stage: &mut Stage<'_>) -> Sight {
-        self.refresh(stage);
+    pub fn record(&mut self, record: &Record, context: &mut WriterContext<'_>) -> RecordNovelty {
+        self.refresh(context);
         let body = record.body();
         if let Body::AckNack(acknack) = body {
             self.requested(acknack);
             let is_reader = |topic: &Topic| is_reader(topic, record.reader());
-            if stage.topic().is_some_and(is_reader) {
+            if context.topic().is_some_and(is_reader) {
                 self.acknowledgements.acknack(acknack);
                 self.acknowledged(acknack);
             }
-            return Sight::New;
+            return RecordNovelty::New;
         }
         if record.flags & flag::NOT_REASSEMBLED != 0 {
             if let Body::Sample(sample) = body {
-                self.not_reassembled(sample, stage);
+                self.not_reassembled(sample, context);
             }
-            return Sight::New;
+            return RecordNovelty::New;
         }
         self.reassembled |= record.flags & flag::HOST != 0 && record.datagram_len > ONE_FRAME;
-        let way = Way::of(record);
+        let route = Route::of(record);
         match body {
             Body::Sample(_) => {}
-            Body::Heartbeat(_) | Body::Gap(_) if !way.is_sent() => {}
-            _ => return Sight::New,
+            Body::Heartbeat(_) | Body::Gap(_) if !route.is_sent() => {}
+            _ => return RecordNovelty::New,
         }
         let is_host = record.flags & flag::HOST != 0;
-        if !is_host && self.at_socket && self.ways.is_at_socket(way.place) {
-            return Sight::Covered;
+        if !is_host && self.at_socket && self.routes.is_at_socket(route.destination) {
+            return RecordNovelty::SeenAtSocket;
         }
-        let topic = stage.topic();
-        let mut index = self.ways.place(way, stage.now, &stage.around, topic);
-        if let Some(known) = self.ways.get_mut(index) {
-            known.last_seen = known.last_seen.max(stage.now);
+        let topic = context.topic();
+        let mut index = self
+            .routes
+            .find_or_insert(route, context.now, &context.graph, topic);
+        if let Some(known) = self.routes.get_mut(index) {
+            known.last_seen = known.last_seen.max(context.now);
             if is_host && !known.at_socket {
                 known.at_socket = true;
-                self.uncover(way, stage);
-                index = self.ways.find(&way).unwrap_or(index);
+                self.uncover(route, context);
+                index = self.routes.find(&route).unwrap_or(index);
             }
         }
         let came_again = match body {
-            Body::Sample(sample) if way.is_sent() => self.leave(index, sample, stage),
-            _ => self.arrive(index, record, body, stage),
+            Body::Sample(sample) if route.is_sent() => self.leave(index, sample, context),
+            _ => self.arrive(index, record, body, context),
         };
-        if came_again { Sight::Again } else { Sight::New }
+        if came_again {
+            RecordNovelty::Duplicate
+        } else {
+            RecordNovelty::New
+        }
     }
 
     /// All readers that acknowledge have all samples below this number; `None` if none does.
@@ -230,13 +236,13 @@ impl Subscribers {
     }
 
     /// A sample on its way out.
-    fn leave(&mut self, index: usize, sample: Sample<'_>, stage: &mut Stage<'_>) -> bool {
-        let Some(way) = self.ways.get(index).map(|known| known.way) else {
+    fn leave(&mut self, index: usize, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
+        let Some(route) = self.routes.get(index).map(|known| known.route) else {
             return false;
         };
         self.totals.seen[1] = true;
         let source = sample.source_timestamp().timestamp();
-        let began = stage.around.calendar.shown(sample.record().began());
+        let began = context.graph.wall_clock.wall_time(sample.record().began());
         // One clock: what leaves before its timestamp, or hours after, is no matter of sending.
         if let Some(source) = source.filter(|_| sample.is_start())
             && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
@@ -246,7 +252,7 @@ impl Subscribers {
             let delay = began.nanoseconds_since(source);
             self.breakdown().send_delay.observe(seconds(delay));
         }
-        let Some(place) = self.delivery(index, Receiver::Way(way), stage) else {
+        let Some(place) = self.delivery(index, Receiver::Route(route), context) else {
             return false;
         };
         let Some(delivery) = self.deliveries.get_mut(place) else {
@@ -254,15 +260,16 @@ impl Subscribers {
         };
         let (again, whole) = delivery.sample(
             sample,
-            &mut scene(&mut self.totals, self.reassembled, stage),
+            &mut delivery_context(&mut self.totals, self.reassembled, context),
         );
         if let Some(whole) = whole {
-            self.departures.note(whole.number, way.place, stage.now);
+            self.departures
+                .note(whole.number, route.destination, context.now);
             if !self.totals.seen[0] {
-                self.transfer(&whole, stage.now);
+                self.transfer(&whole, context.now);
             }
         }
-        again && !way.place.is_multicast()
+        again && !route.destination.is_multicast()
     }
 
     fn arrive(
@@ -270,10 +277,10 @@ impl Subscribers {
         index: usize,
         record: &Record,
         body: Body<'_>,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) -> bool {
         self.totals.seen[0] = true;
-        let Some((receiver, matched)) = self.receiver(index, record, stage) else {
+        let Some((receiver, matched)) = self.receiver(index, record, context) else {
             return false;
         };
         if matched == Matched::No {
@@ -291,11 +298,11 @@ impl Subscribers {
             return false;
         }
         match body {
-            Body::Sample(sample) => return self.sample(index, receiver, sample, stage),
+            Body::Sample(sample) => return self.sample(index, receiver, sample, context),
             Body::Heartbeat(heartbeat) => {
-                self.heartbeat(index, (receiver, matched), heartbeat, stage);
+                self.heartbeat(index, (receiver, matched), heartbeat, context);
             }
-            Body::Gap(gap) => self.gap(index, receiver, gap, stage),
+            Body::Gap(gap) => self.gap(index, receiver, gap, context),
             _ => {}
         }
         false
@@ -306,22 +313,22 @@ impl Subscribers {
         &mut self,
         index: usize,
         record: &Record,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) -> Option<(Receiver, Matched)> {
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
-        let (around, topic) = (stage.around, stage.topic());
-        let known = self.ways.get_mut(index)?;
-        let is_multicast = known.way.place.is_multicast();
+        let (graph, topic) = (context.graph, context.topic());
+        let known = self.routes.get_mut(index)?;
+        let is_multicast = known.route.destination.is_multicast();
         if let Some(prefix) = directed.filter(|_| !is_multicast) {
-            if known.way.socket != 0 && known.owner.is_some_and(|owner| owner != prefix) {
+            if known.route.socket != 0 && known.owner.is_some_and(|owner| owner != prefix) {
                 // Whoever lives here passes it over.
                 return None;
             }
-            known.tell(prefix, &around, topic);
+            known.note_directed(prefix, &graph, topic);
             let matched = if known.owner == Some(prefix) {
                 known.matched
             } else {
-                around.matched(topic, prefix)
+                graph.matched(topic, prefix)
             };
             return Some((Receiver::Participant(prefix), matched));
         }
@@ -330,10 +337,10 @@ impl Subscribers {
             (Some(owner), Some(prefix)) => {
                 (owner == prefix).then_some((Receiver::Participant(owner), known.matched))
             }
-            (None, None) => Some((Receiver::Way(known.way), Matched::Unknown)),
+            (None, None) => Some((Receiver::Route(known.route), Matched::Unknown)),
             (None, Some(_)) => {
                 if let Some(sample) = record.sample() {
-                    self.repair(sample, stage);
+                    self.repair(sample, context);
                 }
                 None
             }
@@ -345,21 +352,21 @@ impl Subscribers {
         index: usize,
         receiver: Receiver,
         sample: Sample<'_>,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) -> bool {
         let no_room = sample.record().flags & flag::NO_ROOM != 0;
-        let way = self.ways.get(index).map(|known| known.way);
-        if way.is_some_and(|way| self.is_repair_elsewhere(way, receiver, sample)) {
+        let route = self.routes.get(index).map(|known| known.route);
+        if route.is_some_and(|route| self.is_repair_elsewhere(route, receiver, sample)) {
             return false;
         }
-        let is_open = |receiver| matches!(receiver, Receiver::Way(way) if way.is_open());
+        let is_open = |receiver| matches!(receiver, Receiver::Route(route) if route.is_open());
         if self.open > 0 && !is_open(receiver) {
-            let is_known = !no_room && self.repair(sample, stage);
+            let is_known = !no_room && self.repair(sample, context);
             if (is_known || no_room) && self.find(receiver).is_none() {
                 return false;
             }
         }
-        let Some(place) = self.delivery(index, receiver, stage) else {
+        let Some(place) = self.delivery(index, receiver, context) else {
             return false;
         };
         let Some(delivery) = self.deliveries.get_mut(place) else {
@@ -369,22 +376,22 @@ impl Subscribers {
         if no_room {
             delivery.no_room(
                 sample,
-                &mut scene(&mut self.totals, self.reassembled, stage),
+                &mut delivery_context(&mut self.totals, self.reassembled, context),
             );
             return false;
         }
         let (again, whole) = delivery.sample(
             sample,
-            &mut scene(&mut self.totals, self.reassembled, stage),
+            &mut delivery_context(&mut self.totals, self.reassembled, context),
         );
         if self.open > 0 {
             self.share(place, next, whole.map(|whole| whole.number));
         }
-        if let Some(known) = self.ways.get_mut(index) {
+        if let Some(known) = self.routes.get_mut(index) {
             known.has_data = true;
         }
         if let Some(whole) = whole {
-            self.came(index, place, &whole, stage.now);
+            self.came(index, place, &whole, context.now);
         }
         again
     }
@@ -392,13 +399,13 @@ impl Subscribers {
     /// A sample came whole this way.
     fn came(&mut self, index: usize, place: usize, whole: &Whole, now: Timestamp) {
         self.transfer(whole, now);
-        let Some(known) = self.ways.get_mut(index).filter(|_| !whole.recovered) else {
+        let Some(known) = self.routes.get_mut(index).filter(|_| !whole.recovered) else {
             return;
         };
-        let way = known.way;
+        let route = known.route;
         known.brought += u64::from(whole.newest);
         let brought = known.brought;
-        if let Some(left) = self.departures.find(whole.number, way.place)
+        if let Some(left) = self.departures.find(whole.number, route.destination)
             && now >= left
         {
             let transit = now.nanoseconds_since(left);
@@ -407,17 +414,17 @@ impl Subscribers {
         let Some(delivery) = self.deliveries.get_mut(place) else {
             return;
         };
-        if delivery.main() != way {
-            let main = self.ways.find(&delivery.main());
-            let main = main.and_then(|index| self.ways.get(index));
+        if delivery.main() != route {
+            let main = self.routes.find(&delivery.main());
+            let main = main.and_then(|index| self.routes.get(index));
             if main.is_none_or(|main| main.brought < brought) {
-                delivery.move_to(way);
+                delivery.move_to(route);
             }
         }
     }
 
     /// Fills gaps of those that may be the receiver; whether any of them knows of the sample.
-    fn repair(&mut self, sample: Sample<'_>, stage: &mut Stage<'_>) -> bool {
+    fn repair(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
         let number = sample.sequence_number();
         let mut is_known = false;
         for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
@@ -425,7 +432,7 @@ impl Subscribers {
             if delivery.misses(number) {
                 delivery.sample(
                     sample,
-                    &mut scene(&mut self.totals, self.reassembled, stage),
+                    &mut delivery_context(&mut self.totals, self.reassembled, context),
                 );
             }
         }
@@ -434,11 +441,11 @@ impl Subscribers {
 
     /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come to
     /// a socket of this host as multicast: a repair for another host that got the multicast too.
-    fn is_repair_elsewhere(&self, way: Way, receiver: Receiver, sample: Sample<'_>) -> bool {
-        let is_at_socket = |way: Way| way.is_open() && way.socket != 0;
-        way.socket == 0
+    fn is_repair_elsewhere(&self, route: Route, receiver: Receiver, sample: Sample<'_>) -> bool {
+        let is_at_socket = |route: Route| route.is_open() && route.socket != 0;
+        route.socket == 0
             && self.at_socket
-            && !way.place.is_multicast()
+            && !route.destination.is_multicast()
             && self.find(receiver).is_none()
             && self.deliveries.iter().any(|delivery| {
                 is_at_socket(delivery.main()) && delivery.next() > sample.sequence_number()
@@ -490,9 +497,9 @@ impl Subscribers {
         &mut self,
         index: usize,
         receiver: Receiver,
-        stage: &mut Stage<'_>,
+        context: &mut WriterContext<'_>,
     ) -> Option<usize> {
-        let known = self.ways.get(index)?;
+        let known = self.routes.get(index)?;
         let cached = known.delivery.filter(|place| {
             let delivery = self.deliveries.get(*place);
             delivery.is_some_and(|delivery| delivery.receiver() == receiver)
@@ -500,25 +507,25 @@ impl Subscribers {
         if cached.is_some() {
             return cached;
         }
-        let way = known.way;
+        let route = known.route;
         let place = match self.find(receiver) {
             Some(place) => place,
-            None if stage.room.used >= stage.room.limit => {
-                stage.room.evictions += 1;
-                stage.room.wanted = true;
+            None if context.quota.used >= context.quota.limit => {
+                context.quota.evictions += 1;
+                context.quota.wanted = true;
                 return None;
             }
             None => {
-                stage.room.used += 1;
-                let mut delivery = Delivery::new(receiver, way, stage.now);
-                delivery.learn(is_best_effort(receiver, stage));
-                delivery.doubt(self.sure_from);
+                context.quota.used += 1;
+                let mut delivery = Delivery::new(receiver, route, context.now);
+                delivery.learn(is_best_effort(receiver, context));
+                delivery.allow_incomplete(self.sure_from);
                 self.deliveries.push(delivery);
                 self.count_open();
                 self.deliveries.len() - 1
             }
         };
-        if let Some(known) = self.ways.get_mut(index) {
+        if let Some(known) = self.routes.get_mut(index) {
             known.delivery = Some(place);
         }
         Some(place)
@@ -540,30 +547,34 @@ impl Subscribers {
     }
 }
 
-impl<'a> Stage<'a> {
+impl<'a> WriterContext<'a> {
     fn topic(&self) -> Option<&'a Topic> {
-        self.around.topics.get(self.topic?)
+        self.graph.topics.get(self.topic?)
     }
 }
 
 fn is_open(delivery: &Delivery) -> bool {
-    matches!(delivery.receiver(), Receiver::Way(way) if way.is_open())
+    matches!(delivery.receiver(), Receiver::Route(route) if route.is_open())
 }
 
 fn is_reader(topic: &Topic, guid: Guid) -> bool {
-    [&topic.readers, &topic.beside]
+    [&topic.readers, &topic.buffer_endpoints]
         .iter()
         .any(|list| list.binary_search(&guid).is_ok())
 }
 
-fn scene<'a>(totals: &'a mut Totals, reassembled: bool, stage: &'a mut Stage<'_>) -> Scene<'a> {
-    Scene {
-        now: stage.now,
-        writer: stage.writer,
-        reliable: stage.reliable,
+fn delivery_context<'a>(
+    totals: &'a mut Totals,
+    reassembled: bool,
+    context: &'a mut WriterContext<'_>,
+) -> DeliveryContext<'a> {
+    DeliveryContext {
+        now: context.now,
+        writer: context.writer,
+        reliable: context.reliable,
         reassembled,
-        budget: stage.budget,
-        journal: stage.journal,
+        budget: context.budget,
+        journal: context.journal,
         totals,
     }
 }

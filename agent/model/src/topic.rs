@@ -8,14 +8,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::names::{ActionPart, DdsTopic, RosName, TopicKind};
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
-use super::selection::{Depth, Wish};
+use super::selection::{Depth, SampleRequest};
 use super::size::Size;
 use super::snapshot::Measurement;
+use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
 /// Handle of a topic.
@@ -29,12 +30,12 @@ pub struct Naming {
     pub dds_name: Arc<str>,
     /// ROS name, or the DDS name.
     pub name: Arc<str>,
-    /// Label of what it is.
-    pub kind: &'static str,
+    /// What it is.
+    pub kind: TopicKind,
     /// Hidden by ROS convention.
     pub hidden: bool,
     /// The endpoint serves the topic from beside it, and is not one of its publishers.
-    pub beside: bool,
+    pub is_buffer: bool,
     /// Its samples are messages.
     pub counts: bool,
 }
@@ -52,7 +53,7 @@ pub enum Watched {
 
 /// Wishes for the samples of one topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Wished {
+pub struct RequestIds {
     /// Whose.
     pub ids: Arc<[u64]>,
     /// Those of them that want the bytes.
@@ -63,7 +64,7 @@ pub struct Wished {
 #[derive(Debug)]
 pub struct Topic {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// Names.
     pub naming: Naming,
     /// Live writers.
@@ -71,7 +72,7 @@ pub struct Topic {
     /// Live readers.
     pub readers: Vec<Guid>,
     /// Writers and readers beside it.
-    pub beside: Vec<Guid>,
+    pub buffer_endpoints: Vec<Guid>,
     /// Type of the endpoint that came last, for when none is left.
     pub last_type: Option<Arc<str>>,
     /// Whether it is measured.
@@ -79,7 +80,7 @@ pub struct Topic {
     /// Watchlist entries that cover it, and how it stands with them.
     pub judgements: Vec<(usize, Judgement)>,
     /// Who wants its samples; `None` = nobody.
-    pub wished: Option<Wished>,
+    pub requested: Option<RequestIds>,
     /// What writers had counted that are measured no more.
     pub retired: Option<Box<Measurement>>,
     /// What had become of their samples.
@@ -98,7 +99,7 @@ pub struct Topic {
 #[derive(Debug, Default)]
 pub struct Topics {
     topics: HashMap<TopicId, Box<Topic>>,
-    index: BTreeMap<(u32, Arc<str>), TopicId>,
+    index: BTreeMap<(DomainId, Arc<str>), TopicId>,
     /// Those without endpoints, by the time when the last one went.
     vanished: BTreeSet<(Timestamp, TopicId)>,
     /// Those of them that hold a measuring place.
@@ -117,40 +118,40 @@ impl Naming {
     /// Of a DDS topic.
     #[must_use]
     pub fn of(topic: &DdsTopic) -> Self {
-        let kind = topic.kind();
-        let (beside, counts) = match kind {
-            TopicKind::CpuBuffer(_) => (true, true),
-            TopicKind::Buffer(_) => (true, false),
+        let demangled = topic.demangle();
+        let kind = TopicKind::of_demangled(&demangled);
+        let (is_buffer, counts) = match demangled {
+            Demangled::CpuBuffer(_) => (true, true),
+            Demangled::Buffer(_) => (true, false),
             _ => (false, true),
         };
-        let named = |name: &RosName, kind: &'static str, dds_name: &DdsTopic| Self {
+        let named = |name: &RosName, dds_name: &DdsTopic| Self {
             dds_name: dds_name.as_str().into(),
             name: name.as_str().into(),
             kind,
             hidden: name.is_hidden(),
-            beside,
+            is_buffer,
             counts,
         };
-        match &kind {
-            TopicKind::Topic(name) => named(name, topic_label(name), topic),
-            TopicKind::CpuBuffer(name) | TopicKind::Buffer(name) => {
-                named(name, topic_label(name), &DdsTopic::of_topic(name))
+        match &demangled {
+            Demangled::CpuBuffer(name) | Demangled::Buffer(name) => {
+                named(name, &DdsTopic::of_topic(name))
             }
-            TopicKind::ServiceRequest(name) => named(name, "service_request", topic),
-            TopicKind::ServiceReply(name) => named(name, "service_reply", topic),
-            TopicKind::RosDiscovery => Self::verbatim(topic, "discovery"),
-            TopicKind::NotRos => Self::verbatim(topic, "dds"),
+            Demangled::Topic(name)
+            | Demangled::ServiceRequest(name)
+            | Demangled::ServiceReply(name) => named(name, topic),
+            Demangled::RosDiscovery | Demangled::NotRos => Self::verbatim(topic, kind),
         }
     }
 
-    fn verbatim(topic: &DdsTopic, kind: &'static str) -> Self {
+    fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
         let name: Arc<str> = topic.as_str().into();
         Self {
             dds_name: Arc::clone(&name),
             name,
             kind,
             hidden: false,
-            beside: false,
+            is_buffer: false,
             counts: true,
         }
     }
@@ -158,9 +159,9 @@ impl Naming {
     /// Watchlist entries that cover it. Entries are about topics: services are covered only by
     /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
     /// `/**` is every topic that `ros2 topic list` shows.
-    fn covered_by(&self, domain_id: u32, watchlist: &Watchlist) -> Vec<usize> {
+    fn covered_by(&self, domain_id: DomainId, watchlist: &Watchlist) -> Vec<usize> {
         let mut covering = watchlist.matching(domain_id, self.watched_as());
-        if self.hidden && !self.is_service() {
+        if self.hidden && !self.kind.is_service() {
             let names_hidden = |index: &usize| {
                 watchlist
                     .watches()
@@ -173,17 +174,13 @@ impl Naming {
     }
 
     /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
-    pub(super) fn is_named_by(&self, domain_id: Option<u32>, watchlist: &Watchlist) -> bool {
+    pub(super) fn is_named_by(&self, domain_id: Option<DomainId>, watchlist: &Watchlist) -> bool {
         watchlist.names(domain_id, self.watched_as())
-    }
-
-    fn is_service(&self) -> bool {
-        matches!(self.kind, "service_request" | "service_reply")
     }
 
     /// The name that watches are about.
     fn watched_as(&self) -> &str {
-        if self.is_service() {
+        if self.kind.is_service() {
             &self.dds_name
         } else {
             &self.name
@@ -191,26 +188,25 @@ impl Naming {
     }
 
     /// Who wants its samples.
-    fn wished_by(&self, domain_id: u32, wishes: &[Wish]) -> Option<Wished> {
-        let covering = wishes.iter().filter(|wish| wish.covers(domain_id, self));
+    fn requested_by(
+        &self,
+        domain_id: DomainId,
+        sample_requests: &[SampleRequest],
+    ) -> Option<RequestIds> {
+        let covering = sample_requests
+            .iter()
+            .filter(|request| request.covers(domain_id, self));
         let covering: Vec<_> = covering.collect();
         let of_depth = |depth| {
-            let deep = covering.iter().filter(move |wish| wish.depth >= depth);
-            deep.map(|wish| wish.id).collect()
+            let deep = covering
+                .iter()
+                .filter(move |request| request.depth >= depth);
+            deep.map(|request| request.id).collect()
         };
-        (!covering.is_empty()).then(|| Wished {
+        (!covering.is_empty()).then(|| RequestIds {
             ids: of_depth(Depth::Arrivals),
             payloads: of_depth(Depth::Payloads),
         })
-    }
-}
-
-fn topic_label(name: &RosName) -> &'static str {
-    match name.action() {
-        Some((_, ActionPart::Feedback)) => "action_feedback",
-        Some((_, ActionPart::Status)) => "action_status",
-        _ if name.service_of_events().is_some() => "service_event",
-        _ => "topic",
     }
 }
 
@@ -247,7 +243,7 @@ impl Topics {
 
     /// The topic of this DDS name, or of the topic it stands beside.
     #[must_use]
-    pub fn find(&self, domain_id: u32, naming: &Naming) -> Option<TopicId> {
+    pub fn find(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicId> {
         self.index
             .get(&(domain_id, Arc::clone(&naming.dds_name)))
             .copied()
@@ -287,18 +283,18 @@ impl Topics {
                 naming: _,
                 writers,
                 readers,
-                beside,
+                buffer_endpoints,
                 last_type: _,
                 watched: _,
                 judgements,
-                wished: _,
+                requested: _,
                 retired: _,
                 retired_totals: _,
                 reader_appeared: _,
                 published: _,
                 vanished: _,
             } = topic;
-            let members = writers.len() + readers.len() + beside.len();
+            let members = writers.len() + readers.len() + buffer_endpoints.len();
             (members, judgements.len())
         };
         let each = || topics.values().map(|topic| lists(topic));
@@ -337,7 +333,7 @@ impl Topics {
     /// Adds an endpoint; gives its topic and whether the topic is new.
     pub fn join(
         &mut self,
-        domain_id: u32,
+        domain_id: DomainId,
         naming: &Naming,
         guid: Guid,
         role: Role,
@@ -353,7 +349,7 @@ impl Topics {
                 self.vanished_watched.remove(&(at, id));
             }
             let list = match role {
-                _ if naming.beside => &mut topic.beside,
+                _ if naming.is_buffer => &mut topic.buffer_endpoints,
                 Role::Writer => &mut topic.writers,
                 Role::Reader => &mut topic.readers,
             };
@@ -374,11 +370,16 @@ impl Topics {
         let Some(topic) = self.topics.get_mut(&id) else {
             return;
         };
-        for list in [&mut topic.writers, &mut topic.readers, &mut topic.beside] {
+        for list in [
+            &mut topic.writers,
+            &mut topic.readers,
+            &mut topic.buffer_endpoints,
+        ] {
             list.retain(|each| *each != guid);
         }
-        let is_empty =
-            topic.writers.is_empty() && topic.readers.is_empty() && topic.beside.is_empty();
+        let is_empty = topic.writers.is_empty()
+            && topic.readers.is_empty()
+            && topic.buffer_endpoints.is_empty();
         if is_empty && topic.vanished.is_none() {
             topic.vanished = Some(now);
             self.vanished.insert((now, id));
@@ -401,21 +402,21 @@ impl Topics {
 
     /// Asks the watchlist and the wishes about one topic, within the cap. One that is watched by its
     /// exact name takes the place of the latest of the others, which is returned.
-    pub fn consult(
+    pub fn apply_lists(
         &mut self,
         id: TopicId,
         watchlist: &Watchlist,
-        wishes: &[Wish],
+        sample_requests: &[SampleRequest],
         cap: usize,
         now: Timestamp,
     ) -> Option<TopicId> {
         let topic = self.topics.get(&id)?;
         let is_named = topic.naming.is_named_by(Some(topic.domain_id), watchlist);
         let covering = topic.naming.covered_by(topic.domain_id, watchlist);
-        let wished = topic.naming.wished_by(topic.domain_id, wishes);
+        let requested = topic.naming.requested_by(topic.domain_id, sample_requests);
         let before = topic.watched;
         let mut displaced = None;
-        let after = if covering.is_empty() && wished.is_none() {
+        let after = if covering.is_empty() && requested.is_none() {
             Watched::No
         } else if before == Watched::Yes
             || self.watched < cap
@@ -440,7 +441,7 @@ impl Topics {
             topic.retired.get_or_insert_default();
         }
         topic.watched = after;
-        topic.wished = wished.filter(|_| after == Watched::Yes);
+        topic.requested = requested.filter(|_| after == Watched::Yes);
         if let Some(at) = topic.vanished {
             match after {
                 Watched::Yes => self.vanished_watched.insert((at, id)),
@@ -495,7 +496,7 @@ impl Topics {
         }
     }
 
-    fn create(&mut self, domain_id: u32, naming: &Naming) -> TopicId {
+    fn create(&mut self, domain_id: DomainId, naming: &Naming) -> TopicId {
         self.created += 1;
         let id = TopicId(self.created);
         self.index
@@ -505,17 +506,17 @@ impl Topics {
             Box::new(Topic {
                 domain_id,
                 naming: Naming {
-                    beside: false,
+                    is_buffer: false,
                     counts: true,
                     ..naming.clone()
                 },
                 writers: Vec::new(),
                 readers: Vec::new(),
-                beside: Vec::new(),
+                buffer_endpoints: Vec::new(),
                 last_type: None,
                 watched: Watched::No,
                 judgements: Vec::new(),
-                wished: None,
+                requested: None,
                 retired: None,
                 retired_totals: None,
                 reader_appeared: Timestamp(0),
@@ -545,7 +546,7 @@ impl Topics {
     fn displace(&mut self) -> Option<TopicId> {
         let id = self.yielding.pop_last()?;
         let topic = self.topics.get_mut(&id)?;
-        (topic.watched, topic.wished) = (Watched::Rejected, None);
+        (topic.watched, topic.requested) = (Watched::Rejected, None);
         topic.judgements.clear();
         self.watched -= 1;
         self.rejected += 1;
@@ -594,36 +595,53 @@ mod tests {
     fn the_same_name_in_two_domains_is_two_topics() {
         let mut topics = Topics::default();
         let naming = naming("rt/chatter");
-        let (one, _) = topics.join(0, &naming, guid(1), Role::Writer, Timestamp(1));
-        let (two, _) = topics.join(5, &naming, guid(2), Role::Writer, Timestamp(1));
+        let (one, _) = topics.join(DomainId(0), &naming, guid(1), Role::Writer, Timestamp(1));
+        let (two, _) = topics.join(DomainId(5), &naming, guid(2), Role::Writer, Timestamp(1));
         assert_ne!(one, two);
     }
 
     #[test]
     fn everything_means_what_topic_list_shows() {
         let all = watchlist(&["/**"]);
-        assert_eq!(naming("rt/points").covered_by(0, &all), [0]);
+        assert_eq!(naming("rt/points").covered_by(DomainId(0), &all), [0]);
         assert!(
             naming("rt/fib/_action/feedback")
-                .covered_by(0, &all)
+                .covered_by(DomainId(0), &all)
                 .is_empty()
         );
-        assert!(naming("rq/addRequest").covered_by(0, &all).is_empty());
-        assert!(naming("ros_discovery_info").covered_by(0, &all).is_empty());
+        assert!(
+            naming("rq/addRequest")
+                .covered_by(DomainId(0), &all)
+                .is_empty()
+        );
+        assert!(
+            naming("ros_discovery_info")
+                .covered_by(DomainId(0), &all)
+                .is_empty()
+        );
         let hidden = watchlist(&["/**/_action/feedback", "/fib/_action/status"]);
         assert_eq!(
-            naming("rt/fib/_action/feedback").covered_by(0, &hidden),
+            naming("rt/fib/_action/feedback").covered_by(DomainId(0), &hidden),
             [0]
         );
-        assert_eq!(naming("rt/fib/_action/status").covered_by(0, &hidden), [1]);
+        assert_eq!(
+            naming("rt/fib/_action/status").covered_by(DomainId(0), &hidden),
+            [1]
+        );
     }
 
     #[test]
     fn cpu_buffers_belong_to_the_topic_beside_them() {
         let mut topics = Topics::default();
-        let (main, _) = topics.join(0, &naming("rt/image"), guid(1), Role::Writer, Timestamp(1));
-        let beside = naming("rt/image/_buf_cpu");
-        let (same, _) = topics.join(0, &beside, guid(2), Role::Writer, Timestamp(1));
+        let (main, _) = topics.join(
+            DomainId(0),
+            &naming("rt/image"),
+            guid(1),
+            Role::Writer,
+            Timestamp(1),
+        );
+        let buffer = naming("rt/image/_buf_cpu");
+        let (same, _) = topics.join(DomainId(0), &buffer, guid(2), Role::Writer, Timestamp(1));
         assert_eq!(main, same);
         assert_eq!(topics.get(main).unwrap().writers, [guid(1)]);
     }
@@ -634,14 +652,20 @@ mod tests {
         let all = watchlist(&["/**"]);
         let mut ids = Vec::new();
         for name in ["rt/a", "rt/b", "rt/c"] {
-            let (id, _) = topics.join(0, &naming(name), guid(1), Role::Writer, Timestamp(1));
-            topics.consult(id, &all, &[], 2, Timestamp(1));
+            let (id, _) = topics.join(
+                DomainId(0),
+                &naming(name),
+                guid(1),
+                Role::Writer,
+                Timestamp(1),
+            );
+            topics.apply_lists(id, &all, &[], 2, Timestamp(1));
             ids.push(id);
         }
         let state = |topics: &Topics, index: usize| topics.get(ids[index]).unwrap().watched;
         assert_eq!((state(&topics, 2), topics.rejected), (Watched::Rejected, 1));
         topics.leave(ids[0], guid(1), Timestamp(2));
-        topics.consult(ids[2], &all, &[], 2, Timestamp(3));
+        topics.apply_lists(ids[2], &all, &[], 2, Timestamp(3));
         assert_eq!((state(&topics, 2), topics.watched()), (Watched::Yes, 2));
         assert!(topics.get(ids[0]).is_none());
     }
@@ -649,7 +673,13 @@ mod tests {
     #[test]
     fn a_vanished_topic_stays_for_its_grace_period() {
         let mut topics = Topics::default();
-        let (id, _) = topics.join(0, &naming("rt/a"), guid(1), Role::Writer, Timestamp(1));
+        let (id, _) = topics.join(
+            DomainId(0),
+            &naming("rt/a"),
+            guid(1),
+            Role::Writer,
+            Timestamp(1),
+        );
         topics.leave(id, guid(1), Timestamp(100));
         topics.expire(Timestamp(599), 500);
         assert!(topics.get(id).unwrap().is_vanished());

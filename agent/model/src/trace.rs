@@ -11,12 +11,13 @@ use std::sync::Arc;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
-use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
+use ros2probe_wire::time::{MILLISECOND, SECOND};
+use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
+use super::route::Destination;
 use super::samples::{Budget, Progress, Samples};
 use super::size::{Size, largest};
-use super::way::Place;
 
 /// Writers whose messages may be sampled.
 const MAX_WRITERS: usize = 4096;
@@ -34,9 +35,9 @@ const MAX_FINISHED: usize = 2048;
 /// For bitmaps of fragments.
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements that come later are of no interest.
-const PATIENCE: u64 = 10_000_000_000;
+const PATIENCE: u64 = 10 * SECOND;
 /// What arrives may turn out to be a copy of what is sent from here.
-const DOUBT: u64 = 500_000_000;
+const LOCAL_COPY_DELAY: u64 = 500 * MILLISECOND;
 /// The loopback interface, in every network namespace.
 const LOOPBACK: u32 = 1;
 /// The part of a trace's identity that decides, as in OpenTelemetry's samplers.
@@ -44,7 +45,7 @@ const RANDOM: u64 = (1 << 56) - 1;
 
 /// What a span tells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stage {
+pub enum SpanStage {
     /// Leaving this host, or on the wire where that is not told apart: first to last fragment. A
     /// gateway that looks at its wire sees what it forwards leaving, too.
     Send,
@@ -58,7 +59,7 @@ pub enum Stage {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Span {
     /// What it tells.
-    pub stage: Stage,
+    pub stage: SpanStage,
     /// Of which message.
     pub message: Message,
     /// Begin.
@@ -77,7 +78,7 @@ pub struct Message {
     /// Out of both.
     pub trace_id: u128,
     /// On which topic.
-    pub subject: Arc<Subject>,
+    pub description: Arc<WriterDescription>,
     /// The writer's own time.
     pub source: RtpsTime,
     /// Size of the payload in bytes.
@@ -85,14 +86,14 @@ pub struct Message {
     /// In so many fragments; 1 for a whole one.
     pub fragments: u32,
     /// Where its first datagram went.
-    pub destination: Place,
+    pub destination: Destination,
 }
 
 /// What all messages of a writer have in common.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Subject {
+pub struct WriterDescription {
     /// Domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// ROS name.
     pub topic: Arc<str>,
     /// Type.
@@ -116,13 +117,13 @@ pub struct Tracer {
     wanted: bool,
     directed: bool,
     /// `None` = none of its messages is wanted.
-    writers: HashMap<Guid, Option<Box<Traced>>>,
-    ledger: Ledger,
+    writers: HashMap<Guid, Option<Box<WriterTrace>>>,
+    shared: Shared,
 }
 
 /// What all writers draw on.
 #[derive(Debug)]
-struct Ledger {
+struct Shared {
     budget: Budget,
     open: usize,
     evictions: u64,
@@ -131,8 +132,8 @@ struct Ledger {
 
 /// One writer some of whose messages are wanted.
 #[derive(Debug)]
-struct Traced {
-    subject: Arc<Subject>,
+struct WriterTrace {
+    description: Arc<WriterDescription>,
     /// Of its messages, before their numbers.
     identity: Identity,
     threshold: u64,
@@ -143,13 +144,13 @@ struct Traced {
     under_way: VecDeque<Message>,
     /// Spans of messages that arrived, until it is sure that they were not sent from here.
     arrived: VecDeque<Span>,
-    waiting: VecDeque<Waiting>,
+    waiting: VecDeque<Unacknowledged>,
     done: VecDeque<u64>,
 }
 
 /// A message that was sent and not acknowledged by everybody.
 #[derive(Debug)]
-struct Waiting {
+struct Unacknowledged {
     message: Message,
     at: Timestamp,
     readers: Vec<Guid>,
@@ -164,7 +165,7 @@ impl Tracer {
             wanted: false,
             directed,
             writers: HashMap::new(),
-            ledger: Ledger {
+            shared: Shared {
                 budget: Budget::new(BITMAP_BYTES),
                 open: 0,
                 evictions: 0,
@@ -183,42 +184,46 @@ impl Tracer {
     pub fn restart(&mut self, wanted: bool) {
         self.wanted = wanted;
         self.writers = HashMap::new();
-        self.ledger.budget = Budget::new(BITMAP_BYTES);
-        self.ledger.open = 0;
+        self.shared.budget = Budget::new(BITMAP_BYTES);
+        self.shared.open = 0;
     }
 
     /// A writer has gone.
     pub fn forget(&mut self, writer: Guid) {
         if let Some(Some(traced)) = self.writers.remove(&writer) {
-            traced.close(&mut self.ledger);
+            traced.close(&mut self.shared);
         }
     }
 
     /// Takes in a record. `about` says of a writer that was not heard before what it writes and
     /// which part of it is wanted; `None` = not known yet.
-    pub fn record(&mut self, record: &Record, about: impl FnOnce() -> Option<(Subject, f64)>) {
+    pub fn record(
+        &mut self,
+        record: &Record,
+        about: impl FnOnce() -> Option<(WriterDescription, f64)>,
+    ) {
         const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
         let writer = record.writer();
         if !self.writers.contains_key(&writer) {
-            let Some((subject, ratio)) = about() else {
+            let Some((description, ratio)) = about() else {
                 return;
             };
             if self.writers.len() >= MAX_WRITERS {
-                self.ledger.evictions += 1;
+                self.shared.evictions += 1;
                 return;
             }
-            let traced = Traced::new(writer, subject, ratio).map(Box::new);
+            let traced = WriterTrace::new(writer, description, ratio).map(Box::new);
             self.writers.insert(writer, traced);
         }
         let Some(Some(traced)) = self.writers.get_mut(&writer) else {
             return;
         };
         match record.body() {
-            Body::AckNack(acknack) => traced.acknowledged(acknack, &mut self.ledger),
+            Body::AckNack(acknack) => traced.acknowledged(acknack, &mut self.shared),
             Body::Sample(sample)
                 if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
             {
-                traced.sample(sample, self.directed, &mut self.ledger);
+                traced.sample(sample, self.directed, &mut self.shared);
             }
             _ => {}
         }
@@ -227,19 +232,19 @@ impl Tracer {
     /// Waits for no acknowledgement that is long overdue.
     pub fn advance(&mut self, now: Timestamp) {
         for traced in self.writers.values_mut().flatten() {
-            traced.release(now, &mut self.ledger);
+            traced.release(now, &mut self.shared);
             while let Some(first) = traced.waiting.front()
                 && now.0.saturating_sub(first.at.0) > PATIENCE
             {
                 traced.waiting.pop_front();
-                self.ledger.open = self.ledger.open.saturating_sub(1);
+                self.shared.open = self.shared.open.saturating_sub(1);
             }
         }
     }
 
     /// What was finished since the last call.
     pub fn take(&mut self) -> Spans {
-        std::mem::take(&mut self.ledger.finished)
+        std::mem::take(&mut self.shared.finished)
     }
 
     /// Entries, or bytes, and cap of every table.
@@ -250,14 +255,14 @@ impl Tracer {
             wanted: _,
             directed: _,
             writers,
-            ledger,
+            shared,
         } = self;
-        let Ledger {
+        let Shared {
             budget,
             open,
             evictions: _,
             finished,
-        } = ledger;
+        } = shared;
         let Spans { spans, lost: _ } = finished;
         let mut sizes = largest(writers.values().flatten().flat_map(|each| each.sizes()));
         sizes.extend([
@@ -272,7 +277,7 @@ impl Tracer {
     /// Messages under way or waiting, their cap, and those given up for it.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
-        (self.ledger.open, MAX_OPEN, self.ledger.evictions)
+        (self.shared.open, MAX_OPEN, self.shared.evictions)
     }
 }
 
@@ -295,11 +300,11 @@ fn numbered(mut identity: Identity, sequence_number: u64) -> u128 {
     identity.bits()
 }
 
-impl Traced {
+impl WriterTrace {
     fn sizes(&self) -> impl Iterator<Item = Size> {
         // A new list does not compile before it has a place here.
         let Self {
-            subject: _,
+            description: _,
             identity: _,
             threshold: _,
             samples,
@@ -309,8 +314,8 @@ impl Traced {
             waiting,
             done,
         } = self;
-        let readers = |each: &Waiting| {
-            let Waiting {
+        let readers = |each: &Unacknowledged| {
+            let Unacknowledged {
                 message: _,
                 at: _,
                 readers,
@@ -332,7 +337,7 @@ impl Traced {
     }
 
     /// `None`: nothing of it is wanted.
-    fn new(writer: Guid, subject: Subject, ratio: f64) -> Option<Self> {
+    fn new(writer: Guid, description: WriterDescription, ratio: f64) -> Option<Self> {
         if ratio.is_nan() || ratio <= 0.0 {
             return None;
         }
@@ -344,7 +349,7 @@ impl Traced {
         )]
         let threshold = ((1.0 - ratio.min(1.0)) * RANDOM as f64) as u64;
         Some(Self {
-            subject: Arc::new(subject),
+            description: Arc::new(description),
             identity: of_writer(writer),
             threshold,
             samples: Samples::default(),
@@ -356,7 +361,7 @@ impl Traced {
         })
     }
 
-    fn sample(&mut self, sample: Sample<'_>, directed: bool, ledger: &mut Ledger) {
+    fn sample(&mut self, sample: Sample<'_>, directed: bool, shared: &mut Shared) {
         let (record, number) = (sample.record(), sample.sequence_number());
         let trace_id = numbered(self.identity, number);
         if (trace_id as u64 & RANDOM) < self.threshold {
@@ -367,7 +372,7 @@ impl Traced {
             || !directed
             || on_wire && record.interface == LOOPBACK;
         if leaves && !self.is_local {
-            self.forget_arrivals(ledger);
+            self.forget_arrivals(shared);
         }
         // Copies that arrive are no part of how it left.
         if leaves != self.is_local || self.done.contains(&number) {
@@ -376,7 +381,7 @@ impl Traced {
         let known = |message: &Message| message.sequence_number == number;
         let index = match self.under_way.iter().position(known) {
             Some(index) => index,
-            None => match self.begin(self.message(sample, trace_id), ledger) {
+            None => match self.begin(self.message(sample, trace_id), shared) {
                 Some(index) => index,
                 None => return,
             },
@@ -385,12 +390,12 @@ impl Traced {
         let (begin, source) = match sample {
             Sample::Data(_) => (record.began(), sample.source_timestamp()),
             Sample::DataFrag(fragments) => {
-                match self.samples.fragment(fragments, at, &mut ledger.budget) {
+                match self.samples.fragment(fragments, at, &mut shared.budget) {
                     Progress::Partial | Progress::Duplicate => return,
                     Progress::Complete(facts) => (facts.began, facts.source),
                     Progress::Rejected | Progress::TooMany => {
                         self.under_way.remove(index);
-                        ledger.give_up();
+                        shared.give_up();
                         return;
                     }
                 }
@@ -404,35 +409,35 @@ impl Traced {
             self.done.pop_front();
         }
         self.done.push_back(number);
-        self.whole(message, begin, at, ledger);
+        self.whole(message, begin, at, shared);
     }
 
     /// A message has been seen whole.
-    fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, ledger: &mut Ledger) {
+    fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, shared: &mut Shared) {
         if self.waiting.len() + self.arrived.len() >= MAX_OPEN_OF_WRITER {
             self.arrived
                 .pop_front()
                 .map_or_else(|| drop(self.waiting.pop_front()), drop);
-            ledger.give_up();
+            shared.give_up();
         }
         let mut span = Span {
-            stage: Stage::Receive,
+            stage: SpanStage::Receive,
             message,
             begin,
             end: at,
         };
         if !self.is_local {
             self.arrived.push_back(span);
-            return self.release(at, ledger);
+            return self.release(at, shared);
         }
-        span.stage = Stage::Send;
+        span.stage = SpanStage::Send;
         let message = span.message.clone();
-        ledger.finish(span);
-        if !self.subject.reliable {
-            ledger.open = ledger.open.saturating_sub(1);
+        shared.finish(span);
+        if !self.description.reliable {
+            shared.open = shared.open.saturating_sub(1);
             return;
         }
-        self.waiting.push_back(Waiting {
+        self.waiting.push_back(Unacknowledged {
             message,
             at,
             readers: Vec::new(),
@@ -440,41 +445,41 @@ impl Traced {
     }
 
     /// Tells of what arrived so long ago that it was not sent from here.
-    fn release(&mut self, now: Timestamp, ledger: &mut Ledger) {
+    fn release(&mut self, now: Timestamp, shared: &mut Shared) {
         while let Some(first) = self.arrived.front()
-            && now.0.saturating_sub(first.end.0) > DOUBT
+            && now.0.saturating_sub(first.end.0) > LOCAL_COPY_DELAY
             && let Some(span) = self.arrived.pop_front()
         {
-            ledger.open = ledger.open.saturating_sub(1);
-            ledger.finish(span);
+            shared.open = shared.open.saturating_sub(1);
+            shared.finish(span);
         }
     }
 
     /// It turns out to send from here.
-    fn forget_arrivals(&mut self, ledger: &mut Ledger) {
+    fn forget_arrivals(&mut self, shared: &mut Shared) {
         self.is_local = true;
         let open = self.under_way.len() + self.arrived.len();
-        ledger.open = ledger.open.saturating_sub(open);
+        shared.open = shared.open.saturating_sub(open);
         self.under_way.clear();
         self.arrived.clear();
         self.done.clear();
-        self.samples.clear(&mut ledger.budget);
+        self.samples.clear(&mut shared.budget);
     }
 
     /// Makes room for a message and gives its place.
-    fn begin(&mut self, message: Message, ledger: &mut Ledger) -> Option<usize> {
+    fn begin(&mut self, message: Message, shared: &mut Shared) -> Option<usize> {
         if self.under_way.len() >= MAX_UNDER_WAY {
             self.under_way.pop_front();
-            ledger.give_up();
+            shared.give_up();
         }
-        if ledger.open >= MAX_OPEN {
+        if shared.open >= MAX_OPEN {
             if self.waiting.pop_front().is_none() {
-                ledger.evictions += 1;
+                shared.evictions += 1;
                 return None;
             }
-            ledger.give_up();
+            shared.give_up();
         }
-        ledger.open += 1;
+        shared.open += 1;
         self.under_way.push_back(message);
         self.under_way.len().checked_sub(1)
     }
@@ -485,29 +490,29 @@ impl Traced {
             writer: record.writer(),
             sequence_number: sample.sequence_number(),
             trace_id,
-            subject: Arc::clone(&self.subject),
+            description: Arc::clone(&self.description),
             source: sample.source_timestamp(),
             size: sample.size(),
             fragments: match sample {
                 Sample::Data(_) => 1,
                 Sample::DataFrag(fragments) => fragments.total(),
             },
-            destination: Place::of(record),
+            destination: Destination::of(record),
         }
     }
 
-    fn acknowledged(&mut self, acknack: AckNack<'_>, ledger: &mut Ledger) {
+    fn acknowledged(&mut self, acknack: AckNack<'_>, shared: &mut Shared) {
         let record = acknack.record();
         let (reader, at) = (record.reader(), Timestamp(record.time));
-        let covered = |waiting: &&mut Waiting| {
+        let covered = |waiting: &&mut Unacknowledged| {
             waiting.message.sequence_number < acknack.base()
                 && !waiting.readers.contains(&reader)
                 && waiting.readers.len() < MAX_READERS
         };
         for waiting in self.waiting.iter_mut().filter(covered) {
             waiting.readers.push(reader);
-            ledger.finish(Span {
-                stage: Stage::Settle(reader),
+            shared.finish(Span {
+                stage: SpanStage::Settle(reader),
                 message: waiting.message.clone(),
                 begin: waiting.at,
                 end: at.max(waiting.at),
@@ -515,15 +520,15 @@ impl Traced {
         }
     }
 
-    fn close(mut self, ledger: &mut Ledger) {
-        self.release(Timestamp(u64::MAX), ledger);
+    fn close(mut self, shared: &mut Shared) {
+        self.release(Timestamp(u64::MAX), shared);
         let open = self.under_way.len() + self.waiting.len();
-        ledger.open = ledger.open.saturating_sub(open);
-        self.samples.clear(&mut ledger.budget);
+        shared.open = shared.open.saturating_sub(open);
+        self.samples.clear(&mut shared.budget);
     }
 }
 
-impl Ledger {
+impl Shared {
     fn finish(&mut self, span: Span) {
         if self.finished.spans.len() < MAX_FINISHED {
             self.finished.spans.push(span);
@@ -544,9 +549,9 @@ mod tests {
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;
+    use ros2probe_wire::time::SECOND;
 
     const WRITER: Guid = Guid::new(GuidPrefix([7; 12]), EntityId([0, 0, 1, 3]));
-    const SECOND: u64 = 1_000_000_000;
 
     fn reader(number: u8) -> Guid {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 4]))
@@ -592,9 +597,9 @@ mod tests {
         tracer
     }
 
-    fn subject() -> Subject {
-        Subject {
-            domain_id: 0,
+    fn description() -> WriterDescription {
+        WriterDescription {
+            domain_id: DomainId(0),
             topic: "/points".into(),
             message_type: "sensor_msgs/msg/PointCloud2".into(),
             reliable: true,
@@ -603,7 +608,7 @@ mod tests {
 
     fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
         for record in records {
-            tracer.record(record, || Some((subject(), ratio)));
+            tracer.record(record, || Some((description(), ratio)));
         }
         tracer.take().spans
     }
@@ -616,7 +621,7 @@ mod tests {
         spans
     }
 
-    fn times(spans: &[Span]) -> Vec<(Stage, u64, u64)> {
+    fn times(spans: &[Span]) -> Vec<(SpanStage, u64, u64)> {
         let times = |span: &Span| (span.stage, span.begin.0, span.end.0);
         spans.iter().map(times).collect()
     }
@@ -643,9 +648,9 @@ mod tests {
         assert_eq!(
             times(&spans),
             [
-                (Stage::Send, 1_000, 1_900),
-                (Stage::Settle(reader(1)), 1_900, 2_300),
-                (Stage::Settle(reader(2)), 1_900, 2_500),
+                (SpanStage::Send, 1_000, 1_900),
+                (SpanStage::Settle(reader(1)), 1_900, 2_300),
+                (SpanStage::Settle(reader(2)), 1_900, 2_500),
             ]
         );
         let [sent, settled, ..] = spans.as_slice() else {
@@ -665,7 +670,7 @@ mod tests {
     fn where_it_only_arrives_it_is_received_in_the_same_trace() {
         let arrives = [data(5, 10, flag::HOST), data(5, 11, flag::HOST)];
         let received = take_all(&mut tracer(), &arrives, 1.0);
-        assert_eq!(times(&received), [(Stage::Receive, 10, 10)]);
+        assert_eq!(times(&received), [(SpanStage::Receive, 10, 10)]);
         let sent = take(&mut tracer(), &[data(5, 3, flag::OUTGOING)], 1.0);
         let trace = |spans: &[Span]| spans.first().map(|span| span.message.trace_id);
         assert_eq!(trace(&sent), trace(&received));
@@ -674,14 +679,14 @@ mod tests {
         let mut undirected = Tracer::new(false);
         undirected.restart(true);
         let spans = take(&mut undirected, &[data(5, 10, 0)], 1.0);
-        assert_eq!(times(&spans), [(Stage::Send, 10, 10)]);
+        assert_eq!(times(&spans), [(SpanStage::Send, 10, 10)]);
         let loopback = Record {
             interface: LOOPBACK,
             ..data(6, 10, 0)
         };
         assert_eq!(
             times(&take(&mut tracer(), &[loopback], 1.0)),
-            [(Stage::Send, 10, 10)]
+            [(SpanStage::Send, 10, 10)]
         );
     }
 
@@ -697,7 +702,7 @@ mod tests {
         let spans = take_all(&mut tracer, &records, 1.0);
         assert_eq!(
             times(&spans),
-            [(Stage::Send, 11, 11), (Stage::Send, 21, 21)]
+            [(SpanStage::Send, 11, 11), (SpanStage::Send, 21, 21)]
         );
         assert_eq!(tracer.size(), (2, MAX_OPEN, 0));
     }
@@ -741,7 +746,7 @@ mod tests {
                     writer: guid_words(other),
                     ..data(sample, SECOND, flag::OUTGOING)
                 };
-                tracer.record(&record, || Some((subject(), 1.0)));
+                tracer.record(&record, || Some((description(), 1.0)));
             }
         }
         assert!(tracer.size().0 <= MAX_OPEN, "{:?}", tracer.size());
@@ -761,7 +766,7 @@ mod tests {
             tracer.record(&data(number, number, 0), || {
                 asked += 1;
                 // At first discovery does not know it.
-                (asked > 1).then(|| (subject(), 0.0))
+                (asked > 1).then(|| (description(), 0.0))
             });
         }
         assert_eq!(asked, 2);

@@ -1,6 +1,7 @@
 //! What to watch and what to expect of it: plain data, already checked, and the matcher that tells
 //! which entries cover a topic.
 
+use ros2probe_wire::DomainId;
 use std::collections::HashMap;
 use std::sync::Arc;
 
@@ -14,7 +15,7 @@ pub struct Watch {
     /// Exact ROS name (`/points`) or glob: `*` within one token, `**` across tokens.
     pub pattern: String,
     /// Only this domain; `None` = every domain.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// What should hold.
     pub expectations: Expectations,
     /// Series per delivery.
@@ -166,9 +167,6 @@ pub const MAX_GLOBS: usize = 256;
 /// See [`MAX_GLOBS`].
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
-/// The highest domain id for which RTPS has ports.
-pub const MAX_DOMAIN: u32 = 232;
-
 /// Ranges of what may be expected, as the configuration's schema has them.
 const RANGES: [(&str, f64, f64); 5] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
@@ -296,7 +294,7 @@ impl Watchlist {
 
     /// The entries that cover this topic, as indices into [`Self::watches`].
     #[must_use]
-    pub fn matching(&self, domain_id: u32, topic: &str) -> Vec<usize> {
+    pub fn matching(&self, domain_id: DomainId, topic: &str) -> Vec<usize> {
         let covers = |place: &usize| {
             let watch = self.watches.get(*place);
             watch.is_some_and(|watch| glob::covers(&watch.pattern, topic))
@@ -323,7 +321,7 @@ impl Watchlist {
 
     /// Whether an entry is this exact name, for this domain or, with `None`, for any.
     #[must_use]
-    pub fn names(&self, domain_id: Option<u32>, topic: &str) -> bool {
+    pub fn names(&self, domain_id: Option<DomainId>, topic: &str) -> bool {
         let mut places = self.patterns.get(topic).into_iter().flatten();
         places.any(|place| {
             let watch = self.watches.get(*place);
@@ -336,7 +334,7 @@ impl Watchlist {
 
     /// Where the entry with this pattern for this domain stands.
     #[must_use]
-    pub fn position(&self, pattern: &str, domain_id: Option<u32>) -> Option<usize> {
+    pub fn position(&self, pattern: &str, domain_id: Option<DomainId>) -> Option<usize> {
         let mut places = self.patterns.get(pattern)?.iter().copied();
         places.find(|place| {
             let watch = self.watches.get(*place);
@@ -362,10 +360,16 @@ mod tests {
     #[test]
     fn one_star_stays_within_its_token_and_two_cross_them() {
         let list = watchlist(&["/camera/*/image_raw", "/**", "/points", "/camera/**"]);
-        assert_eq!(list.matching(0, "/camera/left/image_raw"), [0, 1, 3]);
-        assert_eq!(list.matching(0, "/camera/left/up/image_raw"), [1, 3]);
-        assert_eq!(list.matching(0, "/points"), [1, 2]);
-        assert_eq!(list.matching(0, "/points2"), [1]);
+        assert_eq!(
+            list.matching(DomainId(0), "/camera/left/image_raw"),
+            [0, 1, 3]
+        );
+        assert_eq!(
+            list.matching(DomainId(0), "/camera/left/up/image_raw"),
+            [1, 3]
+        );
+        assert_eq!(list.matching(DomainId(0), "/points"), [1, 2]);
+        assert_eq!(list.matching(DomainId(0), "/points2"), [1]);
     }
 
     #[test]
@@ -377,10 +381,10 @@ mod tests {
             ("/c/d", &[1, 2, 4]),
             ("/**", &[2]),
         ] {
-            assert_eq!(next.matching(0, topic), places, "{topic}");
+            assert_eq!(next.matching(DomainId(0), topic), places, "{topic}");
         }
         assert_eq!(next.position("/e", None), Some(3));
-        assert_eq!(next.position("/e", Some(0)), None);
+        assert_eq!(next.position("/e", Some(DomainId(0))), None);
         assert_eq!(next.position("/a", None), None);
     }
 
@@ -404,12 +408,12 @@ mod tests {
     #[test]
     fn a_domain_narrows_an_entry() {
         let watch = Watch {
-            domain_id: Some(5),
+            domain_id: Some(DomainId(5)),
             ..Watch::named("/points").unwrap()
         };
         let list = Watchlist::new(vec![watch]).unwrap();
-        assert_eq!(list.matching(5, "/points"), [0]);
-        assert!(list.matching(0, "/points").is_empty());
+        assert_eq!(list.matching(DomainId(5), "/points"), [0]);
+        assert!(list.matching(DomainId(0), "/points").is_empty());
     }
 
     #[test]
@@ -424,7 +428,7 @@ mod tests {
             "/\u{1F916}",
             &"/x".repeat(5000),
         ] {
-            let _ = list.matching(0, name);
+            let _ = list.matching(DomainId(0), name);
         }
     }
 

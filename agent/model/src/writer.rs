@@ -5,9 +5,9 @@
 //! [`super::sequence`] and [`super::samples`].
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
-use super::calendar::Calendar;
 use super::header::{PLAUSIBLE, stamp_time};
 use super::histogram::Histogram;
 use super::in_order::Progress;
@@ -15,22 +15,23 @@ use super::journal::{Journal, Loss, Missing};
 use super::payloads::MissedReason;
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception};
-use super::sampled::{News, Sampled, Seen};
+use super::sampled::{Sampled, SampledUpdate, Seen};
 use super::samples::Budget;
 use super::sequence::{FAR, REACH};
 use super::size::Size;
 use super::snapshot::Measurement;
+use super::wall_clock::WallClock;
 
 /// How long a gap of a best-effort writer may fill by reordering.
-pub const BEST_EFFORT_WINDOW: u64 = 1_000_000_000;
+pub const BEST_EFFORT_WINDOW: u64 = SECOND;
 /// How long a reliable writer may take to retransmit: three of Fast DDS's HEARTBEAT periods.
-pub const RELIABLE_WINDOW: u64 = 10_000_000_000;
+pub const RELIABLE_WINDOW: u64 = 10 * SECOND;
 /// A first sample older than this is history that a late joiner asked for.
-const HISTORY: u64 = 10_000_000_000;
+const HISTORY: u64 = 10 * SECOND;
 
 /// A writer that was seen in its own process is so for this long after its last record: what else
 /// is read in shared memory in that time has been seen.
-const EXACT_FOR: u64 = 10_000_000_000;
+const EXACT_FOR: u64 = 10 * SECOND;
 
 /// What discovery says about the writer; all false while it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -45,7 +46,7 @@ pub struct Traits {
 
 /// What one record changes besides the writer itself.
 #[derive(Debug)]
-pub struct Scene<'a> {
+pub struct MeasurementContext<'a> {
     /// The time of the record, or of the look at the clock.
     pub now: Timestamp,
     /// Memory for fragmented samples.
@@ -53,7 +54,7 @@ pub struct Scene<'a> {
     /// Where losses are told.
     pub journal: &'a mut Journal,
     /// What the writer's clock is held against.
-    pub calendar: Calendar,
+    pub wall_clock: WallClock,
 }
 
 /// A message as it was counted.
@@ -74,7 +75,7 @@ pub struct Counted {
     /// It was seen where not every message is seen.
     pub sampled: bool,
     /// Its number is not believed to be the writer's: it has no place in an order.
-    pub doubted: bool,
+    pub unconfirmed: bool,
 }
 
 /// One measured writer.
@@ -161,8 +162,8 @@ impl Writer {
     }
 
     /// Samples in fragments that begin before this may lack some that nobody lost.
-    pub const fn doubt(&mut self, until: Timestamp) {
-        self.reception.doubt(until);
+    pub const fn allow_incomplete(&mut self, until: Timestamp) {
+        self.reception.allow_incomplete(until);
     }
 
     /// What discovery and its HEARTBEATs said.
@@ -191,11 +192,11 @@ impl Writer {
         if self.is_under_way(sample) {
             return false;
         }
-        if is_looked_at(record) && self.is_exact(at) {
+        if is_polled(record) && self.is_exact(at) {
             return true;
         }
-        if self.doubts(sample) {
-            return sequence.has_doubted(number);
+        if self.is_unconfirmed(sample) {
+            return sequence.has_unconfirmed(number);
         }
         match &self.sampled {
             Some(sampled) if sampled.is_current(at) => sampled.has(number, sequence.next()),
@@ -229,7 +230,7 @@ impl Writer {
     }
 
     /// It is no longer seen in the process that it belongs to.
-    pub const fn seen_exactly_no_longer(&mut self) {
+    pub const fn end_exact_view(&mut self) {
         self.exact = None;
     }
 
@@ -239,11 +240,11 @@ impl Writer {
         &mut self,
         record: &Record,
         opened: Timestamp,
-        scene: &mut Scene<'_>,
+        context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let at = record_time(record);
         let is_exact = record.flags & flag::EXACT != 0;
-        let is_sampled = is_looked_at(record);
+        let is_sampled = is_polled(record);
         if is_exact {
             self.exact = self.exact.max(Some(at));
         }
@@ -251,7 +252,7 @@ impl Writer {
         if let Body::Sample(sample) = body
             && self.is_under_way(sample)
         {
-            return self.catch_up(sample, scene);
+            return self.catch_up(sample, context);
         }
         if is_sampled && self.is_exact(at) {
             // It has been seen already, or is on its way.
@@ -262,8 +263,8 @@ impl Writer {
             _ => sampled.is_current(at),
         });
         if is_sampled || takes {
-            let counted = self.sampled_record(record, is_sampled, scene);
-            self.leave_unseen(scene.journal);
+            let counted = self.sampled_record(record, is_sampled, context);
+            self.leave_unseen(context.journal);
             if let Some(sampled) = self.sampled.as_mut().filter(|_| is_exact) {
                 // From here on every message is seen.
                 sampled.end();
@@ -274,17 +275,17 @@ impl Writer {
         let before = (sequence.next(), sequence.last_advance());
         let mut counted = None;
         match body {
-            Body::Sample(sample) => counted = self.sample(sample, scene),
+            Body::Sample(sample) => counted = self.sample(sample, context),
             Body::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
-                let (reception, mut settling) = self.parts(scene.journal, scene.now);
-                reception.heartbeat(heartbeat, scene.budget, &mut |decision| {
+                let (reception, mut settling) = self.parts(context.journal, context.now);
+                reception.heartbeat(heartbeat, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
             Body::Gap(gap) => {
-                let (reception, mut settling) = self.parts(scene.journal, scene.now);
-                reception.gap(gap, scene.budget, &mut |decision| {
+                let (reception, mut settling) = self.parts(context.journal, context.now);
+                reception.gap(gap, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
@@ -340,27 +341,27 @@ impl Writer {
     }
 
     /// Settles what has waited long enough.
-    pub fn advance(&mut self, scene: &mut Scene<'_>) {
+    pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
-            sampled.look(scene.now);
-            self.leave_unseen(scene.journal);
+            sampled.tick(context.now);
+            self.leave_unseen(context.journal);
         }
-        let (now, window) = (scene.now, settle_window(self.traits.reliable));
-        let (reception, mut settling) = self.parts(scene.journal, scene.now);
+        let (now, window) = (context.now, settle_window(self.traits.reliable));
+        let (reception, mut settling) = self.parts(context.journal, context.now);
         let windows = (window, BEST_EFFORT_WINDOW);
-        reception.advance(now, windows, scene.budget, &mut |decision| {
+        reception.advance(now, windows, context.budget, &mut |decision| {
             settling.take(decision);
         });
     }
 
     /// Settles everything: nothing more will come.
-    pub fn settle(&mut self, scene: &mut Scene<'_>) {
+    pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.settle_all();
-            self.leave_unseen(scene.journal);
+            self.leave_unseen(context.journal);
         }
-        let (reception, mut settling) = self.parts(scene.journal, scene.now);
-        reception.settle(scene.budget, &mut |decision| settling.take(decision));
+        let (reception, mut settling) = self.parts(context.journal, context.now);
+        reception.settle(context.budget, &mut |decision| settling.take(decision));
     }
 
     /// Everything counted so far.
@@ -420,26 +421,35 @@ impl Writer {
         (&mut self.reception, settling)
     }
 
-    fn sample(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> Option<Counted> {
+    fn sample(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
         let record = sample.record();
         let now = record_time(record);
         let reliable = self.traits.reliable;
-        let (reception, mut settling) = self.parts(scene.journal, scene.now);
-        let outcome = reception.sample(sample, reliable, scene.budget, &mut |decision| {
+        let (reception, mut settling) = self.parts(context.journal, context.now);
+        let outcome = reception.sample(sample, reliable, context.budget, &mut |decision| {
             settling.take(decision);
         });
         match outcome {
             Outcome::Open => {}
             // Seen at several sockets is not sent again: there the caller knows.
-            Outcome::Again => {
+            Outcome::Duplicate => {
                 self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
             }
             Outcome::Whole(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
-                let calendar = scene.calendar.shown(now);
+                let wall_clock = context.wall_clock.wall_time(now);
                 let (source, stamp) = (whole.source, whole.stamp);
-                if !whole.doubted {
-                    self.delays(whole.number, whole.newest, (source, stamp), (now, calendar));
+                if !whole.unconfirmed {
+                    self.delays(
+                        whole.number,
+                        whole.newest,
+                        (source, stamp),
+                        (now, wall_clock),
+                    );
                 }
                 return Some(Counted {
                     number: whole.number,
@@ -449,7 +459,7 @@ impl Writer {
                     at: now,
                     began: whole.began,
                     sampled: false,
-                    doubted: whole.doubted,
+                    unconfirmed: whole.unconfirmed,
                 });
             }
             Outcome::Whole(_) => {}
@@ -479,10 +489,10 @@ impl Writer {
     }
 
     /// Whether the number of this DATA or DATA_FRAG is away from those that the writer uses.
-    fn doubts(&self, sample: Sample<'_>) -> bool {
+    fn is_unconfirmed(&self, sample: Sample<'_>) -> bool {
         let source = sample.source_timestamp().timestamp();
         let sequence = self.reception.sequence();
-        sequence.doubts(sample.sequence_number(), source, reach(sample.record()))
+        sequence.is_unconfirmed(sample.sequence_number(), source, reach(sample.record()))
     }
 
     fn is_exact(&self, now: Timestamp) -> bool {
@@ -500,7 +510,7 @@ impl Writer {
         &mut self,
         record: &Record,
         is_sampled: bool,
-        scene: &mut Scene<'_>,
+        context: &mut MeasurementContext<'_>,
     ) -> Option<Counted> {
         let now = record_time(record);
         let abandoned = match self.is_sampled(now) {
@@ -519,8 +529,12 @@ impl Writer {
         let sequence = self.reception.sequence_mut();
         let told = match record.body() {
             Body::Sample(sample) => {
-                let news = self.sampled_news(sample, reach, scene.budget)?;
-                return self.sampled_sample(sample, &news, (now, scene.calendar.shown(now)));
+                let update = self.sampled_update(sample, reach, context.budget)?;
+                return self.sampled_sample(
+                    sample,
+                    &update,
+                    (now, context.wall_clock.wall_time(now)),
+                );
             }
             Body::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
@@ -539,21 +553,21 @@ impl Writer {
     }
 
     /// What a sample, or a part of one, changes in the sampled view.
-    fn sampled_news(
+    fn sampled_update(
         &mut self,
         sample: Sample<'_>,
         reach: u64,
         budget: &mut Budget,
-    ) -> Option<News> {
+    ) -> Option<SampledUpdate> {
         let sampled = self.sampled.as_mut()?;
         let (number, now) = (sample.sequence_number(), record_time(sample.record()));
         let source = sample.source_timestamp().timestamp();
         let sequence = self.reception.sequence();
-        let doubted = sequence.doubts(number, source, reach);
-        let has = !doubted && sampled.has(number, sequence.next());
+        let unconfirmed = sequence.is_unconfirmed(number, source, reach);
+        let has = !unconfirmed && sampled.has(number, sequence.next());
         let is_whole = match sample {
             Sample::DataFrag(fragments) => {
-                !has && self.reception.assemble(fragments, doubted, budget)
+                !has && self.reception.assemble(fragments, unconfirmed, budget)
             }
             Sample::Data(_) => true,
         };
@@ -570,30 +584,36 @@ impl Writer {
 
     /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
     /// it comes.
-    fn catch_up(&mut self, sample: Sample<'_>, scene: &mut Scene<'_>) -> Option<Counted> {
+    fn catch_up(
+        &mut self,
+        sample: Sample<'_>,
+        context: &mut MeasurementContext<'_>,
+    ) -> Option<Counted> {
         let is_whole = match sample {
             Sample::Data(_) => true,
-            Sample::DataFrag(fragments) => self.reception.assemble(fragments, false, scene.budget),
+            Sample::DataFrag(fragments) => {
+                self.reception.assemble(fragments, false, context.budget)
+            }
         };
         let seen = if is_whole { Seen::Whole } else { Seen::Part };
         let number = sample.sequence_number();
-        let news = self.sampled.as_mut()?.catch_up(number, seen);
+        let update = self.sampled.as_mut()?.catch_up(number, seen);
         let now = record_time(sample.record());
-        self.sampled_sample(sample, &news, (now, scene.calendar.shown(now)))
+        self.sampled_sample(sample, &update, (now, context.wall_clock.wall_time(now)))
     }
 
     fn sampled_sample(
         &mut self,
         sample: Sample<'_>,
-        news: &News,
-        (now, calendar): (Timestamp, Timestamp),
+        update: &SampledUpdate,
+        (now, wall_clock): (Timestamp, Timestamp),
     ) -> Option<Counted> {
         let (number, is_message) = (sample.sequence_number(), sample.is_message());
         // Those that were not seen are taken for as large as the next one that was.
-        let disposals = u64::from(!is_message && news.samples > 0);
-        let messages = news.samples - disposals;
+        let disposals = u64::from(!is_message && update.samples > 0);
+        let messages = update.samples - disposals;
         let bytes = u64::from(sample.size());
-        let told = (news.alike - disposals).saturating_mul(bytes);
+        let told = (update.alike - disposals).saturating_mul(bytes);
         self.tally.messages += messages;
         self.tally.bytes = self.tally.bytes.saturating_add(told);
         let slot = self.tally.window.current(now);
@@ -604,14 +624,14 @@ impl Writer {
         }
         let sampled = self.sampled.as_mut()?;
         let stamp = sampled.stamp(number, sample.header_stamp());
-        if let Some(interval) = news.interval {
+        if let Some(interval) = update.interval {
             self.interarrival.observe(seconds(interval));
         }
         let source = sample.source_timestamp();
-        if news.arrived && is_message {
-            self.delays(number, true, (source, stamp), (now, calendar));
+        if update.arrived && is_message {
+            self.delays(number, true, (source, stamp), (now, wall_clock));
         }
-        if news.finished && is_message {
+        if update.finished && is_message {
             return Some(Counted {
                 number,
                 bytes,
@@ -620,7 +640,7 @@ impl Writer {
                 at: now,
                 began: now,
                 sampled: true,
-                doubted: news.doubted,
+                unconfirmed: update.unconfirmed,
             });
         }
         None
@@ -645,11 +665,11 @@ impl Writer {
         number: u64,
         newest: bool,
         (source, stamp): (RtpsTime, Option<(i32, u32)>),
-        (now, calendar): (Timestamp, Timestamp),
+        (now, wall_clock): (Timestamp, Timestamp),
     ) {
         let source = source.timestamp();
         if self.traits.keeps_history {
-            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < calendar.0);
+            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < wall_clock.0);
             let first = self.reception.sequence().first();
             if !newest || number < first || number == first && old {
                 return;
@@ -657,11 +677,11 @@ impl Writer {
         }
         let stamp = stamp
             .filter(|_| self.traits.has_header)
-            .and_then(|stamp| stamp_time(stamp, calendar));
+            .and_then(|stamp| stamp_time(stamp, wall_clock));
         let mut negative = false;
         if let Some(source) = source {
-            let delay = calendar.nanoseconds_since(source);
-            let is_plausible = source.0.abs_diff(calendar.0) <= PLAUSIBLE;
+            let delay = wall_clock.nanoseconds_since(source);
+            let is_plausible = source.0.abs_diff(wall_clock.0) <= PLAUSIBLE;
             self.implausible_latency += u64::from(!is_plausible);
             negative |= delay < 0;
             if delay >= 0 && is_plausible {
@@ -672,7 +692,7 @@ impl Writer {
             }
         }
         if let Some(stamp) = stamp {
-            let delay = calendar.nanoseconds_since(stamp);
+            let delay = wall_clock.nanoseconds_since(stamp);
             negative |= delay < 0;
             if delay >= 0 {
                 self.header_latency.observe(seconds(delay));
@@ -735,11 +755,11 @@ impl Settling<'_> {
 
 /// How far ahead of those that came the numbers of a record may be: looks at shared memory miss more.
 const fn reach(record: &Record) -> u64 {
-    if is_looked_at(record) { FAR } else { REACH }
+    if is_polled(record) { FAR } else { REACH }
 }
 
 /// Whether it was read in shared memory, where others may have been missed.
-const fn is_looked_at(record: &Record) -> bool {
+const fn is_polled(record: &Record) -> bool {
     record.flags & (flag::SHM | flag::EXACT) == flag::SHM
 }
 

@@ -6,9 +6,9 @@ use std::ops::RangeInclusive;
 use std::os::fd::{AsRawFd as _, BorrowedFd};
 use std::time::Duration;
 
-use ros2probe::capture::ahead::{Ahead, Ready};
-use ros2probe::capture::filter::{Filter, FilterSettings};
-use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_capture::ahead::{Ahead, Ready};
+use ros2probe_capture::filter::{Filter, FilterSettings};
+use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::filter::{Budget, Counter};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 use ros2probe_wire::host::Piece;

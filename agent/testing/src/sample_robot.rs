@@ -4,23 +4,24 @@ use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe::agent_facts::{
+use ros2probe_daemon::agent_facts::{
     AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
-use ros2probe::model::diagnosis::{
+use ros2probe_daemon::state::StateFacts;
+use ros2probe_model::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
-use ros2probe::model::discovery::Addresses;
-use ros2probe::model::histogram::Histogram;
-use ros2probe::model::snapshot::{
+use ros2probe_model::discovery::Addresses;
+use ros2probe_model::histogram::Histogram;
+use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, Passage, PassageCount,
-    ProcessFacts, SampledFacts, Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts,
+    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
+    Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
     WatchFacts, WatchState, WatchedTopicFacts,
 };
-use ros2probe::state::StateFacts;
+use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::discovery::TypeHash;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 /// Everything an agent knows of a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
@@ -36,7 +37,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         at: Timestamp(1_700_000_000_000_000_000),
         participants: vec![ParticipantFacts {
             guid,
-            domain_id: 0,
+            domain_id: DomainId(0),
             vendor: "eProsima Fast DDS".to_owned(),
             enclave: Some("/".to_owned()),
             process: process(),
@@ -56,7 +57,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             unidentified_drops: 5,
         }],
         nodes: vec![NodeFacts {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: "/lidar".to_owned(),
             participant: guid,
             writers: Vec::new(),
@@ -78,7 +79,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
-            domain_id: 0,
+            domain_id: DomainId(0),
             entity: "writer",
             event: "appeared",
             count: 12,
@@ -107,10 +108,10 @@ fn diagnoses() -> Diagnoses {
     let (writer, reader) = (guid([0, 0, 1, 3]), guid([0, 0, 2, 4]));
     let participant = guid([0, 0, 1, 0xc1]);
     let topic = TopicKey {
-        domain_id: 0,
+        domain_id: DomainId(0),
         dds_name: "rt/points".into(),
         name: "/points".into(),
-        kind: "topic",
+        kind: TopicKind::Topic,
     };
     let mut policies = Policies::default();
     policies.insert(Policy::Reliability);
@@ -131,7 +132,7 @@ fn diagnoses() -> Diagnoses {
             hashes: vec![TypeHash([1; 32]), TypeHash([2; 32])],
         },
         Diagnosis::DuplicateNode {
-            domain_id: 0,
+            domain_id: DomainId(0),
             node: "/lidar".into(),
             participants: vec![participant; 3],
         },
@@ -148,7 +149,7 @@ fn diagnoses() -> Diagnoses {
         Diagnosis::NodeInSeveralDomains {
             node: "/lidar".into(),
             participant,
-            domains: vec![0, 5],
+            domains: vec![DomainId(0), DomainId(5)],
         },
     ];
     let qos_pairs = vec![QosPairs {
@@ -219,13 +220,13 @@ pub fn topic(name: &str) -> TopicFacts {
         type_hash: None,
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
-        passages: 1,
+        transports: 1,
     };
     TopicFacts {
-        domain_id: 0,
+        domain_id: DomainId(0),
         name: name.to_owned(),
         dds_name: format!("rt{name}"),
-        kind: "topic",
+        kind: TopicKind::Topic,
         hidden: false,
         message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
         type_hashes: Vec::new(),
@@ -249,8 +250,8 @@ pub fn topic(name: &str) -> TopicFacts {
             last_seen: Timestamp(1_700_000_000_000_000_000),
         }],
         vanished: false,
-        passages: vec![PassageCount {
-            passage: Passage::SharedMemory,
+        transports: vec![TransportCount {
+            transport: Transport::SharedMemory,
             pairs: 1,
         }],
         is_read: false,

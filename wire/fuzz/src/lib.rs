@@ -9,7 +9,7 @@
 
 use ros2probe_wire::discovery::{self, Discovery, Role};
 use ros2probe_wire::entities::ParticipantEntities;
-use ros2probe_wire::names::{MAX_LEN, TopicKind};
+use ros2probe_wire::names::{Demangled, MAX_LEN};
 use ros2probe_wire::record::{self, Record, Sample, flag, kind};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Step, Walk};
@@ -156,10 +156,10 @@ fn endpoint(role: Role, vendor: VendorId, payload: Payload<'_>, inline_qos: &Inl
     assert!(endpoint.qos.partitions.len() <= 16);
     let topic = endpoint.topic.as_str();
     assert!(topic.len() <= MAX_LEN && topic.chars().all(|c| !c.is_control() && c != '"'));
-    match endpoint.topic.kind() {
-        TopicKind::Topic(name) => assert_eq!(topic, format!("rt{name}")),
-        TopicKind::ServiceRequest(name) => assert_eq!(topic, format!("rq{name}Request")),
-        TopicKind::ServiceReply(name) => assert_eq!(topic, format!("rr{name}Reply")),
+    match endpoint.topic.demangle() {
+        Demangled::Topic(name) => assert_eq!(topic, format!("rt{name}")),
+        Demangled::ServiceRequest(name) => assert_eq!(topic, format!("rq{name}Request")),
+        Demangled::ServiceReply(name) => assert_eq!(topic, format!("rr{name}Reply")),
         _ => {}
     }
     assert!(endpoint.type_name.service().as_str().len() <= endpoint.type_name.as_str().len());

@@ -6,6 +6,7 @@ use alloc::vec::Vec;
 
 use super::{UserData, guid, push_locator, vendor};
 use crate::cursor::{Cursor, Endianness, Reason, WireError};
+use crate::domain::DomainId;
 use crate::guid::{EntityId, Guid};
 use crate::parameters::{ParameterId, ParameterList};
 use crate::qos;
@@ -46,7 +47,7 @@ pub struct ParticipantAnnouncement {
     /// Silent for longer than this, it is gone.
     pub lease: Duration,
     /// Its domain; Fast DDS 2.x does not say, there the port tells.
-    pub domain_id: Option<u32>,
+    pub domain_id: Option<DomainId>,
     /// Its domain's tag; empty is the default.
     pub domain_tag: String,
     /// Its entity name, where it is plain text; Fast DDS puts the enclave here.
@@ -121,7 +122,7 @@ impl ParticipantAnnouncement {
             ParameterId::PARTICIPANT_LEASE_DURATION => {
                 self.lease = qos::duration(&mut value, "PID_PARTICIPANT_LEASE_DURATION")?;
             }
-            ParameterId::DOMAIN_ID => self.domain_id = Some(value.u32("PID_DOMAIN_ID")?),
+            ParameterId::DOMAIN_ID => self.domain_id = Some(DomainId(value.u32("PID_DOMAIN_ID")?)),
             ParameterId::DOMAIN_TAG => {
                 self.domain_tag = text::name(&mut value, "PID_DOMAIN_TAG", MAX_NAME_LEN)?.into();
             }

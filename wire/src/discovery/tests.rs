@@ -5,6 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::cursor::Endianness;
+use crate::domain::DomainId;
 use crate::guid::{EntityId, GuidPrefix};
 use crate::names::MAX_LEN;
 use crate::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};
@@ -97,7 +98,7 @@ fn a_participant_as_cyclone_dds_announces_it() {
         ProtocolVersion { major: 2, minor: 1 }
     );
     assert_eq!(participant.lease, Duration::Finite(10_000_000_000));
-    assert_eq!(participant.domain_id, Some(0));
+    assert_eq!(participant.domain_id, Some(DomainId(0)));
     assert_eq!(participant.enclave.as_deref(), Some("/"));
     assert!(participant.is_ros() && !participant.is_secured && !participant.is_truncated);
     assert_eq!(participant.process_name(), Some("python"));
@@ -393,7 +394,7 @@ fn security_filters_and_domain_tags_are_noticed() {
     assert!(participant.is_secured);
     assert_eq!(
         (participant.domain_id, participant.domain_tag.as_str()),
-        (Some(42), "tag1")
+        (Some(DomainId(42)), "tag1")
     );
     let mut payload = endpoint_list("rt/a", "A");
     payload

@@ -3,8 +3,10 @@ use std::vec::Vec;
 use proptest::prelude::*;
 
 use super::*;
+use crate::cursor::{Reason, WireError};
 use crate::guid::{Guid, GuidPrefix};
 use crate::record::{Body, Sample};
+use crate::rtps::{InlineQos, Payload, VendorId};
 
 const SOURCE: [u8; 12] = *b"\x01\x0fsourcepref";
 const OTHER: [u8; 12] = *b"\x01\x10otherprefi";

@@ -198,49 +198,11 @@ pub(super) fn read<'a>(
 ) -> Result<Body<'a>, WireError> {
     Ok(match id {
         SubmessageId::PAD => Body::Pad,
-        SubmessageId::INFO_TS => {
-            receiver.timestamp = if flags.contains(SubmessageFlags::INVALIDATE) {
-                RtpsTime::default()
-            } else {
-                let seconds = body.u32("INFO_TS seconds")?;
-                let fraction = body.u32("INFO_TS fraction")?;
-                RtpsTime(u64::from(seconds) << 32 | u64::from(fraction))
-            };
-            Body::InfoTimestamp
-        }
-        SubmessageId::INFO_SRC => {
-            body.take("INFO_SRC unused", 4)?;
-            let [major, minor] = body.array("INFO_SRC version")?;
-            // RTPS 2.5, 8.3.8.9.4: the time in force ends with the source it came from.
-            *receiver = Receiver {
-                version: ProtocolVersion { major, minor },
-                vendor: VendorId(body.array("INFO_SRC vendor")?),
-                source: GuidPrefix(body.array("INFO_SRC prefix")?),
-                destination: receiver.destination,
-                timestamp: RtpsTime::default(),
-            };
-            Body::InfoSource
-        }
-        SubmessageId::INFO_DST => {
-            receiver.destination = GuidPrefix(body.array("INFO_DST prefix")?);
-            Body::InfoDestination
-        }
-        SubmessageId::INFO_REPLY => {
-            let unicast = LocatorList::read(&mut body)?;
-            let multicast = flags
-                .contains(SubmessageFlags::MULTICAST)
-                .then(|| LocatorList::read(&mut body))
-                .transpose()?;
-            Body::InfoReply(InfoReply::Lists(unicast, multicast))
-        }
-        SubmessageId::INFO_REPLY_IP4 => {
-            let unicast = locator_ip4(&mut body)?;
-            let multicast = flags
-                .contains(SubmessageFlags::MULTICAST)
-                .then(|| locator_ip4(&mut body))
-                .transpose()?;
-            Body::InfoReply(InfoReply::Ip4(unicast, multicast))
-        }
+        SubmessageId::INFO_TS
+        | SubmessageId::INFO_SRC
+        | SubmessageId::INFO_DST
+        | SubmessageId::INFO_REPLY
+        | SubmessageId::INFO_REPLY_IP4 => info(id, flags, body, receiver)?,
         SubmessageId::ACKNACK => {
             let (reader, writer) = from_reader(&mut body, receiver)?;
             Body::AckNack(AckNack {
@@ -301,6 +263,61 @@ pub(super) fn read<'a>(
         | SubmessageId::SEC_POSTFIX
         | SubmessageId::SRTPS_PREFIX
         | SubmessageId::SRTPS_POSTFIX => Body::Secure(body.rest()),
+        _ => Body::Unknown(body.rest()),
+    })
+}
+
+/// Reads one of the INFO submessages, which change the receiver state (RTPS 2.5, 8.3.4).
+fn info<'a>(
+    id: SubmessageId,
+    flags: SubmessageFlags,
+    mut body: Cursor<'a>,
+    receiver: &mut Receiver,
+) -> Result<Body<'a>, WireError> {
+    Ok(match id {
+        SubmessageId::INFO_TS => {
+            receiver.timestamp = if flags.contains(SubmessageFlags::INVALIDATE) {
+                RtpsTime::default()
+            } else {
+                let seconds = body.u32("INFO_TS seconds")?;
+                let fraction = body.u32("INFO_TS fraction")?;
+                RtpsTime(u64::from(seconds) << 32 | u64::from(fraction))
+            };
+            Body::InfoTimestamp
+        }
+        SubmessageId::INFO_SRC => {
+            body.take("INFO_SRC unused", 4)?;
+            let [major, minor] = body.array("INFO_SRC version")?;
+            // RTPS 2.5, 8.3.8.9.4: the time in force ends with the source it came from.
+            *receiver = Receiver {
+                version: ProtocolVersion { major, minor },
+                vendor: VendorId(body.array("INFO_SRC vendor")?),
+                source: GuidPrefix(body.array("INFO_SRC prefix")?),
+                destination: receiver.destination,
+                timestamp: RtpsTime::default(),
+            };
+            Body::InfoSource
+        }
+        SubmessageId::INFO_DST => {
+            receiver.destination = GuidPrefix(body.array("INFO_DST prefix")?);
+            Body::InfoDestination
+        }
+        SubmessageId::INFO_REPLY => {
+            let unicast = LocatorList::read(&mut body)?;
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
+                .then(|| LocatorList::read(&mut body))
+                .transpose()?;
+            Body::InfoReply(InfoReply::Lists(unicast, multicast))
+        }
+        SubmessageId::INFO_REPLY_IP4 => {
+            let unicast = locator_ip4(&mut body)?;
+            let multicast = flags
+                .contains(SubmessageFlags::MULTICAST)
+                .then(|| locator_ip4(&mut body))
+                .transpose()?;
+            Body::InfoReply(InfoReply::Ip4(unicast, multicast))
+        }
         _ => Body::Unknown(body.rest()),
     })
 }

@@ -5,9 +5,8 @@
 
 use std::fs::File;
 use std::io;
-use std::mem::size_of_val;
 use std::ops::Deref;
-use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, OwnedFd};
 
 use aya::Ebpf;
 use aya::maps::ring_buf::RingBufItem;
@@ -16,13 +15,13 @@ use aya::programs::ProgramFd;
 use ros2probe_wire::host::{Piece, Socket};
 use zerocopy::FromBytes;
 
+use super::super::bpf;
 use super::super::tracepoints::{KernelLayout, Tracepoints};
 use super::{
     Filter, FilterError, FilterSettings, UNUSED, failed, load_program, open, ring_size, take,
 };
 
-/// `BPF_LINK_CREATE` and the attach types of linux/bpf.h.
-const LINK_CREATE: libc::c_int = 28;
+/// Attach types of linux/bpf.h.
 const INGRESS: u32 = 0;
 const EGRESS: u32 = 1;
 
@@ -206,26 +205,6 @@ impl Links {
 /// What is not a link would outlive the process; the kernels that have the maps we need (5.8) have
 /// links (5.7).
 fn link(program: &OwnedFd, cgroup: &File, direction: u32) -> io::Result<OwnedFd> {
-    // Program, target, attach type, flags.
-    let attributes = [
-        program.as_raw_fd().cast_unsigned(),
-        cgroup.as_raw_fd().cast_unsigned(),
-        direction,
-        0,
-    ];
-    // SAFETY: the attributes' size is given and they outlive the call.
-    let link = unsafe {
-        libc::syscall(
-            libc::SYS_bpf,
-            LINK_CREATE,
-            attributes.as_ptr(),
-            size_of_val(&attributes),
-        )
-    };
-    let link = libc::c_int::try_from(link).map_err(io::Error::other)?;
-    if link < 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: a descriptor just made, which nobody else owns.
-    Ok(unsafe { OwnedFd::from_raw_fd(link) })
+    let [program, cgroup] = [program.as_raw_fd(), cgroup.as_raw_fd()].map(i32::cast_unsigned);
+    bpf::create_link(program, cgroup, direction)
 }

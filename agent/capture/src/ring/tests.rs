@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, PacketType, Payload};
+use rustix::thread::{CapabilitySet, capabilities, set_capabilities};
 
 use super::*;
 use crate::filter::{Filter, FilterSettings};
@@ -405,7 +406,9 @@ fn fragments_from_the_ring_become_datagrams_in_both_ip_versions() {
 #[test]
 fn without_the_capability_the_error_names_it() {
     let thread = std::thread::spawn(|| {
-        if caps::clear(None, caps::CapSet::Effective).is_err() {
+        let mut sets = capabilities(None).unwrap();
+        sets.effective = CapabilitySet::empty();
+        if set_capabilities(None, sets).is_err() {
             return None;
         }
         Some(Ring::open(SMALL, None).unwrap_err())

@@ -4,7 +4,9 @@
 //! ports announce is read once. Ports that are silent are looked at less often, so that a hundred
 //! idle ones cost little. Sleeping between looks is the caller's.
 
-use std::collections::{HashMap, HashSet, VecDeque};
+mod recent_messages;
+
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use ros2probe_wire::record::{Record, flag};
@@ -19,12 +21,11 @@ use super::port::Port;
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
 use crate::system::thread_cpu;
+use recent_messages::{Identity, RecentMessages};
 
 /// Ports and segments that are open at once.
 const MAX_PORTS: usize = 512;
 const MAX_SEGMENTS: usize = 512;
-/// Messages remembered, so that one is not read again at another port.
-const REMEMBERED: usize = 8192;
 /// Messages read in one look; the rest of a flood is read in the next.
 const PER_LOOK: usize = 2048;
 const PER_LOOK_IN_A_HURRY: usize = 64;
@@ -124,21 +125,6 @@ enum Segment {
     Open(SharedFile, u64),
     /// Not to be opened, as of then.
     Missing(u64),
-}
-
-/// The latest messages by where they lay.
-#[derive(Default)]
-struct RecentMessages {
-    set: HashSet<Identity>,
-    order: VecDeque<Identity>,
-}
-
-/// One use of one buffer.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
-struct Identity {
-    serial: u64,
-    node: u32,
-    validity: u32,
 }
 
 /// When a message was read: its times and whether those tell when it was sent.
@@ -581,19 +567,6 @@ impl Tap {
         let directory = self.directories.directories.get(&directory);
         let name = Name::Segment(generation, id).file_name();
         directory.is_some_and(|directory| locks.is_abandoned(&directory.path.join(name)))
-    }
-}
-
-impl RecentMessages {
-    fn add(&mut self, identity: Identity) {
-        if self.order.len() >= REMEMBERED
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.set.remove(&oldest);
-        }
-        if self.set.insert(identity) {
-            self.order.push_back(identity);
-        }
     }
 }
 

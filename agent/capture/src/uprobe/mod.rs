@@ -21,9 +21,9 @@ use super::filter_reader::FilterReader;
 use super::shm::directories::Scope;
 use super::system::Clocks;
 use crate::threads::Spawn;
-use caps::{CapSet, Capability, CapsHashSet};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
+use rustix::thread::{CapabilitySet, capabilities};
 
 /// A process hands over a hundred thousand messages a second if it can, ten times what a socket
 /// takes: its ring is larger by this.
@@ -54,28 +54,27 @@ pub enum UprobeError {
 
 /// Capabilities that uprobes in other processes need. `CAP_PERFMON` alone sufficed from Linux 5.8 on,
 /// and later kernels refuse it. Reading which files the processes of other users map needs both.
-const REQUIRED: [(Capability, &str); 2] = [
-    (Capability::CAP_SYS_ADMIN, "CAP_SYS_ADMIN"),
-    (Capability::CAP_SYS_PTRACE, "CAP_SYS_PTRACE"),
+const REQUIRED: [(CapabilitySet, &str); 2] = [
+    (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
+    (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE"),
 ];
 
-/// Whether attaching uprobes needs this capability.
+/// Capabilities that attaching uprobes needs.
 #[must_use]
-pub fn requires(capability: Capability) -> bool {
-    REQUIRED.iter().any(|(one, _)| *one == capability)
+pub fn required() -> CapabilitySet {
+    REQUIRED.iter().map(|(one, _)| *one).collect()
 }
 
 /// Names of the capabilities that attaching uprobes needs and `effective` lacks.
 #[must_use]
-pub fn lacking(effective: &CapsHashSet) -> Vec<&'static str> {
-    let lacking = REQUIRED.iter().filter(|(one, _)| !effective.contains(one));
+pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
+    let lacking = REQUIRED.iter().filter(|(one, _)| !effective.contains(*one));
     lacking.map(|(_, name)| *name).collect()
 }
 
 /// What the calling thread lacks; nothing when its capabilities cannot be read.
 fn missing() -> Vec<&'static str> {
-    let effective = caps::read(None, CapSet::Effective);
-    effective.map_or_else(|_| Vec::new(), |effective| lacking(&effective))
+    capabilities(None).map_or_else(|_| Vec::new(), |sets| lacking(sets.effective))
 }
 
 /// The kernel programs and the thread that attaches them.

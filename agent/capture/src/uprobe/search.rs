@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 
 use super::library::{self, LibraryError};
 use super::processes::{LibraryId, Mapped, Processes, is_library};
+use crate::error_chain::in_words;
 use crate::filter::{FilterError, Probe, Probes};
-use crate::live::in_words;
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::DirectoryWatch;
 use crate::threads::{Spawn, Task};

@@ -121,7 +121,7 @@ impl ReplayAgent {
         let watches = Arc::new(watches);
         let settings = observer::Settings {
             // No kernel has to be told first.
-            telling: 0,
+            payload_delay: 0,
             ..observer::Settings::default().with_limits(&config.limits)
         };
         let token = CancellationToken::new();

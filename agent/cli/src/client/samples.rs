@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::{Agent, ClientError, Lines, Next};
 use ros2probe_api::samples::{self, Line, Open};
@@ -141,7 +141,7 @@ impl<'a> Samples<'a> {
         };
         let message_type = message_type.or_else(opened).unwrap_or_default();
         let topic = Arc::new(Topic {
-            domain_id,
+            domain_id: DomainId(domain_id),
             name: name.into(),
             dds_name: format!("rt{name}").into(),
             message_type: message_type.into(),

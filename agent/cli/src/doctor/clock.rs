@@ -103,9 +103,9 @@ fn milliseconds(microseconds: i64) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::host_state::ClockState;
     use super::super::host_state::tests::host;
     use super::*;
+    use ros2probe_capture::system::ClockState;
 
     fn found(clock: Result<ClockState, String>) -> Finding {
         let (_directory, mut host) =

@@ -9,7 +9,10 @@ use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use caps::{CapSet, CapsHashSet};
+use ros2probe_capture::system::{ClockState, clock_state};
+use rustix::param::page_size;
+use rustix::process::{Gid, getegid, geteuid, getgroups};
+use rustix::thread::{CapabilitySet, capabilities};
 
 /// Bytes of one file that are read, unless a check says otherwise.
 const MAX_FILE: u64 = 256 << 10;
@@ -21,10 +24,10 @@ const MAX_NAMES: usize = 1 << 16;
 pub struct HostState {
     /// `/proc`, `/sys`, `/etc` and `/run`.
     pub files: Files,
-    /// Bytes of a page; 0 = not known.
+    /// Bytes of a page.
     pub page_bytes: u64,
     /// Effective capabilities of this process.
-    pub capabilities: CapsHashSet,
+    pub capabilities: CapabilitySet,
     /// Effective user.
     pub user_id: u32,
     /// Its groups.
@@ -33,17 +36,6 @@ pub struct HostState {
     pub environment: BTreeMap<String, String>,
     /// What the kernel says of the clock.
     pub clock: Result<ClockState, String>,
-}
-
-/// The kernel's state of its clock, `adjtimex(2)`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ClockState {
-    /// Somebody keeps it synchronised.
-    pub synchronised: bool,
-    /// Estimated error in microseconds.
-    pub estimated_error: i64,
-    /// Largest error in microseconds.
-    pub maximum_error: i64,
 }
 
 /// Files below a root.
@@ -70,16 +62,15 @@ impl HostState {
     /// This one.
     #[must_use]
     pub fn read() -> Self {
-        // SAFETY: none of these has preconditions.
-        let user_id = unsafe { libc::geteuid() };
         Self {
             files: Files::below("/"),
-            page_bytes: page_bytes(),
-            capabilities: caps::read(None, CapSet::Effective).unwrap_or_default(),
-            user_id,
+            page_bytes: page_size() as u64,
+            capabilities: capabilities(None)
+                .map_or_else(|_| CapabilitySet::empty(), |sets| sets.effective),
+            user_id: geteuid().as_raw(),
             group_ids: group_ids(),
             environment: environment(),
-            clock: clock(),
+            clock: clock_state().map_err(|error| error.to_string()),
         }
     }
 
@@ -182,22 +173,10 @@ pub fn base_name(path: &str) -> &str {
         .unwrap_or(path)
 }
 
-fn page_bytes() -> u64 {
-    // SAFETY: sysconf has no preconditions.
-    let bytes = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
-    u64::try_from(bytes).unwrap_or(0)
-}
-
 fn group_ids() -> Vec<u32> {
-    // SAFETY: has no preconditions.
-    let own = unsafe { libc::getegid() };
-    let mut groups = vec![0; 1024];
-    let room = libc::c_int::try_from(groups.len()).unwrap_or(0);
-    // SAFETY: `groups` has room for so many.
-    let count = unsafe { libc::getgroups(room, groups.as_mut_ptr()) };
-    groups.truncate(usize::try_from(count).unwrap_or(0));
-    groups.push(own);
-    groups
+    let groups = getgroups().unwrap_or_default();
+    let groups = groups.into_iter().chain([getegid()]);
+    groups.map(Gid::as_raw).collect()
 }
 
 fn environment() -> BTreeMap<String, String> {
@@ -208,21 +187,6 @@ fn environment() -> BTreeMap<String, String> {
             (text(name), text(value))
         })
         .collect()
-}
-
-fn clock() -> Result<ClockState, String> {
-    // SAFETY: a `timex` is plain numbers, for which zero is a value; zero modes change nothing.
-    let mut state: libc::timex = unsafe { std::mem::zeroed() };
-    // SAFETY: `state` is ours and outlives the call.
-    let result = unsafe { libc::adjtimex(&raw mut state) };
-    if result < 0 {
-        return Err(io::Error::last_os_error().to_string());
-    }
-    Ok(ClockState {
-        synchronised: result != libc::TIME_ERROR && state.status & libc::STA_UNSYNC == 0,
-        estimated_error: state.esterror,
-        maximum_error: state.maxerror,
-    })
 }
 
 #[cfg(test)]
@@ -240,7 +204,7 @@ pub(super) mod tests {
         let host = HostState {
             files: Files::below(directory.path()),
             page_bytes: 4096,
-            capabilities: CapsHashSet::new(),
+            capabilities: CapabilitySet::empty(),
             user_id: 1000,
             group_ids: vec![1000],
             environment: BTreeMap::new(),

@@ -28,7 +28,7 @@ use finding::Finding;
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
-use ros2probe_capture::live::in_words;
+use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
@@ -114,7 +114,7 @@ pub fn examine_capture(answers: &Answers, name: &str) -> Report {
 
 /// What an agent would see: tried, where that is allowed. Not in other processes' code.
 fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
-    if let Some(missing) = privilege::missing(&host.capabilities, settings) {
+    if let Some(missing) = privilege::missing(host.capabilities, settings) {
         return visibility::untried(&format!("lacks {}", missing.needs()));
     }
     let mut settings = settings.clone();

@@ -43,8 +43,7 @@ pub fn check(
 }
 
 fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Finding {
-    let mut held: Vec<_> = host.capabilities.iter().map(ToString::to_string).collect();
-    held.sort();
+    let held = privilege::capability_names(host.capabilities);
     let held = match held.len() {
         0 => "none".to_owned(),
         1..=8 => held.join(", "),
@@ -53,7 +52,7 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
     let report = |severity, sentence: String| {
         Finding::new(AREA, "capabilities", severity, sentence).seen(&held, "CapEff, this process")
     };
-    match privilege::missing(&host.capabilities, settings) {
+    match privilege::missing(host.capabilities, settings) {
         None => report(Severity::Ok, "this shell may capture".to_owned()),
         Some(_) if is_running => report(
             Severity::Ok,
@@ -116,7 +115,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
     }
-    let missing = ros2probe_capture::uprobe::lacking(&host.capabilities);
+    let missing = ros2probe_capture::uprobe::lacking(host.capabilities);
     if missing.is_empty() {
         return None;
     }
@@ -203,7 +202,7 @@ fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
-    use caps::{Capability, CapsHashSet};
+    use rustix::thread::CapabilitySet;
 
     use super::super::host_state::tests::host;
     use super::*;
@@ -246,8 +245,7 @@ mod tests {
                 .any(|remedy| remedy.line.starts_with("sudo setcap "))
         );
         assert_eq!(own(&host, &settings, true).severity, Severity::Ok);
-        host.capabilities =
-            CapsHashSet::from([Capability::CAP_SYS_ADMIN, Capability::CAP_NET_ADMIN]);
+        host.capabilities = CapabilitySet::SYS_ADMIN | CapabilitySet::NET_ADMIN;
         assert_eq!(own(&host, &settings, false).severity, Severity::Ok);
     }
 

@@ -107,11 +107,8 @@ fn an_agent_that_may_only_look_at_the_wire_says_so() -> Result<()> {
     Ok(())
 }
 
-#[test]
-fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> Result<()> {
-    let host = Namespace::alone()?;
-    let directory = tempfile::tempdir()?;
-    let file = |name: &str| -> PathBuf { directory.path().join(name) };
+/// A host that knows the package's user, and the files that package and service manager make.
+fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     for (name, line) in [
         (
@@ -129,7 +126,7 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
         chown(file(name), Some(USER), Some(USER))?;
     }
     let socket = file("run").join("api.sock");
-    let capture = at_the_sockets_of(&host);
+    let capture = at_the_sockets_of(host);
     let configuration = format!(
         "{capture}state_directory: {}\napi: {{socket: {}}}\n",
         file("state").display(),
@@ -147,6 +144,16 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
     for open in ["", "start", "rp"] {
         std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
     }
+    Ok(())
+}
+
+#[test]
+fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let file = |name: &str| -> PathBuf { directory.path().join(name) };
+    let socket = file("run").join("api.sock");
+    installed(&host, &file)?;
     let log = file("log");
     let mut agent = Agent::start_logging(&host, file("start"), &file("ros2probe.yaml"), &log)?;
     // What the thread at shared memory keeps depends on what root has here; the rest has nothing.

@@ -2,6 +2,8 @@
 //! in the bag or counted as missing, however the recording, its reader or its storage ends. Needs
 //! root.
 
+mod robot;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
 use std::io::Write as _;
@@ -11,6 +13,7 @@ use std::sync::{PoisonError, RwLock};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
+use robot::{Recorder, Robot, is_exact, numbers, sent, settled};
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -45,28 +48,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (Stack::Cyclone, "/imu", 320, SMALL),
         (Stack::Fast, "/odom", 320, SMALL),
     ];
-    let mut pairs = Vec::new();
-    for (stack, topic, size, count) in streams {
-        let small = Stream::small(2 * count);
-        let stream = Stream {
-            topic: topic.to_owned(),
-            size,
-            rate: if size == CLOUD { 20.0 } else { small.rate },
-            reliable: true,
-            depth: if size == CLOUD { 20 } else { 1000 },
-            stretch: count,
-            linger: 60.0,
-            ..small
-        };
-        let subscriber = Peer::launch(&host, stack, Role::Subscriber, &stream, &["/map"])?;
-        let publisher = Peer::launch(&host, stack, Role::Publisher, &stream, &["/driver"])?;
-        pairs.push((topic, count, publisher, subscriber));
-    }
-    for (_, _, publisher, subscriber) in &mut pairs {
-        subscriber.wait_ready()?;
-        publisher.wait_ready()?;
-        publisher.wait_matched()?;
-    }
+    let mut pairs = start_pairs(&host, &streams)?;
     robot.agent.scrape_until("published", |page| {
         let is_known = |topic| page.sum("ros2_topic_publishers", &[("topic", topic)]) > 0.0;
         streams.iter().all(|(_, topic, ..)| is_known(topic))
@@ -91,33 +73,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         (robot.bags().join("all"), ended["report"].clone()),
         (by_client.clone(), report_of(&by_client)?),
     ] {
-        let numbers = numbers(&bag)?;
-        let mut messages = 0;
-        for (topic, count, publisher, _) in &pairs {
-            let sent = sent(publisher)?;
-            let recorded = numbers.get(*topic).cloned().unwrap_or_default();
-            messages += recorded.len();
-            let missing = missing(&report, topic);
-            eprintln!(
-                "{}: {topic}: {} of {} recorded, {missing} missing",
-                bag.display(),
-                recorded.len(),
-                sent.len()
-            );
-            ensure!(sent.len() as u64 == *count, "{topic}: {} sent", sent.len());
-            ensure!(recorded.is_subset(&sent), "{topic}");
-            if is_exact(&page) {
-                let all = recorded.len() as u64 + missing;
-                ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
-            }
-            ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
-        }
-        ensure!(report["messages"] == messages, "{messages} of {report:#}");
-        let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
-        ensure!(
-            code == Some(0) && info.contains(&format!("Messages:          {messages}\n")),
-            "{info}"
-        );
+        all_or_counted(&bag, &report, &pairs, &page)?;
     }
     if is_exact(&page) {
         for (topic, count, ..) in &pairs {
@@ -134,14 +90,82 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
         }
     }
 
-    // A reader that does nothing for a while, with room for four clouds.
+    a_slow_reader_loses_the_largest(&robot, &mut pairs)
+}
+
+/// Topic, messages of each stretch, publisher and subscriber.
+type Pair = (&'static str, u64, Peer, Peer);
+
+fn start_pairs(
+    host: &Namespace,
+    streams: &[(Stack, &'static str, usize, u64)],
+) -> Result<Vec<Pair>> {
+    let mut pairs = Vec::new();
+    for (stack, topic, size, count) in streams.iter().copied() {
+        let small = Stream::small(2 * count);
+        let stream = Stream {
+            topic: topic.to_owned(),
+            size,
+            rate: if size == CLOUD { 20.0 } else { small.rate },
+            reliable: true,
+            depth: if size == CLOUD { 20 } else { 1000 },
+            stretch: count,
+            linger: 60.0,
+            ..small
+        };
+        let subscriber = Peer::launch(host, stack, Role::Subscriber, &stream, &["/map"])?;
+        let publisher = Peer::launch(host, stack, Role::Publisher, &stream, &["/driver"])?;
+        pairs.push((topic, count, publisher, subscriber));
+    }
+    for (_, _, publisher, subscriber) in &mut pairs {
+        subscriber.wait_ready()?;
+        publisher.wait_ready()?;
+        publisher.wait_matched()?;
+    }
+    Ok(pairs)
+}
+
+/// Each message of the first stretch is in the bag, or its report counts it as missing.
+fn all_or_counted(bag: &Path, report: &Value, pairs: &[Pair], page: &Scrape) -> Result<()> {
+    let numbers = numbers(bag)?;
+    let mut messages = 0;
+    for (topic, count, publisher, _) in pairs {
+        let sent = sent(publisher)?;
+        let recorded = numbers.get(*topic).cloned().unwrap_or_default();
+        messages += recorded.len();
+        let missing = missing(report, topic);
+        eprintln!(
+            "{}: {topic}: {} of {} recorded, {missing} missing",
+            bag.display(),
+            recorded.len(),
+            sent.len()
+        );
+        ensure!(sent.len() as u64 == *count, "{topic}: {} sent", sent.len());
+        ensure!(recorded.is_subset(&sent), "{topic}");
+        if is_exact(page) {
+            let all = recorded.len() as u64 + missing;
+            ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
+        }
+        ensure!(recorded.len() as u64 * 2 > *count, "{topic}: {report:#}");
+    }
+    ensure!(report["messages"] == messages, "{messages} of {report:#}");
+    let (code, info) = rp(&["bag", "info", &bag.display().to_string()])?;
+    ensure!(
+        code == Some(0) && info.contains(&format!("Messages:          {messages}\n")),
+        "{info}"
+    );
+    Ok(())
+}
+
+/// A reader that does nothing for a while, with room for four clouds.
+fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Result<()> {
     let arguments = ["/front", "/imu", "--max-cache-size", "3000000"];
-    let mut slow = Recorder::start(&robot, "slow", &arguments)?;
+    let mut slow = Recorder::start(robot, "slow", &arguments)?;
     slow.process.signal("STOP")?;
-    for (_, _, publisher, _) in &mut pairs {
+    for (_, _, publisher, _) in pairs.iter_mut() {
         publisher.go()?;
     }
-    let page = settled(&robot, &pairs, 2)?;
+    let page = settled(robot, pairs, 2)?;
     let memory = Usage::of(robot.agent.process.pid())?.memory.unreclaimable;
     let queued = page.sum("ros2probe_queued_bytes", &[]);
     eprintln!("agent {} MB with {queued} bytes queued", memory >> 20);
@@ -154,7 +178,7 @@ fn every_message_is_in_the_bags_or_counted_as_missing() -> Result<()> {
     ensure!(slow.interrupt()?.code() == Some(0), "{}", slow.stderr());
     let bag = robot.directory.path().join("slow");
     let (numbers, report) = (numbers(&bag)?, report_of(&bag)?);
-    for (topic, count, publisher, _) in &pairs {
+    for (topic, count, publisher, _) in &*pairs {
         let Some(recorded) = numbers.get(*topic) else {
             ensure!(!matches!(*topic, "/front" | "/imu"), "{topic}: {report:#}");
             continue;
@@ -197,15 +221,7 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     let (mut imu, _subscriber) = robot.pair(&Stream::small(1_000_000))?;
     imu.go()?;
 
-    let long = "x".repeat(10_000);
-    for name in ["../x", "", ".x", "a/b", "a\nb", &long] {
-        let (status, problem) = robot.ask("POST", "/recordings", &json!({"name": name}))?;
-        ensure!(status == 422, "{name:.40}: {status} {problem}");
-    }
-    let endless = json!({"name": "x".repeat(1 << 20)});
-    let (status, problem) = robot.ask("POST", "/recordings", &endless)?;
-    ensure!(status == 413, "{status} {problem}");
-    ensure!(fs::read_dir(robot.bags())?.count() == 0);
+    names_that_lead_elsewhere_are_refused(&robot)?;
 
     // Every message of the time is in the bag, was let go by, or is counted as missing.
     let wanted = json!({"name": "led", "topics": {"topics": ["/imu"]}});
@@ -239,9 +255,7 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     ensure!((status, &led["state"]) == (200, &json!("ended")), "{led}");
     ensure!(led["error"].is_null(), "{led}");
     let bag = robot.bags().join("led");
-    let numbers_of =
-        |bag: &Path| -> Result<BTreeSet<u64>> { numbers(bag)?.remove("/imu").context("no /imu") };
-    let recorded = numbers_of(&bag)?;
+    let recorded = numbers_of_imu(&bag)?;
     ensure!(recorded.len() as u64 == count(&led, "messages"), "{led:#}");
     let accounted = recorded.len() as u64 + count(&led, "paused") + missing(&led["report"], "/imu");
     ensure!(span(&recorded)? == accounted, "{recorded:?} {led:#}");
@@ -268,7 +282,34 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     client.process.wait(PATIENCE)?;
     repaired(&killed, &imu, end)?;
 
-    // What was before the silence is in a bag of its own.
+    snapshots_are_taken_of_silence_and_on_request(&robot, &mut imu)?;
+
+    // The agent is killed.
+    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
+    robot.ask("POST", "/recordings", &wanted)?;
+    let last = robot.bags().join("last");
+    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
+    robot.agent.process.signal("KILL")?;
+    let end = now();
+    robot.agent.process.wait(PATIENCE)?;
+    repaired(&last, &imu, end)
+}
+
+fn names_that_lead_elsewhere_are_refused(robot: &Robot<'_>) -> Result<()> {
+    let long = "x".repeat(10_000);
+    for name in ["../x", "", ".x", "a/b", "a\nb", &long] {
+        let (status, problem) = robot.ask("POST", "/recordings", &json!({"name": name}))?;
+        ensure!(status == 422, "{name:.40}: {status} {problem}");
+    }
+    let endless = json!({"name": "x".repeat(1 << 20)});
+    let (status, problem) = robot.ask("POST", "/recordings", &endless)?;
+    ensure!(status == 413, "{status} {problem}");
+    ensure!(fs::read_dir(robot.bags())?.count() == 0);
+    Ok(())
+}
+
+/// What was before the silence is in a bag of its own; a request and a signal make one each.
+fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Peer) -> Result<()> {
     imu.process.signal("STOP")?;
     let written = |page: &Scrape| page.sum("ros2probe_snapshots_written_total", &[]);
     robot
@@ -279,9 +320,9 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
         anyhow::bail!("{events:?}");
     };
     let name = taken["attributes"]["recording"].as_str();
-    let before = numbers_of(&robot.bags().join(name.context("no name")?))?;
+    let before = numbers_of_imu(&robot.bags().join(name.context("no name")?))?;
     // It may have been stopped between sending and saying so.
-    let last = sent(&imu)?.last().copied().context("nothing sent")?;
+    let last = sent(imu)?.last().copied().context("nothing sent")?;
     let is_last = before.last().is_some_and(|it| it.abs_diff(last) <= 1);
     ensure!(is_last, "{last} of {before:?}");
     ensure!((100..=2200).contains(&before.len()), "{before:?}");
@@ -298,16 +339,11 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     robot
         .agent
         .scrape_until("three snapshots", |page| written(page) == 3.0)?;
+    Ok(())
+}
 
-    // The agent is killed.
-    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
-    robot.ask("POST", "/recordings", &wanted)?;
-    let last = robot.bags().join("last");
-    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
-    robot.agent.process.signal("KILL")?;
-    let end = now();
-    robot.agent.process.wait(PATIENCE)?;
-    repaired(&last, &imu, end)
+fn numbers_of_imu(bag: &Path) -> Result<BTreeSet<u64>> {
+    numbers(bag)?.remove("/imu").context("no /imu")
 }
 
 #[test]
@@ -386,211 +422,6 @@ if test -e "$1/bag"; then cp -r "$1/bag" "$5"; fi; exit $code"#
         );
     }
     Ok(())
-}
-
-/// An agent with a place for bags.
-struct Robot<'a> {
-    host: &'a Namespace,
-    directory: TempDir,
-    socket: PathBuf,
-    agent: Agent<'a>,
-}
-
-impl<'a> Robot<'a> {
-    fn start(host: &'a Namespace, settings: &str, enter: &[String]) -> Result<Robot<'a>> {
-        Robot::start_in(host, settings, enter, tempfile::tempdir()?)
-    }
-
-    /// `enter` mounts over the place for bags, which it is given as its next word.
-    fn start_on_disk(
-        host: &'a Namespace,
-        settings: &str,
-        mut enter: Vec<String>,
-    ) -> Result<Robot<'a>> {
-        let directory = tempfile::tempdir()?;
-        enter.push(directory.path().join("bags").display().to_string());
-        Robot::start_in(host, settings, &enter, directory)
-    }
-
-    fn start_in(
-        host: &'a Namespace,
-        settings: &str,
-        enter: &[String],
-        directory: TempDir,
-    ) -> Result<Robot<'a>> {
-        let socket = directory.path().join("api.sock");
-        let bags = directory.path().join("bags");
-        fs::create_dir(&bags)?;
-        let mut all: serde_json::Map<String, Value> = serde_yaml::from_str(settings)?;
-        all.insert(
-            "capture".to_owned(),
-            json!({"source": "host", "cgroup": host.cgroup(), "shm": {"mode": "off"}}),
-        );
-        all.insert("api".to_owned(), json!({"socket": &socket}));
-        all.insert("state_directory".to_owned(), json!(directory.path()));
-        let recordings = all.entry("recordings").or_insert(json!({}));
-        recordings["directory"] = json!(&bags);
-        // Disks are filled to the last byte here.
-        recordings["reserve_percent"] = json!(0);
-        recordings["reserve_bytes"] = json!(0);
-        let configuration = directory.path().join("ros2probe.yaml");
-        fs::write(&configuration, serde_json::to_string(&all)?)?;
-        let arguments = [Path::new("run"), Path::new("--config"), &configuration];
-        let process = Process::start(enter, RP, arguments)?;
-        let mut agent = Agent { process, host };
-        agent.wait_ready(PATIENCE)?;
-        Ok(Robot {
-            host,
-            directory,
-            socket,
-            agent,
-        })
-    }
-
-    fn bags(&self) -> PathBuf {
-        self.directory.path().join("bags")
-    }
-
-    /// A publisher that is known to the agent, held, and its subscriber.
-    fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
-        let start = |role, node| Peer::start(self.host, Stack::Cyclone, role, stream, &[node]);
-        let subscriber = start(Role::Subscriber, "/map")?;
-        let mut publisher = start(Role::Publisher, "/driver")?;
-        publisher.wait_matched()?;
-        let topic = [("topic", stream.topic.as_str())];
-        self.agent.scrape_until("published", |page| {
-            page.sum("ros2_topic_publishers", &topic) > 0.0
-        })?;
-        Ok((publisher, subscriber))
-    }
-
-    /// The status of an answer, and what it says.
-    fn ask(&self, method: &str, path: &str, body: &Value) -> Result<(u16, Value)> {
-        let text = self.curl(method, path, body)?;
-        let (body, status) = text.rsplit_once('\n').context("no status")?;
-        let value = serde_json::from_str(body).with_context(|| text.clone())?;
-        Ok((status.parse()?, value))
-    }
-
-    /// All events of these names so far.
-    fn events(&self, names: &str) -> Result<Vec<Value>> {
-        let path = format!("/events?after=0&follow=false&name={names}");
-        let text = self.curl("GET", &path, &Value::Null)?;
-        let data = text.lines().filter_map(|line| line.strip_prefix("data: "));
-        let events = data.map(serde_json::from_str).collect::<Result<_, _>>();
-        events.with_context(|| text.clone())
-    }
-
-    fn curl(&self, method: &str, path: &str, body: &Value) -> Result<String> {
-        let mut curl = Command::new("curl");
-        curl.args(["--silent", "--show-error", "--globoff", "--max-time", "60"])
-            .args(["--write-out", "\n%{http_code}", "--request", method])
-            .arg("--unix-socket")
-            .arg(&self.socket)
-            .arg(format!("http://localhost{path}"));
-        if !body.is_null() {
-            curl.args(["--header", "content-type: application/json"])
-                .args(["--data-binary", "@-"]);
-        }
-        let mut child = curl
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .spawn()
-            .context("cannot run curl")?;
-        let mut input = child.stdin.take().context("no input")?;
-        if !body.is_null() {
-            // An answer may come before all of it was taken.
-            let _ = input.write_all(body.to_string().as_bytes());
-        }
-        drop(input);
-        let output = child.wait_with_output()?;
-        Ok(String::from_utf8_lossy(&output.stdout).into_owned())
-    }
-}
-
-/// An `rp bag record` that has begun.
-struct Recorder {
-    process: Process,
-    stderr: PathBuf,
-}
-
-impl Recorder {
-    fn start(robot: &Robot<'_>, name: &str, arguments: &[&str]) -> Result<Recorder> {
-        let stderr = robot.directory.path().join(format!("{name}.said"));
-        let output = robot.directory.path().join(name);
-        let mut words = vec!["bag".to_owned(), "record".to_owned()];
-        words.extend(arguments.iter().map(|word| (*word).to_owned()));
-        words.extend(["-o".to_owned(), output.display().to_string()]);
-        words.extend(["--socket".to_owned(), robot.socket.display().to_string()]);
-        let mut enter = robot.host.on_network();
-        enter.extend(["env", "-u", "ROS_DISTRO", "-u", "ROS_DOMAIN_ID"].map(str::to_owned));
-        let errors = File::create(&stderr)?;
-        let process = Process::start_with(&enter, RP, words, errors.into())?;
-        let recorder = Recorder { process, stderr };
-        wait_until("it records", || {
-            Ok(recorder.stderr().contains("Recording..."))
-        })
-        .with_context(|| recorder.stderr())?;
-        Ok(recorder)
-    }
-
-    fn stderr(&self) -> String {
-        fs::read_to_string(&self.stderr).unwrap_or_default()
-    }
-
-    /// Ctrl-C.
-    fn interrupt(&mut self) -> Result<ExitStatus> {
-        self.process.signal("INT")?;
-        self.process.wait(PATIENCE)
-    }
-}
-
-/// Publishers have sent so many stretches, and the agent has counted what it will.
-fn settled(robot: &Robot<'_>, pairs: &[(&str, u64, Peer, Peer)], stretches: u64) -> Result<Scrape> {
-    let mut page = robot.agent.scrape()?;
-    for (topic, count, publisher, _) in pairs {
-        let all = stretches * count;
-        wait_until("all is sent", || Ok(sent(publisher)?.len() as u64 >= all))?;
-        page = robot.agent.settled_scrape(topic, all)?;
-    }
-    Ok(page)
-}
-
-/// Where records of messages were lost, nobody knows of those.
-fn is_exact(page: &Scrape) -> bool {
-    let lost = page.sum("ros2probe_records_dropped_total", &[]);
-    if lost > 0.0 {
-        eprintln!("too busy to be exact: {}", page.doubts());
-    }
-    lost == 0.0
-}
-
-/// Numbers of the messages that a publisher has sent, as its writer counts them.
-fn sent(publisher: &Peer) -> Result<BTreeSet<u64>> {
-    publisher.log()?.writer_numbers("pub")
-}
-
-/// Numbers in a bag by topic, each once, as another reader finds them.
-fn numbers(bag: &Path) -> Result<BTreeMap<String, BTreeSet<u64>>> {
-    let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
-    for file in fs::read_dir(bag)? {
-        let path = file?.path();
-        if path.extension().is_none_or(|extension| extension != "mcap") {
-            continue;
-        }
-        let bytes = fs::read(&path)?;
-        for message in mcap::MessageStream::new(&bytes)? {
-            let message = message.with_context(|| path.display().to_string())?;
-            let topic = numbers.entry(message.channel.topic.clone()).or_default();
-            ensure!(
-                topic.insert(message.sequence.into()),
-                "{} twice in {}",
-                message.sequence,
-                path.display()
-            );
-        }
-    }
-    Ok(numbers)
 }
 
 /// From the first to the last.

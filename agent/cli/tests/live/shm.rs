@@ -5,6 +5,8 @@
 //! Each host has a `/dev/shm` of its own, in a mount namespace as a container has it, which the agent
 //! reaches through `/proc`. The judges are the peers' logs, and what strace says of the agent.
 
+mod files;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -82,39 +84,45 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
     let share = 100.0 * (cpu(&page) - cpu(&half)) / began.elapsed().as_secs_f64();
     println!("{share:.2} % of a CPU once nobody is new");
     for stream in &streams {
-        let topic = [("topic", stream.topic.as_str())];
-        let sum = |name: &str| page.sum(name, &topic);
-        let info = [
-            ("topic", stream.topic.as_str()),
-            ("message_type", "sensor_msgs/msg/PointCloud2"),
-            ("reliability", "RELIABLE"),
-            ("durability", "VOLATILE"),
-        ];
-        assert_eq!(page.sum("ros2_topic_info", &info), 1.0, "{}", page.0);
-        let passage = [topic[0], ("passage", "shared_memory")];
-        assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
-        assert_eq!(sum("ros2_topic_pairs"), 1.0);
-        let second = count(&page, stream) - count(&half, stream);
-        assert_eq!(
-            second,
-            stream.stretch as f64,
-            "{}",
-            shared_memory_metrics(&page)
-        );
-        // A DATA is padded to four bytes where another submessage follows it.
-        let bytes = count(&page, stream) * stream.size as f64;
-        assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
-        assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
-        let coverage = sum("ros2_topic_sampled_coverage_ratio");
-        assert!(coverage > COVERAGE && coverage <= 1.0, "{coverage}");
-        let latencies = sum("ros2_topic_latency_seconds_count");
-        let seen = sum("ros2_topic_sampled_seen_messages_total");
-        assert!(
-            latencies > 0.0 && latencies <= seen,
-            "{latencies} of {seen}"
-        );
+        assert_counted(stream, &half, &page);
     }
     Ok(())
+}
+
+/// Between the two pages a stream sent its second stretch.
+fn assert_counted(stream: &Stream, half: &Scrape, page: &Scrape) {
+    let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", &stream.topic)]);
+    let topic = [("topic", stream.topic.as_str())];
+    let sum = |name: &str| page.sum(name, &topic);
+    let info = [
+        ("topic", stream.topic.as_str()),
+        ("message_type", "sensor_msgs/msg/PointCloud2"),
+        ("reliability", "RELIABLE"),
+        ("durability", "VOLATILE"),
+    ];
+    assert_eq!(page.sum("ros2_topic_info", &info), 1.0, "{}", page.0);
+    let passage = [topic[0], ("passage", "shared_memory")];
+    assert_eq!(page.sum("ros2_topic_pairs", &passage), 1.0);
+    assert_eq!(sum("ros2_topic_pairs"), 1.0);
+    let second = count(page) - count(half);
+    assert_eq!(
+        second,
+        stream.stretch as f64,
+        "{}",
+        shared_memory_metrics(page)
+    );
+    // A DATA is padded to four bytes where another submessage follows it.
+    let bytes = count(page) * stream.size as f64;
+    assert!((sum("ros2_topic_bytes_total") - bytes).abs() <= 4.0 * stream.count as f64);
+    assert_eq!(sum("ros2_topic_lost_messages_total"), 0.0);
+    let coverage = sum("ros2_topic_sampled_coverage_ratio");
+    assert!(coverage > COVERAGE && coverage <= 1.0, "{coverage}");
+    let latencies = sum("ros2_topic_latency_seconds_count");
+    let seen = sum("ros2_topic_sampled_seen_messages_total");
+    assert!(
+        latencies > 0.0 && latencies <= seen,
+        "{latencies} of {seen}"
+    );
 }
 
 #[test]
@@ -224,281 +232,6 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
     assert_eq!(sampled("/points"), 0.0);
     let lost = page.sum("ros2_topic_lost_messages_total", &[]);
     assert_eq!(lost, 0.0);
-    Ok(())
-}
-
-#[test]
-fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Result<()> {
-    let network = Namespace::alone()?;
-    let host = Host::new(&network)?;
-    let directory = tempfile::tempdir()?;
-    let agent = start_agent(&network, directory.path())?;
-    let stream = Stream {
-        count: 1_000_000,
-        ..shared()
-    };
-    let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
-    let memory = host.shared_memory();
-    let (ports, segments) = files_of(&memory)?;
-    let port = fs::read(memory.join(&ports[0]))?;
-    let number: u32 = ports[0].trim_start_matches("fastrtps_port").parse()?;
-    let at = port
-        .windows(4)
-        .position(|word| word == number.to_le_bytes())
-        .context("a port does not say its number")?;
-    for idle in 20_000..20_128_u32 {
-        let mut copy = port.clone();
-        copy[at..at + 4].copy_from_slice(&idle.to_le_bytes());
-        fs::write(memory.join(format!("fastrtps_port{idle}")), copy)?;
-    }
-    let noise: Vec<u8> = (0..70_000_u32)
-        .map(|i| (i.wrapping_mul(2_654_435_761) >> 13) as u8)
-        .collect();
-    for (name, bytes) in [
-        ("fastrtps_port21000", &noise[..]),
-        ("fastrtps_port21001", &[]),
-        ("fastrtps_port21002", &port[..300]),
-        ("fastrtps_0123456789abcdef", &noise[..]),
-        ("fastdds_port21003", &noise[..1]),
-    ] {
-        fs::write(memory.join(name), bytes)?;
-    }
-    publisher.go()?;
-    let open = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "port")]);
-    let idle = agent.scrape_until("128 more ports", |page| open(page) >= 130.0)?;
-    let topic = [("topic", "/imu")];
-    let messages = |page: &Scrape| page.sum("ros2_topic_messages_total", &topic);
-    let began = messages(&idle);
-    agent.scrape_until("messages beside them", |page| {
-        messages(page) > began + 200.0
-    })?;
-    println!("{}", shared_memory_metrics(&agent.scrape()?));
-
-    // A file of that name is somebody else's now, and the one that was open is let go.
-    let copy = memory.join("copy");
-    fs::write(&copy, fs::read(memory.join(&segments[0]))?)?;
-    std::os::unix::fs::chown(&copy, Some(65534), Some(65534))?;
-    fs::rename(&copy, memory.join(&segments[0]))?;
-    for name in files_of(&memory)?
-        .0
-        .iter()
-        .filter(|name| !ports.contains(name))
-    {
-        fs::remove_file(memory.join(name))?;
-    }
-    wait_until("what is gone is let go", || {
-        Ok(host
-            .files_open_in(&agent)?
-            .iter()
-            .all(|name| !name.ends_with(" (deleted)")))
-    })?;
-    // The peers cannot go on without their memory; the agent can.
-    for name in files_of(&memory)?.1 {
-        let file = fs::File::options().write(true).open(memory.join(name))?;
-        file.set_len(100)?;
-    }
-    std::thread::sleep(Duration::from_secs(1));
-    for peer in [&mut publisher, &mut subscriber] {
-        peer.process.signal("KILL")?;
-        peer.process.wait(PATIENCE)?;
-    }
-    host.remove_shared_memory()?;
-    wait_until("everything is let go", || {
-        Ok(host.files_open_in(&agent)?.is_empty())
-    })?;
-    // Those that were killed are there until their leases end.
-    for attempt in 1..=MEETINGS {
-        let (mut publisher, _subscriber) = host.pair(&stream)?;
-        let before = messages(&agent.scrape()?);
-        publisher.go()?;
-        let deadline = Instant::now() + Duration::from_secs(5);
-        while Instant::now() < deadline {
-            if messages(&agent.scrape()?) > before + 200.0 {
-                println!("messages again at attempt {attempt}");
-                return Ok(());
-            }
-            std::thread::sleep(Duration::from_millis(100));
-        }
-    }
-    bail!("no messages of a new pair")
-}
-
-#[test]
-fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_open() -> Result<()> {
-    let network = Namespace::alone()?;
-    let host = Host::new(&network)?;
-    let directory = tempfile::tempdir()?;
-    let agent = start_agent(&network, directory.path())?;
-    let stream = Stream {
-        count: 1_000_000,
-        ..shared()
-    };
-    let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
-    publisher.go()?;
-    let flows = || -> Result<bool> {
-        let sum = |page: Scrape| page.sum("ros2_topic_messages_total", &[("topic", "/imu")]);
-        let before = sum(agent.scrape()?);
-        std::thread::sleep(Duration::from_secs(1));
-        Ok(sum(agent.scrape()?) - before > 100.0)
-    };
-    wait_until("messages flow", flows)?;
-    let mut most = 0;
-    for round in 0..2 {
-        let role = match round % 2 {
-            0 => Role::Subscriber,
-            _ => Role::Publisher,
-        };
-        // Endpoints are announced in shared memory, too: a new publisher may go unnoticed.
-        let mut is_right_again = |attempt: u32| -> Result<bool> {
-            println!("{role:?} killed, attempt {attempt}");
-            let peer = match role {
-                Role::Subscriber => &mut subscriber,
-                Role::Publisher => &mut publisher,
-            };
-            peer.process.signal("KILL")?;
-            peer.process.wait(Duration::from_secs(5))?;
-            *peer = host.launch(role, &stream)?;
-            peer.wait_ready()?;
-            if role == Role::Publisher {
-                peer.go()?;
-            }
-            std::thread::sleep(Duration::from_secs(2));
-            most = most.max(host.files_open_in(&agent)?.len());
-            Ok(flows()? || flows()?)
-        };
-        let mut attempts = 1..=MEETINGS;
-        loop {
-            let attempt = attempts
-                .next()
-                .context("a peer that was killed is not found again")?;
-            if is_right_again(attempt)? {
-                break;
-            }
-        }
-    }
-    // A port and a segment of each of two peers, and of some that were killed and are not tidied up.
-    assert!((4..=64).contains(&most), "{most} files");
-    for peer in [&mut publisher, &mut subscriber] {
-        peer.process.terminate()?;
-    }
-    host.remove_shared_memory()?;
-    wait_until("everything is let go", || {
-        Ok(host.files_open_in(&agent)?.is_empty())
-    })?;
-    let page = agent.settled_scrape(&stream.topic, 0)?;
-    assert_eq!(page.sum("ros2_topic_lost_messages_total", &[]), 0.0);
-    assert_eq!(page.sum("ros2probe_shm_open", &[("kind", "port")]), 0.0);
-    Ok(())
-}
-
-/// Of killed processes the files stay, with what they sent last. An agent that starts then believes
-/// none of it.
-#[test]
-fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> {
-    let network = Namespace::alone()?;
-    let host = Host::new(&network)?;
-    let stream = Stream {
-        count: 400,
-        linger: 60.0,
-        ..shared()
-    };
-    let (mut publisher, mut subscriber) = host.pair(&stream)?;
-    publisher.go()?;
-    publisher.wait_sent(PATIENCE)?;
-    for peer in [&mut publisher, &mut subscriber] {
-        peer.process.signal("KILL")?;
-        peer.process.wait(PATIENCE)?;
-    }
-    let (ports, segments) = files_of(&host.shared_memory())?;
-    ensure!(!ports.is_empty() && !segments.is_empty(), "nothing is left");
-    let directory = tempfile::tempdir()?;
-    let agent = start_agent(&network, directory.path())?;
-    let looked = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "directory")]) > 0.0;
-    agent.scrape_until("shared memory is found", looked)?;
-    // Strangers are shown after 3 s.
-    std::thread::sleep(Duration::from_secs(5));
-    let page = agent.scrape()?;
-    assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0, "{}", page.0);
-    assert_eq!(page.samples("ros2_node_info", &[]).count(), 0);
-    assert_eq!(page.sum("ros2_participants", &[]), 0.0);
-    assert_eq!(page.sum("ros2probe_shm_open", &[("kind", "port")]), 0.0);
-    Ok(())
-}
-
-#[test]
-fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Result<()> {
-    let network = Namespace::alone()?;
-    let host = Host::new(&network)?;
-    let directory = tempfile::tempdir()?;
-    let agent = start_agent(&network, directory.path())?;
-    let stream = Stream {
-        count: 400,
-        linger: 60.0,
-        ..shared()
-    };
-    let (publisher, _subscriber) = host.known_pair(&agent, &stream)?;
-    let trace = directory.path().join("trace");
-    let pid = agent.process.pid().to_string();
-    let mut strace = Command::new("strace")
-        .args(["-f", "-y", "-qq", "-p", &pid, "-o"])
-        .arg(&trace)
-        .spawn()
-        .context("cannot run strace: apt-get install strace")?;
-    wait_until("strace traces", || {
-        let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
-        Ok(!status.contains("TracerPid:\t0\n"))
-    })?;
-    // Files of newcomers are opened before its eyes; it makes the agent too slow to hear names.
-    let _newcomers = host.pair(&Stream {
-        topic: "/late".to_owned(),
-        ..shared()
-    })?;
-    let page = run(&agent, publisher, &stream)?;
-    let _ = Command::new("kill")
-        .args(["-INT", &strace.id().to_string()])
-        .status();
-    strace.wait()?;
-    assert!(
-        page.sum("ros2_topic_sampled_seen_messages_total", &[]) > 0.0,
-        "{}",
-        shared_memory_metrics(&page)
-    );
-
-    let trace = fs::read_to_string(&trace)?;
-    let of_shared_memory: Vec<&str> = trace
-        .lines()
-        .filter(|line| line.contains("dev/shm"))
-        .collect();
-    for call in ["openat(", "pread64("] {
-        assert!(
-            of_shared_memory.iter().any(|line| line.contains(call)),
-            "{call}"
-        );
-    }
-    for line in of_shared_memory {
-        let (_, call) = line.trim().split_once(' ').unwrap_or_default();
-        let name = call.trim().split('(').next().unwrap_or_default();
-        let is_harmless = match name {
-            "openat" => {
-                let writes = ["O_WRONLY", "O_RDWR", "O_CREAT", "O_TRUNC"];
-                line.contains("O_RDONLY") && !writes.iter().any(|flag| line.contains(flag))
-            }
-            // The standard library's own check of a descriptor that it closes.
-            "fcntl" => line.contains("F_GETFD"),
-            "pread64" | "inotify_add_watch" | "statx" | "fstat" | "newfstatat" | "getdents64"
-            | "close" | "lseek" | "readlink" => true,
-            // What strace cut in two was looked at where it began.
-            _ => call.starts_with("<...") || call.trim().starts_with("<..."),
-        };
-        assert!(is_harmless, "{line}");
-    }
-    // Futexes of its own threads apart, the agent waits on nothing and locks nothing.
-    for call in ["flock(", "F_SETLK", "PROT_WRITE, MAP_SHARED, 3<"] {
-        let wrong = trace
-            .lines()
-            .find(|line| line.contains(call) && line.contains("shm"));
-        assert_eq!(wrong, None);
-    }
     Ok(())
 }
 

@@ -11,7 +11,7 @@ use ros2probe::config::{Limits, Watch, Watchlist};
 use ros2probe::model::history::History;
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::model::size::Size;
 use ros2probe::model::snapshot::SocketFacts;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
@@ -176,7 +176,7 @@ fn observer() -> Observer {
     observer.input(Input::Watchlist(Arc::new(
         Watchlist::new(vec![watch]).unwrap(),
     )));
-    observer.input(Input::Wishes(Arc::new(vec![Wish {
+    observer.input(Input::SampleRequests(Arc::new(vec![SampleRequest {
         id: 1,
         selection: Arc::new(Selection::all()),
         domain_id: None,
@@ -449,9 +449,9 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
             "discovery.participants",
             "discovery.pending_endpoints",
             "discovery.pending_nodes",
-            "pieces.samples",
-            "profiler.strangers",
-            "receivers.places",
+            "discovery_fragments.samples",
+            "profiler.unknown_writers",
+            "receivers.addresses",
         ],
     );
     assert!(whole < 96 << 20, "{whole} bytes");
@@ -464,7 +464,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
             "acknowledgements.readers",
             "sequence.gaps",
             "trace.finished",
-            "ways.ways",
+            "routes.routes",
         ],
     );
     assert!(whole < 96 << 20, "{whole} bytes");
@@ -510,6 +510,6 @@ fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
             handover: None,
         });
     });
-    assert_eq!(largest["receivers.places"].0, 16);
+    assert_eq!(largest["receivers.addresses"].0, 16);
     assert!(whole < 2 << 20, "{whole} bytes");
 }

@@ -8,10 +8,10 @@ use ros2probe::model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
@@ -155,7 +155,7 @@ fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
     else {
         panic!("{found:?}");
     };
-    assert_eq!((&*topic.name, topic.domain_id), ("/points", 0));
+    assert_eq!((&*topic.name, topic.domain_id), ("/points", DomainId(0)));
     assert_eq!((*offers, *requests), (writer(1, 1), reader(2, 1)));
     let expected = [Policy::Reliability, Policy::Durability, Policy::Deadline];
     assert_eq!(policies.iter().collect::<Vec<_>>(), expected);
@@ -199,7 +199,7 @@ fn endpoints_of_two_domains_are_no_pair() {
                 topic,
                 reason: Unmatched::Nobody,
                 ..
-            }] if topic.domain_id == 5
+            }] if topic.domain_id == DomainId(5)
         ),
         "{unfed:?}"
     );
@@ -350,7 +350,7 @@ fn two_nodes_of_one_name_are_found_in_one_domain_only() {
     let found = world.found("duplicate_node");
     let participant = |number| Guid::new(prefix(number), EntityId::PARTICIPANT);
     let expected = Diagnosis::DuplicateNode {
-        domain_id: 0,
+        domain_id: DomainId(0),
         node: "/lidar".into(),
         participants: vec![participant(1), participant(2), participant(2)],
     };
@@ -374,7 +374,7 @@ fn one_machine_with_a_node_in_two_domains_is_found_and_a_fleet_is_not() {
     let expected = Diagnosis::NodeInSeveralDomains {
         node: "/lidar".into(),
         participant: Guid::new(prefix(1), EntityId::PARTICIPANT),
-        domains: vec![0, 7],
+        domains: vec![DomainId(0), DomainId(7)],
     };
     assert_eq!(found, [expected]);
 }

@@ -8,6 +8,7 @@
 
 mod replayed;
 
+use ros2probe_wire::DomainId;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
@@ -113,7 +114,7 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
         assert_eq!(lease, Some(theirs.lease), "{name}: lease of {guid}");
         assert_eq!(
             (ours.domain_id, ours.enclave.as_deref()),
-            (0, Some("/")),
+            (DomainId(0), Some("/")),
             "{name}: {guid}"
         );
         let property = |key| theirs.property_list.get(key).map(String::as_str);

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use proptest::prelude::*;
 use ros2probe::model::input::Input;
-use ros2probe::model::payloads::{Given, News};
-use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::payloads::{Dispatch, SampleOutcome};
+use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::model::snapshot::Measurement;
 use ros2probe_testing::model::host::{BOB, Host, Seen};
 use ros2probe_wire::Record;
@@ -462,12 +462,13 @@ fn a_restart_fills_no_gaps_of_the_run_before() {
 fn a_doubted_message_is_given_once_and_holds_no_other_up() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    host.observer.input(Input::Wishes(Arc::new(vec![Wish {
-        id: 1,
-        selection: Arc::new(Selection::all()),
-        domain_id: None,
-        depth: Depth::Arrivals,
-    }])));
+    host.observer
+        .input(Input::SampleRequests(Arc::new(vec![SampleRequest {
+            id: 1,
+            selection: Arc::new(Selection::all()),
+            domain_id: None,
+            depth: Depth::Arrivals,
+        }])));
     let mut given = Vec::new();
     for number in 1..=100 {
         host.wait(10);
@@ -477,9 +478,9 @@ fn a_doubted_message_is_given_once_and_holds_no_other_up() {
         }
         host.data(bob, number);
         let samples = host.observer.drain().samples.into_iter();
-        given.extend(samples.filter_map(|given: Given| match given.news {
-            News::Sample(sample) => Some(sample.sequence_number),
-            News::Missed(_) => None,
+        given.extend(samples.filter_map(|given: Dispatch| match given.outcome {
+            SampleOutcome::Sample(sample) => Some(sample.sequence_number),
+            SampleOutcome::Missed(_) => None,
         }));
     }
     let expected: Vec<_> = (1..50).chain([1 << 40]).chain(50..=100).collect();

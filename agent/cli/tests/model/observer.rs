@@ -9,12 +9,12 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 use std::sync::Arc;
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000 * SECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -100,7 +100,7 @@ impl World {
 
     fn topic(&self, domain_id: u32, name: &str) -> Option<TopicFacts> {
         let mut topics = self.snapshot().topics.into_iter();
-        topics.find(|topic| topic.domain_id == domain_id && topic.name == name)
+        topics.find(|topic| topic.domain_id == DomainId(domain_id) && topic.name == name)
     }
 
     fn measurement(&self, name: &str) -> Measurement {
@@ -208,7 +208,7 @@ fn a_domain_told_by_a_better_port_moves_everything_along() {
             .is_some_and(|topic| topic.vanished)
     );
     assert_eq!(world.topic(3, "/chatter").unwrap().publishers.len(), 1);
-    assert_eq!(world.snapshot().participants[0].domain_id, 3);
+    assert_eq!(world.snapshot().participants[0].domain_id, DomainId(3));
     assert_eq!(world.churn("writer", "appeared"), 1);
 }
 
@@ -370,7 +370,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
     assert_eq!((told[0].first, told.last().unwrap().last), (2, 7));
     for burst in &told {
         assert_eq!(burst.writer, alice(WRITER));
-        assert_eq!(burst.topic, Some((0, "rt/chatter".into())));
+        assert_eq!(burst.topic, Some((DomainId(0), "rt/chatter".into())));
         assert_eq!(burst.node.as_deref(), Some("/talker"));
     }
 
@@ -381,7 +381,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
     let told = losses(&mut world);
     assert_eq!(told.len(), 1);
     assert_eq!((told[0].first, told[0].last, told[0].count), (9, 9, 1));
-    assert_eq!(told[0].topic, Some((0, "rt/chatter".into())));
+    assert_eq!(told[0].topic, Some((DomainId(0), "rt/chatter".into())));
 }
 
 #[test]
@@ -780,7 +780,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     world
         .observer
         .input(Input::Watchlist(Arc::new(watchlist(&patterns))));
-    assert!(!world.observer.has_asked_all());
+    assert!(!world.observer.has_applied_lists());
     let is_measured = |topic: &TopicFacts| topic.measurement.is_some();
     let some = world
         .snapshot()
@@ -792,7 +792,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
     // It goes on being counted.
     world.sample(alice(WRITER), 1);
     let mut rounds = 0;
-    while !world.observer.ask_more() {
+    while !world.observer.apply_more_lists() {
         rounds += 1;
     }
     assert!((2..10).contains(&rounds), "{rounds}");

@@ -6,34 +6,34 @@ use std::sync::Arc;
 use proptest::prelude::*;
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::Settings;
-use ros2probe::model::payloads::{MissedReason, News};
-use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::payloads::{MissedReason, SampleOutcome};
+use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::model::host::{ALICE, BOB, Host, MILLISECOND, READER, START, Seen, WRITER};
 use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
-fn wish(host: &mut Host, depth: Depth) {
-    wishes(host, &[1], depth);
+fn request(host: &mut Host, depth: Depth) {
+    sample_requests(host, &[1], depth);
 }
 
-fn wishes(host: &mut Host, ids: &[u64], depth: Depth) {
-    let wishes = ids.iter().map(|id| Wish {
+fn sample_requests(host: &mut Host, ids: &[u64], depth: Depth) {
+    let sample_requests = ids.iter().map(|id| SampleRequest {
         id: *id,
         selection: Arc::new(Selection::all()),
         domain_id: None,
         depth,
     });
     host.observer
-        .input(Input::Wishes(Arc::new(wishes.collect())));
+        .input(Input::SampleRequests(Arc::new(sample_requests.collect())));
 }
 
 /// A host with a reader of Bob's that acknowledges.
 fn listening() -> (Host, Seen) {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    wish(&mut host, Depth::Arrivals);
+    request(&mut host, Depth::Arrivals);
     host.acknack(bob, 1);
     (host, bob)
 }
@@ -42,12 +42,12 @@ fn listening() -> (Host, Seen) {
 fn given(host: &mut Host) -> Vec<(u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
-        .filter_map(|given| match given.news {
-            News::Sample(sample) => {
+        .filter_map(|given| match given.outcome {
+            SampleOutcome::Sample(sample) => {
                 let at = (sample.time.0 - START) / MILLISECOND;
                 Some((sample.sequence_number, at))
             }
-            News::Missed(_) => None,
+            SampleOutcome::Missed(_) => None,
         })
         .collect()
 }
@@ -60,9 +60,9 @@ fn numbers(host: &mut Host) -> Vec<u64> {
 fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
-        .filter_map(|given| match given.news {
-            News::Missed(missed) => Some((missed.reason, missed.first, missed.last)),
-            News::Sample(_) => None,
+        .filter_map(|given| match given.outcome {
+            SampleOutcome::Missed(missed) => Some((missed.reason, missed.first, missed.last)),
+            SampleOutcome::Sample(_) => None,
         })
         .collect()
 }
@@ -141,7 +141,7 @@ fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
         let mut host = Host::new();
         host.writer(reliable);
         let bob = host.reader(BOB, 7411);
-        wish(&mut host, Depth::Arrivals);
+        request(&mut host, Depth::Arrivals);
         if reliable {
             host.subscribe_with(BOB, 2, false);
         } else {
@@ -158,7 +158,7 @@ fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
 fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    wish(&mut host, Depth::Arrivals);
+    request(&mut host, Depth::Arrivals);
     host.data(bob, 1);
     host.data(bob, 3);
     host.data(bob, 2);
@@ -260,12 +260,12 @@ proptest! {
         let mut numbers = Vec::new();
         let mut told = Vec::new();
         for given in host.observer.drain().samples {
-            match given.news {
-                News::Sample(sample) => {
+            match given.outcome {
+                SampleOutcome::Sample(sample) => {
                     numbers.push(sample.sequence_number);
                     times.push(sample.time);
                 }
-                News::Missed(missed) => {
+                SampleOutcome::Missed(missed) => {
                     prop_assert_eq!(missed.reason, MissedReason::Lost);
                     told.extend(missed.first..=missed.last);
                 }
@@ -291,7 +291,7 @@ impl Unannounced {
     fn new(depth: Depth) -> Self {
         let mut host = Host::with(Settings::default());
         let bob = host.reader(BOB, 7411);
-        wish(&mut host, depth);
+        request(&mut host, depth);
         host.participant(DORA, "10.0.0.3:7411".parse().unwrap());
         Self { host, bob }
     }
@@ -323,7 +323,7 @@ impl Unannounced {
     fn given(&mut self, depth: Depth) -> Vec<u64> {
         let mut numbers = Vec::new();
         for given in self.host.observer.drain().samples {
-            let News::Sample(sample) = given.news else {
+            let SampleOutcome::Sample(sample) = given.outcome else {
                 panic!("{given:?}")
             };
             let number = sample.sequence_number;
@@ -366,15 +366,15 @@ fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
 fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() {
     let mut dora = Unannounced::new(Depth::Arrivals);
     (1..=3).for_each(|number| dora.data(number));
-    wishes(&mut dora.host, &[1, 2], Depth::Arrivals);
+    sample_requests(&mut dora.host, &[1, 2], Depth::Arrivals);
     dora.data(4);
     dora.announce(false);
     dora.data(5);
     let given = dora.host.observer.drain().samples.into_iter();
     let mut told: Vec<_> = given
-        .filter_map(|given| match given.news {
-            News::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),
-            News::Sample(_) => None,
+        .filter_map(|given| match given.outcome {
+            SampleOutcome::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),
+            SampleOutcome::Sample(_) => None,
         })
         .collect();
     told.sort();

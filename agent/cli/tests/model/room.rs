@@ -10,9 +10,9 @@ use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::{Snapshot, SocketFacts, TopicFacts};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 1_795_143_000_000 * MILLISECOND;
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);

@@ -50,7 +50,7 @@ await scenario(async (open) => {
   await until('the stream is closed', async () => (await ask('streams')).live === 0);
   await tab.page.evaluate(() => globalThis.becomeVisible(true));
   await tab.live();
-  assert.equal((await ask('streams')).live, 1);
+  await until('the stream is open', async () => (await ask('streams')).live === 1);
   // A short look elsewhere keeps it.
   const opened = () => tab.requests.filter((request) => request.url().endsWith('/live')).length;
   const before = opened();

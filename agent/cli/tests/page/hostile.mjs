@@ -110,12 +110,10 @@ await scenario(async (open) => {
   assert.ok(shown >= TOPICS, `${shown} vertices`);
   const words = /laid out in (\d+) ms/.exec(await tab.text());
   console.log(`${shown} vertices: ${words[0]}`);
-  await tab.page.keyboard.press('/');
-  await tab.page.getByRole('dialog', { name: 'Search' }).waitFor();
-  await tab.page.keyboard.type('<img');
+  await tab.search('<img');
   await until('results', async () => (await tab.page.locator('.results li').count()) > 1);
   await harmless('search');
-  await tab.page.keyboard.press('Escape');
+  await tab.escape();
 
   const phone = await open({ fragment: '#/topics', width: 360, height: 740 });
   await phone.live();

@@ -2,7 +2,7 @@
 // in it. The agent decodes only while the tree is open.
 
 import assert from 'node:assert/strict';
-import { ask, scenario, until } from './tab.mjs';
+import { ask, gone, reads, scenario, until } from './tab.mjs';
 
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/topics/%2Fimu?domain=0' });
@@ -14,19 +14,19 @@ await scenario(async (open) => {
   const tree = section.getByRole('group', { name: 'Fields of the message' });
   await tree.waitFor();
   const field = (name) => tree.locator('tr', { has: tab.page.getByRole('rowheader', { name, exact: true }) });
-  assert.match(await tree.innerText(), /header \(2\)/);
-  assert.match(await field('sec').innerText(), /sec\s+1\d{9}/);
+  await reads(tree, /header \(2\)/);
+  await reads(field('sec'), /sec\s+1\d{9}/);
   const before = await field('nanosec').innerText();
   await until('the next message', async () => (await field('nanosec').innerText()) !== before);
-  assert.match(await section.innerText(), /by \/imu_driver/);
+  await reads(section, /by \/imu_driver/);
 
   // Folded away, and back.
   await tree.getByRole('button', { name: /^header/ }).click();
-  assert.equal(await field('nanosec').count(), 0);
+  await gone(field('nanosec'));
   await tree.getByRole('button', { name: /^header/ }).click();
   await field('nanosec').waitFor();
   // A covariance is an array of nine.
-  assert.match(await tree.innerText(), /orientation_covariance \(9\)/);
+  await reads(tree, /orientation_covariance \(9\)/);
 
   await tree.getByRole('button', { name: 'Plot linear_acceleration.z' }).click();
   const chart = section.getByRole('img', { name: /^linear_acceleration.z/ });

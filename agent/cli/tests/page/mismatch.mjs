@@ -2,7 +2,7 @@
 // endpoints side by side with the policy that does not fit.
 
 import assert from 'node:assert/strict';
-import { scenario, until } from './tab.mjs';
+import { reads, scenario, there, until } from './tab.mjs';
 
 await scenario(async (open) => {
   const tab = await open();
@@ -10,13 +10,13 @@ await scenario(async (open) => {
   const first = tab.page.locator('.findings li').first();
   await first.waitFor();
   assert.equal(await first.getAttribute('class'), 'error');
-  assert.match(await first.innerText(), /reliab/i);
-  assert.match(await first.innerText(), /Remedy: /);
-  assert.match(await tab.text('nav'), /Overview\s+✖\s*error\s*1/);
+  await reads(first, /reliab/i);
+  await reads(first, /Remedy: /);
+  await tab.shows(/Overview\s+✖\s*error\s*1/, 'nav');
   await first.getByRole('link').click();
   const qos = tab.page.locator('section[aria-labelledby="qos"]');
   await qos.waitFor();
-  assert.match(await qos.innerText(), /offers less than .* requests: reliability/);
+  await reads(qos, /offers less than .* requests: reliability/);
   const row = qos.locator('tr', { hasText: 'Reliability' });
   const cells = await row.locator('td').evaluateAll((all) => all.map((cell) =>
     [cell.className, cell.textContent.replace(/^✖error/, '').trim()]));
@@ -29,10 +29,10 @@ await scenario(async (open) => {
 
   // The topic carries the badge, the graph the mark, the node the finding.
   await tab.go('#/topics?sort=state');
-  assert.match(await tab.page.locator('main tbody tr[data-row]').first().innerText(), /QoS/);
+  await reads(tab.page.locator('main tbody tr[data-row]').first(), /QoS/);
   await tab.go('#/graph');
   await tab.page.locator('.edge.error').first().waitFor();
-  assert.ok((await tab.page.locator('.edge .sign.error').count()) > 0);
+  await there(tab.page.locator('.edge .sign.error'));
   await tab.page.getByRole('combobox', { name: 'Show' }).selectOption('nodes');
   await until('the pair', async () => (await tab.page.locator('.edge.pair, .edge').count()) > 0);
   // A screen reader hears of new findings only: none came since the page was opened.

@@ -2,7 +2,7 @@
 
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
-import { ask, scenario, until } from './tab.mjs';
+import { ask, gone, scenario, until } from './tab.mjs';
 
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/recordings' });
@@ -32,10 +32,11 @@ await scenario(async (open) => {
   await tab.accessible('a recording');
   await card.getByRole('button', { name: 'Stop lap-one' }).click();
   await until('ended', async () => (await card.innerText()).includes('ended'));
-  assert.equal(await card.getByRole('button', { name: /^Pause/ }).count(), 0);
+  await gone(card.getByRole('button', { name: /^Pause/ }));
 
   await card.getByRole('button', { name: 'Files of lap-one' }).click();
   await card.getByText('metadata.yaml').waitFor();
+  await until('both files', async () => (await card.innerText()).match(/\S+\.mcap/g)?.length === 2);
   const fetched = async (name) => {
     const waiting = tab.page.waitForEvent('download');
     await card.getByRole('button', { name: `Download ${name}`, exact: true }).click();

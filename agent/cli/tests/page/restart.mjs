@@ -2,7 +2,7 @@
 // goes on by itself with the new agent's state and nothing of the old one.
 
 import assert from 'node:assert/strict';
-import { ask, scenario, until } from './tab.mjs';
+import { ask, gone, scenario, until } from './tab.mjs';
 
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/topics' });
@@ -19,7 +19,7 @@ await scenario(async (open) => {
   await tab.accessible('without a connection');
   await ask('thaw');
   await tab.live();
-  assert.equal(await tab.page.locator('.notice').count(), 0);
+  await gone(tab.page.locator('.notice'));
 
   // It ends in order, and later there is another.
   const first = await ask('run');

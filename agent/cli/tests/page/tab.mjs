@@ -57,6 +57,19 @@ export async function until(what, holds, patience = PATIENCE_MS) {
   }
 }
 
+/** Waits until a part of the page reads as it should: parts of a view arrive one after the other. */
+export const reads = (locator, pattern) => until(`${locator} reads ${pattern}`, async () => {
+  const text = await locator.innerText();
+  return pattern instanceof RegExp ? pattern.test(text) : text.includes(pattern);
+});
+
+/** Waits until there is at least one of these elements. */
+export const there = (locator) => until(`there is ${locator}`, async () => (await locator.count()) > 0);
+
+/** Waits until there is none of these elements. */
+export const gone = (locator) => until(`there is no ${locator}`, async () =>
+  (await locator.count()) === 0);
+
 /** Answers with the agent's headers and the edited file. */
 async function edited(route) {
   const response = await route.fetch();
@@ -148,6 +161,20 @@ export class Tab {
     }).catch(async (error) => {
       throw new Error(`${error.message}\n${await this.text(selector)}`);
     });
+  }
+
+  /** Opens the search and types there. */
+  async search(text) {
+    await this.page.keyboard.press('/');
+    await this.page.getByRole('dialog', { name: 'Search' }).waitFor();
+    await until('the focus', () => this.page.evaluate(() => document.activeElement.tagName === 'INPUT'));
+    await this.page.keyboard.type(text);
+  }
+
+  /** Closes the dialog that is open. */
+  async escape() {
+    await this.page.keyboard.press('Escape');
+    await gone(this.page.locator('dialog'));
   }
 
   /** Fails with what axe finds against WCAG 2.2 A and AA. */

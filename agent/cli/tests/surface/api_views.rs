@@ -259,6 +259,22 @@ fn one_robot_is_described_as_ros2_would() {
     assert_eq!(add["servers"][0]["node"], "/robot1/sensor_node");
     assert_eq!(texts(&add["types"]), ["example_interfaces/srv/AddTwoInts"]);
 
+    topics_are_described(&robot);
+
+    let participants = robot.get("/participants?domain_id=0");
+    let participants = participants["participants"].as_array().unwrap();
+    assert_eq!(participants.len(), 3);
+    for participant in participants {
+        assert_eq!(participant["host"], "vm");
+        assert!(!participant["nodes"].as_array().unwrap().is_empty());
+        assert!(participant["writers"].as_u64().unwrap() > 5);
+    }
+
+    edges_are_there(&robot);
+    what_is_asked_wrongly_is_refused_with_a_hint(&robot);
+}
+
+fn topics_are_described(robot: &Robot) {
     let topic = robot.get("/topics/robot1/imu/data");
     assert_eq!(texts(&topic["message_types"]), ["sensor_msgs/msg/Imu"]);
     assert!(
@@ -294,16 +310,9 @@ fn one_robot_is_described_as_ros2_would() {
     assert_eq!(temporary["domain_id"], 0);
     let request = robot.get("/topics/rq/robot1/add_two_intsRequest");
     assert_eq!(request["kind"], "service_request");
+}
 
-    let participants = robot.get("/participants?domain_id=0");
-    let participants = participants["participants"].as_array().unwrap();
-    assert_eq!(participants.len(), 3);
-    for participant in participants {
-        assert_eq!(participant["host"], "vm");
-        assert!(!participant["nodes"].as_array().unwrap().is_empty());
-        assert!(participant["writers"].as_u64().unwrap() > 5);
-    }
-
+fn edges_are_there(robot: &Robot) {
     let graph = robot.get("/graph");
     let edges = graph["edges"].as_array().unwrap();
     let is_there = |source: &str, target: &str, kind: &str| {
@@ -320,8 +329,6 @@ fn one_robot_is_described_as_ros2_would() {
     is_there("topic:0:/robot1/imu/data", listener, "feeds");
     is_there(listener, "action:0:/robot1/fibonacci", "calls");
     is_there("service:0:/robot1/add_two_ints", sensor, "served_by");
-
-    what_is_asked_wrongly_is_refused_with_a_hint(&robot);
 }
 
 fn what_is_asked_wrongly_is_refused_with_a_hint(robot: &Robot) {

@@ -12,9 +12,9 @@ use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
 use ros2probe::model::discovery::{Addresses, hexadecimal};
 use ros2probe::model::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::time::MILLISECOND;
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
-const MILLISECOND: u64 = 1_000_000;
 const START: u64 = 5_000 * MILLISECOND;
 /// A conversation takes no longer, and a tick.
 const LIMIT: u64 = 3_100 * MILLISECOND;
@@ -260,7 +260,7 @@ fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
 fn who_has_secrets_or_no_address_is_not_asked() {
     let participant = |secured, metatraffic: &[&str]| ParticipantFacts {
         guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
-        domain_id: 0,
+        domain_id: DomainId(0),
         vendor: String::new(),
         enclave: None,
         process: ProcessFacts::default(),

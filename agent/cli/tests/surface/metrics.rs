@@ -1,5 +1,6 @@
 //! The metrics page: complete, well-formed in both formats whatever the network sends, bounded.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeSet;
 use std::net::Ipv4Addr;
 use std::path::Path;
@@ -12,6 +13,7 @@ use ros2probe::events;
 use ros2probe::model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe::model::topic_kind::TopicKind;
 use ros2probe::recording::SnapshotFigures;
 use ros2probe::settings_cell::Settings;
 use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
@@ -170,6 +172,34 @@ fn values_are_what_the_snapshot_says() {
     }
 }
 
+/// Name, cause and value of what is summed by topic.
+const SUMS: [(&str, &str, &str); 12] = [
+    ("ros2_topic_sent_messages_total", "", "1000"),
+    ("ros2_topic_delivered_messages_total", "", "900"),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "before_host",
+        "60",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "reassembly",
+        "20",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "socket_buffer",
+        "15",
+    ),
+    ("ros2_topic_delivery_pending_messages", "", "1"),
+    ("ros2_topic_delivery_recovered_messages_total", "", "3"),
+    ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
+    ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
+    ("ros2_topic_acknowledgement_lag_messages", "", "56"),
+    ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
+    ("ros2_topic_transit_seconds_count", "", "1000"),
+];
+
 #[test]
 fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let snapshot = sample_robot::snapshot(["/points"]);
@@ -186,32 +216,6 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
          ros_node=\"/mapper\",participant=\"{prefix}.000001c1\",process=\"mapper\",pid=\"42\",\
          cgroup=\"/robot.slice\""
     );
-    let sums = [
-        ("ros2_topic_sent_messages_total", "", "1000"),
-        ("ros2_topic_delivered_messages_total", "", "900"),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "before_host",
-            "60",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "reassembly",
-            "20",
-        ),
-        (
-            "ros2_topic_delivery_lost_messages_total",
-            "socket_buffer",
-            "15",
-        ),
-        ("ros2_topic_delivery_pending_messages", "", "1"),
-        ("ros2_topic_delivery_recovered_messages_total", "", "3"),
-        ("ros2_topic_delivery_irrelevant_messages_total", "", "5"),
-        ("ros2_topic_delivery_unmatched_messages_total", "", "4"),
-        ("ros2_topic_acknowledgement_lag_messages", "", "56"),
-        ("ros2_topic_acknowledgement_lag_seconds", "", "2.75"),
-        ("ros2_topic_transit_seconds_count", "", "1000"),
-    ];
     let each = [
         ("ros2_writer_sent_messages_total", &sent, "", "1000"),
         (
@@ -252,7 +256,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
         "" => format!("{name}{{{labels}}}"),
         cause => format!("{name}{{{labels},cause=\"{cause}\"}}"),
     };
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&asked, &series), Some(value), "{series}\n{asked}");
     }
@@ -267,7 +271,7 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
     let mut plain = settings();
     Arc::make_mut(&mut plain.watches[0]).per_subscriber = false;
     let plain = page(snapshot, plain, Format::Classic);
-    for (name, cause, value) in sums {
+    for (name, cause, value) in SUMS {
         let series = series(name, topic, cause);
         assert_eq!(sample(&plain, &series), Some(value), "{series}");
     }
@@ -351,10 +355,10 @@ fn hostile_names_stay_inside_their_label() {
 fn no_series_appears_twice() {
     let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
     let mut dds = sample_robot::topic("/points");
-    (dds.kind, dds.dds_name) = ("dds", "/points".to_owned());
+    (dds.kind, dds.dds_name) = (TopicKind::Dds, "/points".to_owned());
     snapshot.topics.push(dds);
     let mut request = sample_robot::topic("/points");
-    (request.kind, request.dds_name) = ("service_request", "rq/pointsRequest".to_owned());
+    (request.kind, request.dds_name) = (TopicKind::ServiceRequest, "rq/pointsRequest".to_owned());
     snapshot.topics.push(request);
     let nodes = snapshot.nodes.clone();
     snapshot.nodes.extend(nodes);
@@ -376,14 +380,14 @@ fn no_series_appears_twice() {
 #[test]
 fn a_watched_topic_that_nobody_announced_begins_with_zero() {
     let missing = WatchedTopicFacts {
-        domain_id: 0,
+        domain_id: DomainId(0),
         topic: "/cmd_vel".to_owned(),
         state: WatchState::NotPublished,
         violations: Vec::new(),
     };
     let watch = WatchFacts {
         pattern: "/cmd_vel".to_owned(),
-        domain_id: Some(0),
+        domain_id: Some(DomainId(0)),
         topics: vec![missing],
     };
     let snapshot = Snapshot {

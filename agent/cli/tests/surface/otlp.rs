@@ -117,43 +117,7 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
     let text = receiver.wait_for("another export is complete", |text| {
         complete(text) >= seen + 2
     });
-    let all = exports(&text);
-    let first = |export: &Export| {
-        let item = export.items.first();
-        item.is_some_and(|item| item.fields["Name"] == "ros2.participants")
-    };
-    let ends: Vec<usize> = (0..all.len()).filter(|index| first(&all[*index])).collect();
-    let [.., begin, end] = ends[..] else {
-        panic!("{} exports", all.len())
-    };
-    let exported = exported_series(&all[begin..end]);
-    let (missing, more): (Vec<_>, Vec<_>) = (
-        page.iter()
-            .filter(|each| exported.get(each.0) != Some(each.1))
-            .collect(),
-        exported
-            .iter()
-            .filter(|each| page.get(each.0) != Some(each.1))
-            .collect(),
-    );
-    assert!(
-        missing.is_empty() && more.is_empty(),
-        "page: {missing:#?}\nexported: {more:#?}"
-    );
-    let resource = &all[begin].resource;
-    for (key, value) in [
-        ("service.name", "ros2probe"),
-        ("service.version", env!("CARGO_PKG_VERSION")),
-        ("robot.name", "marvin"),
-        ("site", "hall 2"),
-    ] {
-        assert_eq!(
-            resource.get(key).map(String::as_str),
-            Some(value),
-            "{resource:?}"
-        );
-    }
-    assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
+    assert_exported(&text, &page);
 
     let counter = |name: &str, outcome: &str| {
         format!("ros2probe_otlp_{name}{{signal=\"metrics\",{outcome}}}")
@@ -191,6 +155,47 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
         "{:?}",
         begun.elapsed()
     );
+}
+
+/// The last export that is complete has each series of the page, and names the robot.
+fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
+    let all = exports(text);
+    let first = |export: &Export| {
+        let item = export.items.first();
+        item.is_some_and(|item| item.fields["Name"] == "ros2.participants")
+    };
+    let ends: Vec<usize> = (0..all.len()).filter(|index| first(&all[*index])).collect();
+    let [.., begin, end] = ends[..] else {
+        panic!("{} exports", all.len())
+    };
+    let exported = exported_series(&all[begin..end]);
+    let (missing, more): (Vec<_>, Vec<_>) = (
+        page.iter()
+            .filter(|each| exported.get(each.0) != Some(each.1))
+            .collect(),
+        exported
+            .iter()
+            .filter(|each| page.get(each.0) != Some(each.1))
+            .collect(),
+    );
+    assert!(
+        missing.is_empty() && more.is_empty(),
+        "page: {missing:#?}\nexported: {more:#?}"
+    );
+    let resource = &all[begin].resource;
+    for (key, value) in [
+        ("service.name", "ros2probe"),
+        ("service.version", env!("CARGO_PKG_VERSION")),
+        ("robot.name", "marvin"),
+        ("site", "hall 2"),
+    ] {
+        assert_eq!(
+            resource.get(key).map(String::as_str),
+            Some(value),
+            "{resource:?}"
+        );
+    }
+    assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
 }
 
 /// An event: its name and what is known of it.

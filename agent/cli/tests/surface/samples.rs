@@ -1,6 +1,8 @@
 //! Samples one by one: from the model over replayed captures, and from the real binary by
 //! `GET /samples`.
 
+mod shared_memory;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,8 +15,8 @@ use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Watch, Watchlist};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::payloads::{MissedReason, News};
-use ros2probe::model::selection::{Depth, Selection, Wish};
+use ros2probe::model::payloads::{MissedReason, SampleOutcome};
+use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe_api::samples::Line;
 use ros2probe_testing::local_agent;
@@ -22,7 +24,7 @@ use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -55,8 +57,8 @@ fn find(folder: &Path, captures: &mut Vec<PathBuf>) {
     }
 }
 
-fn wish(id: u64, depth: Depth) -> Wish {
-    Wish {
+fn request(id: u64, depth: Depth) -> SampleRequest {
+    SampleRequest {
         id,
         selection: Arc::new(Selection::all()),
         domain_id: None,
@@ -65,14 +67,14 @@ fn wish(id: u64, depth: Depth) -> Wish {
 }
 
 /// What a capture says when everything is watched and, with a depth, everything wished for.
-fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
+fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcome>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
     observer.input(Input::Watchlist(Arc::new(
         Watchlist::new(everything).unwrap(),
     )));
     if let Some(depth) = depth {
-        observer.input(Input::Wishes(Arc::new(vec![wish(1, depth)])));
+        observer.input(Input::SampleRequests(Arc::new(vec![request(1, depth)])));
     }
     let mut reader = PcapReader::open(capture).unwrap();
     let mut feed = FrameDecoder::new(Limits::default());
@@ -80,7 +82,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
     let mut take = |observer: &mut Observer| {
         for given in observer.drain().samples {
             assert_eq!(*given.to, [1]);
-            news.push(given.news);
+            news.push(given.outcome);
         }
     };
     while let Some(captured) = reader.next_packet().unwrap() {
@@ -99,12 +101,14 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<News>) {
 }
 
 /// Samples and their bytes by topic, each sample checked to be the next and the only one.
-fn counts(news: &[News], depth: Depth) -> BTreeMap<(u32, String), (u64, u64)> {
+fn counts(news: &[SampleOutcome], depth: Depth) -> BTreeMap<(DomainId, String), (u64, u64)> {
     let mut counts: BTreeMap<_, (u64, u64)> = BTreeMap::new();
     let mut seen = BTreeSet::new();
     let mut last = 0;
     for news in news {
-        let News::Sample(sample) = news else { continue };
+        let SampleOutcome::Sample(sample) = news else {
+            continue;
+        };
         assert!(seen.insert((sample.writer, sample.sequence_number)));
         assert!(sample.time.0 >= last);
         last = sample.time.0;
@@ -119,9 +123,9 @@ fn counts(news: &[News], depth: Depth) -> BTreeMap<(u32, String), (u64, u64)> {
     counts
 }
 
-fn unannounced(news: &[News], dds_name: &str) -> u64 {
+fn unannounced(news: &[SampleOutcome], dds_name: &str) -> u64 {
     let missed = news.iter().filter_map(|news| match news {
-        News::Missed(missed) if missed.reason == MissedReason::Unannounced => Some(missed),
+        SampleOutcome::Missed(missed) if missed.reason == MissedReason::Unannounced => Some(missed),
         _ => None,
     });
     let of_topic = missed.filter(|missed| &*missed.topic.dds_name == dds_name);
@@ -165,8 +169,8 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
             }
             assert!(counts.is_empty(), "{name}: {counts:?}");
             let missed = news.iter().filter_map(|news| match news {
-                News::Missed(missed) => Some((missed.reason, missed.samples)),
-                News::Sample(_) => None,
+                SampleOutcome::Missed(missed) => Some((missed.reason, missed.samples)),
+                SampleOutcome::Sample(_) => None,
             });
             let mut told: BTreeMap<_, u64> = BTreeMap::new();
             for (reason, samples) in missed {
@@ -214,10 +218,10 @@ fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_ti
             let (mut given, mut lost, mut early) = (Vec::new(), BTreeSet::new(), 0);
             for news in replayed(&capture, Some(depth)).1 {
                 match news {
-                    News::Sample(sample) if &*sample.topic.name == "/chatter" => {
+                    SampleOutcome::Sample(sample) if &*sample.topic.name == "/chatter" => {
                         given.push((sample.sequence_number - 1, sample.time.0));
                     }
-                    News::Missed(missed) if &*missed.topic.name == "/chatter" => {
+                    SampleOutcome::Missed(missed) if &*missed.topic.name == "/chatter" => {
                         match missed.reason {
                             MissedReason::Lost => lost.extend(missed.first - 1..missed.last),
                             MissedReason::Unannounced => early += missed.samples,
@@ -291,24 +295,27 @@ impl Robot {
 
     fn subscribe(&mut self, topics: &[&str], depth: Depth) {
         let selection = Selection::named(topics.iter().copied()).unwrap();
-        let wishes = vec![Wish {
+        let sample_requests = vec![SampleRequest {
             selection: Arc::new(selection),
-            ..wish(3, depth)
+            ..request(3, depth)
         }];
-        self.observer.input(Input::Wishes(Arc::new(wishes)));
+        self.observer
+            .input(Input::SampleRequests(Arc::new(sample_requests)));
     }
 
     /// Writer, number and payload, or the reason why not, of what is given.
     fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
         let given = self.observer.drain().samples.into_iter();
         given
-            .map(|given| match given.news {
-                News::Sample(sample) => {
+            .map(|given| match given.outcome {
+                SampleOutcome::Sample(sample) => {
                     let payload = sample.payload.as_ref().map(|bytes| bytes.to_vec());
                     let payload = payload.unwrap_or_default();
                     (sample.writer.prefix, sample.sequence_number, Ok(payload))
                 }
-                News::Missed(missed) => (missed.writer.prefix, missed.first, Err(missed.reason)),
+                SampleOutcome::Missed(missed) => {
+                    (missed.writer.prefix, missed.first, Err(missed.reason))
+                }
             })
             .collect()
     }
@@ -342,143 +349,6 @@ fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
 }
 
 #[test]
-fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
-    let mut robot = Robot::new(Settings::default());
-    robot.subscribe(&["/points"], Depth::Payloads);
-    robot.at += SECOND;
-    let large = payload(3000);
-    for start in [1, 2, 3] {
-        robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
-    }
-    // Looks at two ports may find them in another order, and twice.
-    for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
-        robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
-    }
-    let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
-    let given = robot.given();
-    let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
-    // The last fragment of 2 was seen while one was missing: it was given up then.
-    assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
-    assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
-    robot.receive(Message::from(ALICE).data(WRITER, 4, &payload(24)));
-    // A fragment was overwritten before it was read.
-    for start in [1, 3] {
-        robot.receive(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
-    }
-    let expected = [
-        (ALICE, 4, Ok(payload(24))),
-        (ALICE, 5, Err(MissedReason::NotCaptured)),
-    ];
-    assert_eq!(robot.given(), expected);
-}
-
-#[test]
-fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_for_them() {
-    let mut robot = Robot::new(Settings::default());
-    robot.subscribe(&["/points"], Depth::Payloads);
-    let small = payload(24);
-    let look = |robot: &mut Robot, number| {
-        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
-    };
-    for number in [1, 2, 5] {
-        look(&mut robot, number);
-    }
-    let given = |number| (ALICE, number, Ok(small.clone()));
-    assert_eq!(robot.given(), [given(1), given(2), given(5)]);
-    let sent = robot.at;
-    let now = Timestamp(sent + SECOND / 20);
-    robot.observer.input(Input::Time(now));
-    assert!(robot.observer.given_until(now).0 < sent);
-    // One of them comes late.
-    look(&mut robot, 3);
-    assert_eq!(robot.given(), [given(3)]);
-    let now = Timestamp(sent + SECOND);
-    robot.observer.input(Input::Time(now));
-    assert_eq!(robot.observer.given_until(now), now);
-    let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
-    assert_eq!(robot.given(), [not_captured]);
-    // The end of a capture waits for nothing.
-    look(&mut robot, 8);
-    robot.observer.input(Input::End);
-    assert_eq!(
-        robot.given(),
-        [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
-    );
-}
-
-#[test]
-fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
-    let mut robot = Robot::new(Settings::default());
-    let reader = Guid::new(BOB, EntityId([0, 0, 0x12, 0x04]));
-    let subscription = forge::endpoint(reader, "rt/points", "a::msg::dds_::B_", true);
-    robot.put(Message::from(BOB).data(SEDP_READERS, 1, &subscription));
-    robot.subscribe(&["/points"], Depth::Payloads);
-    let small = payload(24);
-    let mut times = BTreeMap::new();
-    // 3 is sent again, 5 was not seen.
-    for number in [1, 2, 4, 6, 3, 7] {
-        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
-        times.insert(number, robot.at);
-    }
-    let now = Timestamp(robot.at + SECOND / 20);
-    robot.observer.input(Input::Time(now));
-    let end = Timestamp(robot.at + SECOND);
-    let mut given = Vec::new();
-    for now in [now, end] {
-        robot.observer.input(Input::Time(now));
-        for each in robot.observer.drain().samples {
-            match each.news {
-                News::Sample(sample) => given.push((sample.sequence_number, Some(sample.time.0))),
-                News::Missed(missed) => given.push((missed.first, None)),
-            }
-        }
-    }
-    // A reader gets 4 with 3, and 6 when it came: it may have had 5.
-    let repaired = times[&3];
-    let expected = [
-        (1, Some(times[&1])),
-        (2, Some(times[&2])),
-        (3, Some(repaired)),
-        (4, Some(repaired + 1)),
-        (5, None),
-        (6, Some(repaired + 2)),
-        (7, Some(times[&7])),
-    ];
-    assert_eq!(given, expected);
-}
-
-#[test]
-fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_reader() {
-    let mut robot = Robot::new(Settings::default());
-    robot.subscribe(&["/points"], Depth::Payloads);
-    let small = payload(24);
-    robot.receive(Message::from(ALICE).data(WRITER, 1, &small));
-    // INFO_DST and ACKNACK: all below 4.
-    let body = [
-        &[0, 0, 0x12, 0x04][..],
-        &WRITER.0,
-        &[0, 0, 0, 0, 4, 0, 0, 0],
-        &[0; 8],
-    ];
-    let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
-    robot.receive(acknowledgement.submessage(0x06, 0x03, &body.concat()));
-    robot
-        .observer
-        .input(Input::Time(Timestamp(robot.at + SECOND / 20)));
-    robot
-        .observer
-        .input(Input::Time(Timestamp(robot.at + SECOND)));
-    let mut missed = 0;
-    for each in robot.observer.drain().samples {
-        if let News::Missed(each) = each.news {
-            assert_eq!(each.reason, MissedReason::NotCaptured);
-            missed += each.samples;
-        }
-    }
-    assert_eq!(missed, 2);
-}
-
-#[test]
 fn a_sample_that_stays_incomplete_is_told_and_not_given() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
@@ -505,28 +375,28 @@ fn each_subscription_is_told_of_the_losses_since_it_began() {
     let data = |robot: &mut Robot, number| {
         robot.put(Message::from(ALICE).data(WRITER, number, b"\0\x01\0\0anything"));
     };
-    let wishes = |robot: &mut Robot, ids: &[u64]| {
-        let wishes = ids.iter().map(|id| wish(*id, Depth::Arrivals));
+    let sample_requests = |robot: &mut Robot, ids: &[u64]| {
+        let sample_requests = ids.iter().map(|id| request(*id, Depth::Arrivals));
         robot
             .observer
-            .input(Input::Wishes(Arc::new(wishes.collect())));
+            .input(Input::SampleRequests(Arc::new(sample_requests.collect())));
     };
-    wishes(&mut robot, &[3]);
+    sample_requests(&mut robot, &[3]);
     data(&mut robot, 1);
     data(&mut robot, 4);
-    wishes(&mut robot, &[3, 5]);
+    sample_requests(&mut robot, &[3, 5]);
     data(&mut robot, 8);
     robot.at += 12 * SECOND;
     robot.observer.input(Input::Time(Timestamp(robot.at)));
     let given = robot.observer.drain().samples.into_iter();
     let mut missed: Vec<_> = given
-        .filter_map(|given| match given.news {
-            News::Missed(missed) => {
+        .filter_map(|given| match given.outcome {
+            SampleOutcome::Missed(missed) => {
                 assert_eq!(missed.reason, MissedReason::Lost);
                 assert_eq!(missed.samples, missed.last - missed.first + 1);
                 Some((given.to.to_vec(), missed.first, missed.last))
             }
-            News::Sample(_) => None,
+            SampleOutcome::Sample(_) => None,
         })
         .collect();
     missed.sort();
@@ -552,7 +422,7 @@ fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
     assert_eq!(verdict(&mut robot), Some(Verdict::Capture));
     robot.put(Message::from(ALICE).data(WRITER, 3, &payload(20)));
     assert_eq!(robot.given(), [(ALICE, 3, Ok(payload(20)))]);
-    robot.observer.input(Input::Wishes(Arc::default()));
+    robot.observer.input(Input::SampleRequests(Arc::default()));
     assert_eq!(verdict(&mut robot), Some(Verdict::Ignore));
     robot.put(Message::from(ALICE).data(WRITER, 4, &payload(20)));
     assert!(robot.given().is_empty());

@@ -1,5 +1,6 @@
 //! From shape to meaning: what the types and ranges of the shape cannot say.
 
+use ros2probe_wire::DomainId;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -10,6 +11,7 @@ use globset::Glob;
 use super::check::check;
 use super::document::Node;
 use super::mistake::{Mistakes, Position};
+use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
     WatchShape,
@@ -20,7 +22,6 @@ use super::{
     RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
     StateChoice,
 };
-use crate::surface::otlp::endpoint;
 
 /// Each keeps memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
@@ -228,7 +229,7 @@ impl Reader {
         }
         Watch {
             pattern: entry.topic,
-            domain_id: entry.domain,
+            domain_id: entry.domain.map(DomainId),
             expectations: Expectations {
                 min_rate_hz: entry.min_rate_hz,
                 max_rate_hz: entry.max_rate_hz,
@@ -383,7 +384,7 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
                  `[::1]:{port}`, or `off`"
             ))
         }
-        "otlp.endpoint" if text != "off" && endpoint(text).is_none() => Err(
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
             "must be an URL of a gRPC receiver, as in `http://collector:4317`, or `off`".to_owned(),
         ),
         "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(

@@ -7,6 +7,7 @@ mod document;
 mod limits;
 mod meaning;
 mod mistake;
+mod otlp_endpoint;
 mod shape;
 
 use std::collections::BTreeMap;
@@ -20,6 +21,7 @@ use serde::Deserialize;
 
 pub use limits::markdown as limits_markdown;
 pub use mistake::{Mistake, Mistakes, Position};
+pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, ShmMode, ShmSettings, SourceChoice,
 };

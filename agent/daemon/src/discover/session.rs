@@ -13,6 +13,7 @@ use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
 use ros2probe_wire::record::{Body, Gap, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -20,12 +21,11 @@ use super::message::{
     LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
     SUBSCRIPTIONS_READER,
 };
-use ros2probe_model::pieces::Pieces;
+use ros2probe_model::discovery_fragments::DiscoveryFragments;
 
 /// Packets sent to one participant, goodbye included.
 pub const MOST_PACKETS: u32 = 6;
 
-const MILLISECOND: u64 = 1_000_000;
 /// Both announce themselves within 2 ms; when nothing comes for this long, the introduction is
 /// repeated once.
 const SILENCE: u64 = 500 * MILLISECOND;
@@ -91,7 +91,7 @@ pub struct Session {
     /// When something was last asked for, and how often.
     asked: Option<Timestamp>,
     requests: u32,
-    pieces: Pieces,
+    discovery_fragments: DiscoveryFragments,
     /// Samples of which some fragments have come, and when the last one did.
     partial: BTreeMap<(EntityId, u64), Timestamp>,
     endpoints: BTreeMap<Guid, EndpointAnnouncement>,
@@ -143,7 +143,7 @@ impl Session {
             heard: None,
             asked: None,
             requests: 0,
-            pieces: Pieces::default(),
+            discovery_fragments: DiscoveryFragments::default(),
             partial: BTreeMap::new(),
             endpoints: BTreeMap::new(),
             user_writers: BTreeMap::new(),
@@ -337,7 +337,7 @@ impl Session {
             return Some((SamplePayload::Borrowed(found.payload()), qos));
         };
         let key = (found.record.writer().entity, sample.sequence_number());
-        let Some(bytes) = self.pieces.put(fragments, found.payload) else {
+        let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
             if self.partial.len() < MOST_PARTIAL || self.partial.contains_key(&key) {
                 self.partial.insert(key, now);
             }
@@ -468,7 +468,7 @@ impl Session {
                     _ => NODES_READER,
                 };
                 let guid = Guid::new(self.target.prefix, *writer);
-                let missing = self.pieces.missing(guid, *number);
+                let missing = self.discovery_fragments.missing(guid, *number);
                 self.requests += 1;
                 message = message.ask_fragments(reader, *writer, *number, missing, self.requests);
                 asked = true;

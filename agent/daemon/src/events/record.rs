@@ -4,10 +4,10 @@
 use std::borrow::Cow;
 use std::fmt::{Display, Write as _};
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Timestamp};
 
 use super::table::{self, Definition, Severity};
 use crate::agent_facts::SourceKind;
@@ -256,7 +256,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
         let went = matches!(change, Disposed | Expired | Cascaded);
         ("cause", went.then(|| text(change.label())))
     };
-    let domain = |domain_id: &u32| ("domain_id", number(*domain_id));
+    let domain = |domain_id: &DomainId| ("domain_id", number(domain_id.0));
     match kind {
         EventKind::Participant {
             change,
@@ -289,7 +289,10 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             vec![
                 domain(domain_id),
                 ("topic", Some(text(&series(naming.as_ref(), topic)))),
-                ("kind", naming.as_ref().map(|naming| text(naming.kind))),
+                (
+                    "kind",
+                    naming.as_ref().map(|naming| text(naming.kind.label())),
+                ),
                 ("role", Some(text(role))),
                 ("endpoint", written(guid)),
                 ("message_type", Some(text(message_type))),
@@ -562,7 +565,7 @@ mod tests {
         let lost = |change| {
             Occurrence::Robot(EventKind::Participant {
                 change,
-                domain_id: 0,
+                domain_id: DomainId(0),
                 guid: ros2probe_wire::Guid::from_bytes([1; 16]),
                 vendor: ros2probe_wire::rtps::VendorId([1, 0x0f]),
                 host: None,

@@ -1,6 +1,6 @@
 //! The log of events under storms, slow readers and restarts.
 
-use ros2probe_wire::Guid;
+use ros2probe_wire::{DomainId, Guid};
 
 use super::*;
 use ros2probe_model::churn;
@@ -11,7 +11,7 @@ fn node(at: u64) -> Event {
         at: Timestamp(at),
         kind: EventKind::Node {
             change: churn::Event::Appeared,
-            domain_id: 7,
+            domain_id: DomainId(7),
             participant: Guid::from_bytes([1; 16]),
             name: "/lidar".into(),
         },
@@ -70,7 +70,7 @@ fn a_storm_is_cut_in_each_second_and_told_in_one_event() {
     log.add(taken((0..storm).map(node).collect()), second(0));
     let other = Event {
         kind: EventKind::Silence {
-            domain_id: 0,
+            domain_id: DomainId(0),
             topic: "/imu".into(),
             watch: "/imu".into(),
             last_message: None,

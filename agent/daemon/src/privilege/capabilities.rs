@@ -2,39 +2,43 @@
 
 use std::fmt;
 
-use caps::errors::CapsError;
-use caps::{CapSet, Capability, CapsHashSet};
+use rustix::io::Errno;
+use rustix::thread::{
+    CapabilitySet, CapabilitySets, capabilities, capability_is_in_ambient_set,
+    capability_is_in_bounding_set, clear_ambient_capability_set,
+    remove_capability_from_bounding_set, set_capabilities,
+};
 
 use crate::config::{CaptureSettings, SourceChoice};
 
 /// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
 /// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
-const HOST: [Capability; 3] = [
-    Capability::CAP_NET_ADMIN,
-    Capability::CAP_BPF,
-    Capability::CAP_PERFMON,
+const HOST: [CapabilitySet; 3] = [
+    CapabilitySet::NET_ADMIN,
+    CapabilitySet::BPF,
+    CapabilitySet::PERFMON,
 ];
 
 /// Packet sockets (`CAP_NET_RAW`); the rest as for the host's sockets.
-const WIRE: [Capability; 3] = [
-    Capability::CAP_NET_RAW,
-    Capability::CAP_BPF,
-    Capability::CAP_PERFMON,
+const WIRE: [CapabilitySet; 3] = [
+    CapabilitySet::NET_RAW,
+    CapabilitySet::BPF,
+    CapabilitySet::PERFMON,
 ];
 
 /// Live capture is not possible for lack of these.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Missing {
     /// Each source that would do, with what it lacks.
-    sources: Vec<(SourceChoice, Vec<Capability>)>,
+    sources: Vec<(SourceChoice, Vec<CapabilitySet>)>,
     /// What grants everything that the configuration can make use of.
-    grant: Vec<Capability>,
+    grant: Vec<CapabilitySet>,
 }
 
 /// Why privileges could not be given up.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot give up privileges: {0}")]
-pub struct DropError(CapsError);
+#[error("cannot give up privileges")]
+pub struct DropError(#[from] Errno);
 
 /// The calling thread has no capability in any set that would give it one, and can gain none: what
 /// is asked for to serve HTTP.
@@ -45,22 +49,22 @@ pub struct Unprivileged(());
 #[derive(Debug, thiserror::Error)]
 pub enum CapabilitiesRemain {
     /// These are left.
-    #[error("refusing to serve: {left} left in the {set:?} set after all were given up")]
+    #[error("refusing to serve: {left} left in the {set} set after all were given up")]
     Capabilities {
         /// Their names.
         left: String,
         /// Where.
-        set: CapSet,
+        set: &'static str,
     },
     /// A program that it executes could.
     #[error("refusing to serve: no_new_privs is not set after it was")]
     MayGain,
     /// The kernel does not say.
-    #[error("refusing to serve: cannot read which capabilities are left: {0}")]
-    Unreadable(CapsError),
+    #[error("refusing to serve: cannot read which capabilities are left")]
+    Unreadable(#[source] Errno),
     /// Likewise.
     #[error("refusing to serve: cannot read no_new_privs")]
-    Unknown(#[source] std::io::Error),
+    Unknown(#[source] Errno),
 }
 
 /// Looks for what capturing as `settings` say needs. Where the choice of the source is the
@@ -69,21 +73,21 @@ pub enum CapabilitiesRemain {
 /// # Errors
 /// The capabilities that are not effective. When they cannot be read, opening the sockets will tell.
 pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
-    let Ok(effective) = caps::read(None, CapSet::Effective) else {
+    let Ok(sets) = capabilities(None) else {
         return Ok(());
     };
-    missing(&effective, settings).map_or(Ok(()), Err)
+    missing(sets.effective, settings).map_or(Ok(()), Err)
 }
 
 /// What a process with these effective capabilities lacks; `None` = nothing.
 #[must_use]
-pub fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Missing> {
+pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
     // The old, wider capability still counts for its successors.
-    let admin = effective.contains(&Capability::CAP_SYS_ADMIN);
-    let has = |capability: &Capability| {
-        let inherited = matches!(capability, Capability::CAP_BPF | Capability::CAP_PERFMON);
-        effective.contains(capability) || (admin && inherited)
+    let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
+        true => CapabilitySet::BPF | CapabilitySet::PERFMON,
+        false => CapabilitySet::empty(),
     };
+    let has = |capability: &CapabilitySet| (effective | inherited).contains(*capability);
     let mut sources = Vec::new();
     let mut grant = Vec::new();
     for (source, needed) in candidates(settings) {
@@ -97,13 +101,13 @@ pub fn missing(effective: &CapsHashSet, settings: &CaptureSettings) -> Option<Mi
 }
 
 /// The sources that `settings` allow, each with what it needs.
-fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)> {
+fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySet>)> {
     let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
     let mirrors = !settings.mirror_interfaces.is_empty();
-    let entering = (!settings.network_namespaces.is_empty()).then_some(Capability::CAP_SYS_ADMIN);
+    let entering = (!settings.network_namespaces.is_empty()).then_some(CapabilitySet::SYS_ADMIN);
     let wire = || WIRE.into_iter().chain(entering).collect();
     let host = || {
-        let packets = [Some(Capability::CAP_NET_RAW), entering];
+        let packets = [Some(CapabilitySet::NET_RAW), entering];
         let packets = packets.into_iter().flatten().filter(|_| mirrors);
         HOST.into_iter().chain(packets).collect()
     };
@@ -118,18 +122,44 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<Capability>)
 
 /// Gives up what the calling thread does not keep, from every set; from the bounding set where it
 /// may, and where it may not nothing can be gained from it any more.
-pub(super) fn keep(is_kept: impl Fn(Capability) -> bool) -> Result<(), DropError> {
-    let permitted = caps::read(None, CapSet::Permitted).map_err(DropError)?;
-    if caps::has_cap(None, CapSet::Effective, Capability::CAP_SETPCAP).map_err(DropError)? {
-        for capability in caps::read(None, CapSet::Bounding).map_err(DropError)? {
-            caps::drop(None, CapSet::Bounding, capability).map_err(DropError)?;
+pub(super) fn keep(kept: CapabilitySet) -> Result<(), DropError> {
+    let sets = capabilities(None)?;
+    if sets.effective.contains(CapabilitySet::SETPCAP) {
+        for (_, capability) in CapabilitySet::all().iter_names() {
+            if capability_is_in_bounding_set(capability)? {
+                remove_capability_from_bounding_set(capability)?;
+            }
         }
     }
-    let kept: CapsHashSet = permitted.into_iter().filter(|one| is_kept(*one)).collect();
-    caps::clear(None, CapSet::Ambient).map_err(DropError)?;
-    caps::clear(None, CapSet::Inheritable).map_err(DropError)?;
-    caps::set(None, CapSet::Effective, &kept).map_err(DropError)?;
-    caps::set(None, CapSet::Permitted, &kept).map_err(DropError)
+    clear_ambient_capability_set()?;
+    let kept = sets.permitted & kept;
+    set_capabilities(
+        None,
+        CapabilitySets {
+            effective: kept,
+            permitted: kept,
+            inheritable: CapabilitySet::empty(),
+        },
+    )?;
+    Ok(())
+}
+
+/// Names of the capabilities in a set, sorted.
+#[must_use]
+pub fn capability_names(set: CapabilitySet) -> Vec<String> {
+    let named = set.iter_names().map(|(name, _)| format!("CAP_{name}"));
+    let mut names: Vec<_> = named.collect();
+    names.sort();
+    names
+}
+
+/// Capabilities in the calling thread's ambient set.
+fn ambient() -> Result<CapabilitySet, Errno> {
+    let mut ambient = CapabilitySet::empty();
+    for (_, capability) in CapabilitySet::all().iter_names() {
+        ambient.set(capability, capability_is_in_ambient_set(capability)?);
+    }
+    Ok(ambient)
 }
 
 impl Unprivileged {
@@ -138,26 +168,23 @@ impl Unprivileged {
     /// # Errors
     /// There is something, or it cannot be read.
     pub fn verify() -> Result<Self, CapabilitiesRemain> {
-        for set in [
-            CapSet::Effective,
-            CapSet::Permitted,
-            CapSet::Inheritable,
-            CapSet::Ambient,
+        let sets = capabilities(None).map_err(CapabilitiesRemain::Unreadable)?;
+        let ambient = ambient().map_err(CapabilitiesRemain::Unreadable)?;
+        for (set, left) in [
+            ("Effective", sets.effective),
+            ("Permitted", sets.permitted),
+            ("Inheritable", sets.inheritable),
+            ("Ambient", ambient),
         ] {
-            let left = caps::read(None, set).map_err(CapabilitiesRemain::Unreadable)?;
             if !left.is_empty() {
-                let mut left: Vec<_> = left.iter().map(Capability::to_string).collect();
-                left.sort();
-                return Err(CapabilitiesRemain::Capabilities {
-                    left: left.join(", "),
-                    set,
-                });
+                let left = capability_names(left).join(", ");
+                return Err(CapabilitiesRemain::Capabilities { left, set });
             }
         }
         match rustix::thread::no_new_privs() {
             Ok(true) => Ok(Self(())),
             Ok(false) => Err(CapabilitiesRemain::MayGain),
-            Err(error) => Err(CapabilitiesRemain::Unknown(error.into())),
+            Err(error) => Err(CapabilitiesRemain::Unknown(error)),
         }
     }
 }
@@ -170,7 +197,8 @@ impl Missing {
             .sources
             .iter()
             .map(|(source, lacking)| {
-                let names: Vec<String> = lacking.iter().map(Capability::to_string).collect();
+                let names = lacking.iter().copied().flat_map(capability_names);
+                let names: Vec<_> = names.collect();
                 format!("{} for the source `{}`", names.join(", "), source.label())
             })
             .collect();
@@ -180,8 +208,8 @@ impl Missing {
     /// The command that grants them to this program.
     #[must_use]
     pub fn command(&self) -> String {
-        let grant = self.grant.iter().map(|one| one.to_string().to_lowercase());
-        let grant: Vec<_> = grant.collect();
+        let grant = self.grant.iter().copied().flat_map(capability_names);
+        let grant: Vec<_> = grant.map(|name| name.to_lowercase()).collect();
         let program = std::env::current_exe();
         let program = program.map_or_else(|_| "rp".to_owned(), |path| path.display().to_string());
         format!("sudo setcap {}+ep {program}", grant.join(","))
@@ -208,7 +236,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
 
-    fn set(capabilities: &[Capability]) -> CapsHashSet {
+    fn set(capabilities: &[CapabilitySet]) -> CapabilitySet {
         capabilities.iter().copied().collect()
     }
 
@@ -219,15 +247,15 @@ mod tests {
         }
     }
 
-    fn lacks(has: &[Capability], settings: &CaptureSettings) -> Vec<Vec<Capability>> {
-        let missing = missing(&set(has), settings);
+    fn lacks(has: &[CapabilitySet], settings: &CaptureSettings) -> Vec<Vec<CapabilitySet>> {
+        let missing = missing(set(has), settings);
         let sources = missing.map_or_else(Vec::new, |missing| missing.sources);
         sources.into_iter().map(|(_, lacking)| lacking).collect()
     }
 
     #[test]
     fn three_capabilities_are_enough_for_either_source() {
-        let nothing: [Vec<Capability>; 0] = [];
+        let nothing: [Vec<CapabilitySet>; 0] = [];
         let auto = settings(SourceChoice::Auto);
         assert_eq!(lacks(&HOST, &settings(SourceChoice::Host)), nothing);
         assert_eq!(lacks(&WIRE, &settings(SourceChoice::Wire)), nothing);
@@ -236,11 +264,11 @@ mod tests {
         assert_eq!(lacks(&[], &auto), [HOST, WIRE]);
         assert_eq!(
             lacks(&WIRE, &settings(SourceChoice::Host)),
-            [[Capability::CAP_NET_ADMIN]]
+            [[CapabilitySet::NET_ADMIN]]
         );
         assert_eq!(
             lacks(&HOST, &settings(SourceChoice::Wire)),
-            [[Capability::CAP_NET_RAW]]
+            [[CapabilitySet::NET_RAW]]
         );
     }
 
@@ -250,8 +278,8 @@ mod tests {
         let mut lines = manifest.lines().map(str::trim);
         let added = lines.find_map(|line| line.strip_prefix("add: [")?.strip_suffix(']'));
         let added = added.unwrap().split(", ");
-        let added: CapsHashSet = added
-            .map(|name| format!("CAP_{name}").parse().unwrap())
+        let added: CapabilitySet = added
+            .map(|name| CapabilitySet::from_name(name).unwrap())
             .collect();
         assert_eq!(added, set(&[HOST, WIRE].concat()));
     }
@@ -262,25 +290,25 @@ mod tests {
             include_interfaces: vec!["eth0".to_owned()],
             ..settings(SourceChoice::Auto)
         };
-        assert_eq!(lacks(&HOST, &named), [[Capability::CAP_NET_RAW]]);
+        assert_eq!(lacks(&HOST, &named), [[CapabilitySet::NET_RAW]]);
         let mirroring = CaptureSettings {
             mirror_interfaces: vec!["mirror0".to_owned()],
             ..settings(SourceChoice::Host)
         };
-        assert_eq!(lacks(&HOST, &mirroring), [[Capability::CAP_NET_RAW]]);
+        assert_eq!(lacks(&HOST, &mirroring), [[CapabilitySet::NET_RAW]]);
         let entering = CaptureSettings {
             network_namespaces: vec![PathBuf::from("/run/netns/a")],
             ..settings(SourceChoice::Wire)
         };
-        assert_eq!(lacks(&WIRE, &entering), [[Capability::CAP_SYS_ADMIN]]);
-        let old = [Capability::CAP_NET_RAW, Capability::CAP_SYS_ADMIN];
+        assert_eq!(lacks(&WIRE, &entering), [[CapabilitySet::SYS_ADMIN]]);
+        let old = [CapabilitySet::NET_RAW, CapabilitySet::SYS_ADMIN];
         assert!(lacks(&old, &entering).is_empty());
     }
 
     #[test]
     fn the_message_names_what_each_source_lacks_and_the_command_that_grants_it() {
-        let has = set(&[Capability::CAP_BPF, Capability::CAP_PERFMON]);
-        let missing = missing(&has, &settings(SourceChoice::Auto)).unwrap();
+        let has = set(&[CapabilitySet::BPF, CapabilitySet::PERFMON]);
+        let missing = missing(has, &settings(SourceChoice::Auto)).unwrap();
         let message = missing.to_string();
         assert!(
             message.starts_with(

@@ -5,7 +5,7 @@ use std::sync::OnceLock;
 use std::sync::mpsc;
 use std::thread::{Builder, JoinHandle};
 
-use caps::Capability;
+use rustix::thread::CapabilitySet;
 
 use super::calls::{self, FilterError};
 use super::capabilities::{self, DropError};
@@ -133,21 +133,24 @@ impl Role {
         Self::SharedMemory { needs_nice }
     }
 
-    fn keeps(self, capability: Capability) -> bool {
+    fn capabilities(self) -> CapabilitySet {
+        let nothing = CapabilitySet::empty();
+        let bpf = |needs_bpf| {
+            if needs_bpf {
+                CapabilitySet::BPF
+            } else {
+                nothing
+            }
+        };
         match self {
-            Self::Service | Self::Serve | Self::Export => false,
-            Self::Capture { needs_bpf } => needs_bpf && capability == Capability::CAP_BPF,
-            Self::Reattach { needs_bpf } => match capability {
-                Capability::CAP_NET_ADMIN => true,
-                Capability::CAP_BPF => needs_bpf,
-                _ => false,
-            },
-            Self::SharedMemory { needs_nice } => match capability {
-                Capability::CAP_SYS_PTRACE => true,
-                Capability::CAP_SYS_NICE => needs_nice,
-                _ => false,
-            },
-            Self::Exact => uprobe::requires(capability),
+            Self::Service | Self::Serve | Self::Export => nothing,
+            Self::Capture { needs_bpf } => bpf(needs_bpf),
+            Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
+            Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,
+            Self::SharedMemory { needs_nice: true } => {
+                CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
+            }
+            Self::Exact => uprobe::required(),
         }
     }
 }
@@ -174,7 +177,7 @@ pub fn confine(role: Role) -> Result<(), ConfineError> {
 /// # Errors
 /// When the kernel refuses, which it does not for a thread that gives up what it has.
 pub fn give_up(role: Role) -> Result<(), DropError> {
-    capabilities::keep(|capability| role.keeps(capability))
+    capabilities::keep(role.capabilities())
 }
 
 /// What is in force in this process.

@@ -13,7 +13,9 @@ mod probe;
 mod threads;
 mod user;
 
-pub use capabilities::{CapabilitiesRemain, DropError, Missing, Unprivileged, check, missing};
+pub use capabilities::{
+    CapabilitiesRemain, DropError, Missing, Unprivileged, capability_names, check, missing,
+};
 pub use confinement::{
     ConfineError, Role, Sandbox, SpawnError, confine, give_up, sandbox, spawn, spawn_source,
 };

@@ -3,7 +3,9 @@
 
 use std::fs;
 
-use caps::Capability;
+use rustix::thread::CapabilitySet;
+
+use super::capabilities::capability_names;
 
 /// One thread.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,15 +40,9 @@ fn read(status: &str) -> ThreadCapabilities {
         value.unwrap_or_default().trim()
     };
     let permitted = u64::from_str_radix(value("CapPrm"), 16).unwrap_or(u64::MAX);
-    let mut capabilities: Vec<_> = caps::all()
-        .iter()
-        .filter(|capability| permitted & capability.bitmask() != 0)
-        .map(Capability::to_string)
-        .collect();
-    capabilities.sort();
     ThreadCapabilities {
         name: value("Name").to_owned(),
-        capabilities,
+        capabilities: capability_names(CapabilitySet::from_bits_retain(permitted)),
         filtered: value("Seccomp") == "2",
     }
 }

@@ -4,11 +4,13 @@
 use std::fs;
 use std::io;
 
-use caps::{CapSet, Capability};
 use rustix::process::{Gid, Uid, geteuid};
 use rustix::thread::{
-    set_keep_capabilities, set_thread_groups, set_thread_res_gid, set_thread_res_uid,
+    CapabilitySet, capabilities, set_capabilities, set_keep_capabilities, set_thread_groups,
+    set_thread_res_gid, set_thread_res_uid,
 };
+
+use super::capabilities::capability_names;
 
 /// The user and the group.
 const NAME: &str = "ros2probe";
@@ -35,9 +37,11 @@ pub fn become_own_user() -> Identity {
     let Some((user, group)) = find(&read("/etc/passwd"), &read("/etc/group")) else {
         return Identity::Root(format!("user {NAME} does not exist"));
     };
-    let effective = caps::read(None, CapSet::Effective).unwrap_or_default();
-    let needed = [Capability::CAP_SETUID, Capability::CAP_SETGID];
-    if let Some(missing) = needed.iter().find(|one| !effective.contains(one)) {
+    let effective =
+        capabilities(None).map_or_else(|_| CapabilitySet::empty(), |sets| sets.effective);
+    let needed = [CapabilitySet::SETUID, CapabilitySet::SETGID];
+    if let Some(missing) = needed.into_iter().find(|one| !effective.contains(*one)) {
+        let missing = capability_names(missing).concat();
         return Identity::Root(format!("becoming the user {NAME} takes {missing}"));
     }
     match become_user(user, group) {
@@ -68,8 +72,9 @@ fn become_user(user: Uid, group: Gid) -> io::Result<()> {
     set_keep_capabilities(true)?;
     set_thread_res_uid(user, user, user)?;
     set_keep_capabilities(false)?;
-    let permitted = caps::read(None, CapSet::Permitted).map_err(io::Error::other)?;
-    caps::set(None, CapSet::Effective, &permitted).map_err(io::Error::other)
+    let mut sets = capabilities(None)?;
+    sets.effective = sets.permitted;
+    Ok(set_capabilities(None, sets)?)
 }
 
 #[cfg(test)]
@@ -95,9 +100,9 @@ mod tests {
     fn who_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
         assert!(geteuid().is_root(), "this takes root: run `make test`");
         let thread = std::thread::spawn(|| {
-            let before = caps::read(None, CapSet::Effective).unwrap();
+            let before = capabilities(None).unwrap().effective;
             become_user(Uid::from_raw(65534), Gid::from_raw(65533)).unwrap();
-            assert_eq!(caps::read(None, CapSet::Effective).unwrap(), before);
+            assert_eq!(capabilities(None).unwrap().effective, before);
             fs::read_to_string("/proc/thread-self/status").unwrap()
         });
         let status = thread.join().unwrap();

@@ -5,10 +5,7 @@
 //! the file system at every few megabytes and every second; several recordings may overdraw a limit by
 //! so much.
 
-use std::ffi::CString;
 use std::io;
-use std::mem::MaybeUninit;
-use std::os::unix::ffi::OsStrExt as _;
 use std::path::{Path, PathBuf};
 
 use crate::config::RecordingLimits;
@@ -122,15 +119,8 @@ struct FilesystemSpace {
 fn space(directory: &Path) -> io::Result<FilesystemSpace> {
     let existing = directory.ancestors().find(|path| path.exists());
     let path = existing.unwrap_or(directory);
-    let path = CString::new(path.as_os_str().as_bytes())?;
-    let mut statistics = MaybeUninit::<libc::statvfs>::uninit();
-    // SAFETY: the path ends in a zero, and both outlive the call.
-    if unsafe { libc::statvfs(path.as_ptr(), statistics.as_mut_ptr()) } != 0 {
-        return Err(io::Error::last_os_error());
-    }
-    // SAFETY: the call has filled it.
-    let statistics = unsafe { statistics.assume_init() };
-    let bytes = |blocks: libc::fsblkcnt_t| blocks.saturating_mul(statistics.f_frsize);
+    let statistics = rustix::fs::statvfs(path)?;
+    let bytes = |blocks: u64| blocks.saturating_mul(statistics.f_frsize);
     Ok(FilesystemSpace {
         size: bytes(statistics.f_blocks),
         free: bytes(statistics.f_bavail),

@@ -9,7 +9,8 @@ use ros2probe_api::endpoints::Endpoint;
 use ros2probe_api::participants::UnknownWriter;
 use ros2probe_api::samples::OfferedQos;
 use ros2probe_api::topics::Topic;
-use ros2probe_model::snapshot::{EndpointFacts, Passage, Snapshot, TopicFacts};
+use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
+use ros2probe_model::topic_kind::TopicKind;
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -47,7 +48,7 @@ pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, Discover
     let topics = topics.iter();
     let topics = topics.filter(|topic| topic.domain_id == domain_id);
     let topics = topics.map(|topic| {
-        let name = if is_topic(&topic.kind) {
+        let name = if is_ros_topic(&topic.kind) {
             &topic.name
         } else {
             &topic.dds_name
@@ -62,7 +63,8 @@ impl GraphSnapshot {
     #[must_use]
     pub fn answered(topics: &[Topic<'_>], unknown_writers: Vec<UnknownWriter<'_>>) -> Self {
         let topics = topics.iter();
-        let topics = topics.filter(|topic| is_topic(&topic.kind) && !topic.publishers.is_empty());
+        let topics =
+            topics.filter(|topic| is_ros_topic(&topic.kind) && !topic.publishers.is_empty());
         let unknown_writers = unknown_writers.into_iter();
         Self {
             topics: topics.map(PublishedTopic::from).collect(),
@@ -94,6 +96,11 @@ impl From<&Topic<'_>> for PublishedTopic {
     }
 }
 
+/// Whether ROS names a topic by it; a kind that this version does not know counts as one.
+fn is_ros_topic(kind: &str) -> bool {
+    TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
+}
+
 fn owned(texts: &[Cow<'_, str>]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }
@@ -101,7 +108,8 @@ fn owned(texts: &[Cow<'_, str>]) -> Vec<String> {
 impl From<&Snapshot> for GraphSnapshot {
     fn from(snapshot: &Snapshot) -> Self {
         let topics = snapshot.topics.iter();
-        let topics = topics.filter(|topic| is_topic(topic.kind) && !topic.publishers.is_empty());
+        let topics =
+            topics.filter(|topic| topic.kind.is_ros_topic() && !topic.publishers.is_empty());
         let unknown_writers = snapshot.unknown_writers.iter();
         Self {
             topics: topics.map(PublishedTopic::from).collect(),
@@ -114,12 +122,12 @@ impl From<&Snapshot> for GraphSnapshot {
 
 impl From<&TopicFacts> for PublishedTopic {
     fn from(facts: &TopicFacts) -> Self {
-        let passages = facts.passages.iter();
-        let passages = passages.map(|count| (count.passage.label(), count.pairs));
+        let passages = facts.transports.iter();
+        let passages = passages.map(|count| (count.transport.label(), count.pairs));
         let publishers = facts.publishers.iter();
         let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
         Self {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: facts.name.clone(),
             message_types: facts.message_types.clone(),
             subscribed: !facts.subscriptions.is_empty(),
@@ -132,18 +140,10 @@ impl From<&TopicFacts> for PublishedTopic {
     }
 }
 
-/// Neither half of a service, nor what follows no ROS convention.
-fn is_topic(kind: &str) -> bool {
-    !matches!(
-        kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    )
-}
-
 fn other_transport<'a>(
     passages: impl Iterator<Item = (&'a str, usize)> + Clone,
 ) -> Option<&'a str> {
-    let network = Passage::Network.label();
+    let network = Transport::Network.label();
     if passages.clone().any(|(passage, _)| passage == network) {
         return None;
     }

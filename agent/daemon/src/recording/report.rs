@@ -327,6 +327,7 @@ fn few(names: &[&str]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use std::sync::Arc;
 
     use ros2probe_wire::Guid;
@@ -337,7 +338,7 @@ mod tests {
     fn missed(first: u64, samples: u64, reason: MissedReason) -> Missed {
         Missed {
             topic: Arc::new(Topic {
-                domain_id: 0,
+                domain_id: DomainId(0),
                 name: "/points".into(),
                 dds_name: "rt/points".into(),
                 message_type: "sensor_msgs/msg/PointCloud2".into(),

@@ -112,6 +112,7 @@ fn cost(sample: &Sample) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::Guid;
 
     use super::*;
@@ -120,7 +121,7 @@ mod tests {
     fn sample(seconds: u64, bytes: usize) -> Arc<Sample> {
         Arc::new(Sample {
             topic: Arc::new(Topic {
-                domain_id: 0,
+                domain_id: DomainId(0),
                 name: "/a".into(),
                 dds_name: "rt/a".into(),
                 message_type: "std_msgs/msg/String".into(),

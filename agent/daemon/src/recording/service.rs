@@ -1,6 +1,7 @@
 //! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
 //! the configuration allows and nowhere else.
 
+use ros2probe_wire::DomainId;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -233,7 +234,7 @@ impl Recordings {
         let known = self.latest.state();
         let covered = known.known().topics.iter().filter(|topic| {
             let (kind, hidden) = (topic.kind, topic.hidden);
-            topic.domain_id == wanted.domain_id
+            topic.domain_id == DomainId(wanted.domain_id)
                 && subscription
                     .selection()
                     .covers(kind, &topic.name, &topic.dds_name, hidden)
@@ -375,7 +376,7 @@ impl Recordings {
             announced: Box::new(move |names| {
                 let state = latest.state();
                 let topics = state.known().topics.iter();
-                let topics = topics.filter(|topic| topic.domain_id == domain_id);
+                let topics = topics.filter(|topic| topic.domain_id == DomainId(domain_id));
                 let topics: HashMap<_, _> =
                     topics.map(|topic| (topic.name.as_str(), topic)).collect();
                 let announced = names.iter().map(|name| {

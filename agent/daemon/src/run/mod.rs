@@ -27,7 +27,7 @@ use ros2probe_capture::system::give_back_memory;
 use ros2probe_model::history::History;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
-use ros2probe_model::selection::Wish;
+use ros2probe_model::selection::SampleRequest;
 use ros2probe_model::snapshot::Snapshot;
 pub use source::{Source, probe};
 
@@ -65,7 +65,7 @@ pub struct Run {
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
     /// Those that subscriptions wait for to be in force.
-    wishes: Option<Arc<Vec<Wish>>>,
+    sample_requests: Option<Arc<Vec<SampleRequest>>>,
     /// The time that subscriptions were last told.
     published_until: Timestamp,
     stop: CancellationToken,
@@ -105,7 +105,7 @@ impl Run {
             drops: DropMonitor::default(),
             watches,
             subscriptions,
-            wishes: None,
+            sample_requests: None,
             published_until: Timestamp::default(),
             stop,
             keeper: None,
@@ -143,16 +143,16 @@ impl Run {
     }
 
     fn work(&mut self) -> Result<(), RunError> {
-        let has_asked_all = self.take_watches();
+        let has_applied_lists = self.take_watches();
         self.hand_over();
-        if has_asked_all {
+        if has_applied_lists {
             self.confirm_wishes();
         }
         self.publish();
         let mut published = Instant::now();
         while !self.stop.is_cancelled() {
             let subscribed = self.subscriptions.is_open();
-            let slice = if !self.observer.has_asked_all() {
+            let slice = if !self.observer.has_applied_lists() {
                 Duration::ZERO
             } else if self.outputs.latest.is_asked() {
                 PUBLISH_ASKED
@@ -165,7 +165,7 @@ impl Run {
             let bell = self.outputs.latest.bell().descriptor();
             let polled = self.source.poll(slice, step, bell, &mut self.observer);
             self.outputs.latest.bell().silence();
-            let has_asked_all = self.take_watches();
+            let has_applied_lists = self.take_watches();
             let finished = self.source.is_finished();
             if finished {
                 if let Some(end) = self.source.cut() {
@@ -177,7 +177,7 @@ impl Run {
             }
             self.remember();
             self.hand_over();
-            if has_asked_all {
+            if has_applied_lists {
                 self.confirm_wishes();
             }
             let age = published.elapsed();
@@ -239,7 +239,7 @@ impl Run {
         }
         self.outputs.events.add(output.events, now);
         self.outputs.spans.add(output.spans);
-        let clock = self.observer.given_until(now);
+        let clock = self.observer.dispatched_until(now);
         if clock.0.saturating_add(SET_BACK) < self.published_until.0 {
             self.published_until = clock;
         }
@@ -257,9 +257,10 @@ impl Run {
                 self.subscriptions.retain(watchlist.watches());
                 self.observer.input(Input::Watchlist(watchlist));
             }
-            if let Some(wishes) = self.subscriptions.take_changed() {
-                self.observer.input(Input::Wishes(Arc::clone(&wishes)));
-                self.wishes = Some(wishes);
+            if let Some(sample_requests) = self.subscriptions.take_changed() {
+                self.observer
+                    .input(Input::SampleRequests(Arc::clone(&sample_requests)));
+                self.sample_requests = Some(sample_requests);
             }
         }
         self.ask()
@@ -267,9 +268,9 @@ impl Run {
 
     /// Confirms wishes whose verdicts the kernel has, before the next packets.
     fn confirm_wishes(&mut self) {
-        if let Some(wishes) = self.wishes.take() {
-            self.subscriptions.in_force(&wishes);
-            if wishes.is_empty() {
+        if let Some(sample_requests) = self.sample_requests.take() {
+            self.subscriptions.in_force(&sample_requests);
+            if sample_requests.is_empty() {
                 // Buffers of large messages are free now, and the next subscription may be far off.
                 give_back_memory();
             }
@@ -278,7 +279,7 @@ impl Run {
 
     /// Goes on with what new lists say of each topic; whether that is done. A replay waits for it.
     fn ask(&mut self) -> bool {
-        while !self.observer.ask_more() {
+        while !self.observer.apply_more_lists() {
             if let Source::Live(_) = self.source {
                 return false;
             }

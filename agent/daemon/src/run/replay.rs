@@ -165,7 +165,7 @@ impl Replay {
         let end = Instant::now() + timeout;
         while !self.finished {
             let now = Instant::now();
-            if now >= end || observer.has_much_to_give() {
+            if now >= end || observer.has_much_output() {
                 break;
             }
             if let Some(waiting) = &self.waiting {

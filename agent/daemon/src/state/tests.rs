@@ -1,3 +1,5 @@
+use rustix::fs::{CWD, FileType, Mode, mknodat};
+
 use super::*;
 
 fn directory() -> (tempfile::TempDir, StateDirectory) {
@@ -189,9 +191,7 @@ fn a_link_in_place_of_a_state_file_is_neither_read_nor_written_through() {
 fn a_pipe_or_a_directory_in_place_of_a_state_file_does_not_hang_the_start() {
     let (place, directory) = directory();
     let path = place.path().join(FILE);
-    let name = std::ffi::CString::new(path.as_os_str().as_encoded_bytes()).unwrap();
-    // SAFETY: the path ends in a zero and outlives the call.
-    assert_eq!(unsafe { libc::mkfifo(name.as_ptr(), 0o600) }, 0);
+    mknodat(CWD, &path, FileType::Fifo, Mode::RUSR | Mode::WUSR, 0).unwrap();
     let (found, heard) = std::sync::mpsc::channel();
     std::thread::spawn(move || found.send((unusable(&directory), directory)));
     let (reason, directory) = heard.recv_timeout(Duration::from_secs(10)).unwrap();

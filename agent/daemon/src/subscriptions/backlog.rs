@@ -120,5 +120,5 @@ fn key(item: &Item) -> Option<Key> {
         Item::Missed(missed) => &missed.topic,
         Item::Clock(_) | Item::End(_) => return None,
     };
-    Some((topic.domain_id, Arc::clone(&topic.dds_name)))
+    Some((topic.domain_id.0, Arc::clone(&topic.dds_name)))
 }

@@ -7,14 +7,14 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{DomainId, Timestamp};
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
 use super::{Depth, Item, Overflow, Request, Selection};
 use ros2probe_model::payloads::{Missed, MissedReason, Sample};
-use ros2probe_model::selection::Wish;
+use ros2probe_model::selection::SampleRequest;
 
 /// What a queued entry costs besides a payload.
 const OVERHEAD: usize = 256;
@@ -121,11 +121,11 @@ impl Channel {
         &self.selection
     }
 
-    pub(super) fn wish(&self) -> Wish {
-        Wish {
+    pub(super) fn request(&self) -> SampleRequest {
+        SampleRequest {
             id: self.id,
             selection: Arc::clone(&self.selection),
-            domain_id: self.request.domain_id,
+            domain_id: self.request.domain_id.map(DomainId),
             depth: self.request.depth,
         }
     }

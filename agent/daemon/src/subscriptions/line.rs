@@ -36,7 +36,7 @@ fn sample(sample: &Sample) -> samples::Sample {
     let len = |payload: &bytes::Bytes| u32::try_from(payload.len()).unwrap_or(u32::MAX);
     samples::Sample {
         topic: name.to_string(),
-        domain_id: *domain_id,
+        domain_id: domain_id.0,
         message_type: message_type.to_string(),
         time_ns: nanoseconds(sample.time),
         writer: sample.writer.to_string(),
@@ -53,7 +53,7 @@ fn sample(sample: &Sample) -> samples::Sample {
 fn missed(missed: &Missed) -> samples::Missed {
     samples::Missed {
         topic: missed.topic.name.to_string(),
-        domain_id: missed.topic.domain_id,
+        domain_id: missed.topic.domain_id.0,
         writer: missed.writer.to_string(),
         samples: missed.samples,
         first_sequence_number: missed.first,

@@ -23,8 +23,8 @@ use crate::config::{Watch, check_globs};
 use crate::snapshot_cell::SnapshotCell;
 use channel::Channel;
 use retained::Retained;
-use ros2probe_model::payloads::{Given, News, Sample};
-use ros2probe_model::selection::Wish;
+use ros2probe_model::payloads::{Dispatch, Sample, SampleOutcome};
+use ros2probe_model::selection::SampleRequest;
 
 pub use ros2probe_model::payloads::{Missed, MissedReason, Topic};
 pub use ros2probe_model::selection::{Choice, ChoiceError, Depth, Selection};
@@ -113,7 +113,7 @@ pub struct Subscriptions {
     changing: Mutex<Opened>,
     retained: Mutex<Retained>,
     /// For the capture thread: the latest wishes it has not taken yet.
-    news: ArcSwapOption<Vec<Wish>>,
+    news: ArcSwapOption<Vec<SampleRequest>>,
     latest: Arc<SnapshotCell>,
     caps: Caps,
     /// Ends waiting for readers when the agent ends.
@@ -238,7 +238,7 @@ impl Subscriptions {
 
     /// For the capture thread: all wishes, when they have changed since the last call.
     #[must_use]
-    pub fn take_changed(&self) -> Option<Arc<Vec<Wish>>> {
+    pub fn take_changed(&self) -> Option<Arc<Vec<SampleRequest>>> {
         self.news.swap(None)
     }
 
@@ -246,9 +246,9 @@ impl Subscriptions {
     pub fn retain(&self, watches: &[Arc<Watch>]) {
         let changing = self.changing();
         let mut retained = self.retained();
-        let before = retained.wishes().count();
+        let before = retained.sample_requests().count();
         retained.set(watches.iter().map(|watch| &**watch));
-        let is_idle = before == 0 && retained.wishes().count() == 0;
+        let is_idle = before == 0 && retained.sample_requests().count() == 0;
         drop(retained);
         if !is_idle {
             self.change(self.channels.load().to_vec());
@@ -258,10 +258,14 @@ impl Subscriptions {
 
     /// For the capture thread: the model and the kernel know these wishes. Readers that are new
     /// among them get first what is retained for them.
-    pub fn in_force(&self, wishes: &[Wish]) {
+    pub fn in_force(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             let is_new = !channel.is_in_force();
-            if !is_new || !wishes.iter().any(|wish| wish.id == channel.id()) {
+            if !is_new
+                || !sample_requests
+                    .iter()
+                    .any(|request| request.id == channel.id())
+            {
                 continue;
             }
             if channel.depth() == Depth::Payloads {
@@ -271,7 +275,7 @@ impl Subscriptions {
                     let mut publishers = topics().flat_map(|topic| &topic.publishers);
                     publishers.any(|publisher| publisher.guid == writer)
                 };
-                let samples = self.retained().for_reader(&channel.wish(), is_there);
+                let samples = self.retained().for_reader(&channel.request(), is_there);
                 for sample in samples {
                     self.given.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
@@ -284,10 +288,10 @@ impl Subscriptions {
 
     /// For the capture thread: puts what the model gives into the queues, and the time up to which
     /// that is all, if it has gone on.
-    pub fn deliver(&self, given: Vec<Given>, clock: Option<Timestamp>) {
+    pub fn deliver(&self, given: Vec<Dispatch>, clock: Option<Timestamp>) {
         let mut retained = self.retained();
-        for Given { to, news } in &given {
-            if let News::Sample(sample) = news {
+        for Dispatch { to, outcome } in &given {
+            if let SampleOutcome::Sample(sample) = outcome {
                 retained.keep(to, sample);
             }
         }
@@ -296,10 +300,10 @@ impl Subscriptions {
         if channels.is_empty() {
             return;
         }
-        for Given { to, news } in given {
-            match news {
-                News::Sample(sample) => self.sample(&channels, &to, &sample),
-                News::Missed(missed) => {
+        for Dispatch { to, outcome } in given {
+            match outcome {
+                SampleOutcome::Sample(sample) => self.sample(&channels, &to, &sample),
+                SampleOutcome::Missed(missed) => {
                     for channel in addressed(&channels, &to) {
                         self.count_missed(missed.reason, missed.samples);
                         channel.miss(missed.clone(), &self.stop);
@@ -383,12 +387,14 @@ impl Subscriptions {
 
     /// Others are open from now on. Called while `changing` is held.
     fn change(&self, channels: Vec<Arc<Channel>>) {
-        let wishes = channels.iter().map(|channel| channel.wish());
+        let sample_requests = channels.iter().map(|channel| channel.request());
         let retained = self.retained();
-        let wishes = wishes.chain(retained.wishes().cloned()).collect();
+        let sample_requests = sample_requests
+            .chain(retained.sample_requests().cloned())
+            .collect();
         drop(retained);
         self.channels.store(Arc::new(channels));
-        self.news.store(Some(Arc::new(wishes)));
+        self.news.store(Some(Arc::new(sample_requests)));
     }
 
     fn retained(&self) -> std::sync::MutexGuard<'_, Retained> {

@@ -12,7 +12,7 @@ use ros2probe_wire::qos::Durability;
 
 use crate::config::{Retain, Watch};
 use ros2probe_model::payloads::{Sample, Topic};
-use ros2probe_model::selection::{Depth, Selection, Wish};
+use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_model::topic::Naming;
 
 /// From here on ids are those of wishes for what is retained, not of readers.
@@ -25,7 +25,7 @@ const BYTES: usize = 4 << 20;
 /// What is retained.
 #[derive(Debug, Default)]
 pub(super) struct Retained {
-    wishes: Vec<Wish>,
+    sample_requests: Vec<SampleRequest>,
     samples: BTreeMap<Guid, Arc<Sample>>,
     bytes: usize,
 }
@@ -34,8 +34,8 @@ impl Retained {
     /// Retains what these watches ask for, and nothing else any more.
     pub(super) fn set<'a>(&mut self, watches: impl Iterator<Item = &'a Watch>) {
         let asking = watches.filter(|watch| watch.retain == Retain::Last);
-        let wishes = asking.zip(FIRST..).filter_map(|(watch, id)| {
-            Some(Wish {
+        let sample_requests = asking.zip(FIRST..).filter_map(|(watch, id)| {
+            Some(SampleRequest {
                 id,
                 // Checked when it was configured.
                 selection: Arc::new(Selection::named([watch.pattern.as_str()]).ok()?),
@@ -43,16 +43,19 @@ impl Retained {
                 depth: Depth::Payloads,
             })
         });
-        self.wishes = wishes.collect();
-        let wishes = &self.wishes;
-        self.samples
-            .retain(|_, sample| wishes.iter().any(|wish| covers(wish, &sample.topic)));
+        self.sample_requests = sample_requests.collect();
+        let sample_requests = &self.sample_requests;
+        self.samples.retain(|_, sample| {
+            sample_requests
+                .iter()
+                .any(|request| covers(request, &sample.topic))
+        });
         self.bytes = self.samples.values().map(|sample| size(sample)).sum();
     }
 
     /// What the model has to give for that.
-    pub(super) fn wishes(&self) -> impl Iterator<Item = &Wish> {
-        self.wishes.iter()
+    pub(super) fn sample_requests(&self) -> impl Iterator<Item = &SampleRequest> {
+        self.sample_requests.iter()
     }
 
     /// Bytes kept.
@@ -84,7 +87,7 @@ impl Retained {
     /// What a new reader is to get first, oldest first; of writers that are still there.
     pub(super) fn for_reader(
         &mut self,
-        wish: &Wish,
+        request: &SampleRequest,
         is_there: impl Fn(Guid) -> bool,
     ) -> Vec<Arc<Sample>> {
         let writers: Vec<Guid> = self.samples.keys().copied().collect();
@@ -92,7 +95,7 @@ impl Retained {
             self.forget(gone);
         }
         let samples = self.samples.values();
-        let wanted = samples.filter(|sample| covers(wish, &sample.topic));
+        let wanted = samples.filter(|sample| covers(request, &sample.topic));
         let mut wanted: Vec<_> = wanted.map(Arc::clone).collect();
         wanted.sort_by_key(|sample| sample.time);
         wanted
@@ -109,13 +112,14 @@ fn size(sample: &Sample) -> usize {
     sample.payload.as_ref().map_or(0, bytes::Bytes::len)
 }
 
-fn covers(wish: &Wish, topic: &Topic) -> bool {
+fn covers(request: &SampleRequest, topic: &Topic) -> bool {
     DdsTopic::parse(&topic.dds_name)
-        .is_ok_and(|name| wish.covers(topic.domain_id, &Naming::of(&name)))
+        .is_ok_and(|name| request.covers(topic.domain_id, &Naming::of(&name)))
 }
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::qos::{Qos, Role};
     use ros2probe_wire::rtps::VendorId;
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
@@ -143,7 +147,7 @@ mod tests {
         };
         Arc::new(Sample {
             topic: Arc::new(Topic {
-                domain_id: 0,
+                domain_id: DomainId(0),
                 name: name.into(),
                 dds_name: format!("rt{name}").into(),
                 message_type: "tf2_msgs/msg/TFMessage".into(),
@@ -170,16 +174,19 @@ mod tests {
         };
         let mut retained = Retained::default();
         retained.set([&watch, &Watch::named("/other").unwrap()].into_iter());
-        let ids: Vec<u64> = retained.wishes().map(|wish| wish.id).collect();
+        let ids: Vec<u64> = retained
+            .sample_requests()
+            .map(|request| request.id)
+            .collect();
         assert_eq!(ids.len(), 1);
         (retained, ids[0])
     }
 
-    fn reader() -> Wish {
-        Wish {
+    fn reader() -> SampleRequest {
+        SampleRequest {
             id: 7,
             selection: Arc::new(Selection::all()),
-            domain_id: Some(0),
+            domain_id: Some(DomainId(0)),
             depth: Depth::Payloads,
         }
     }

@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::*;
 use crate::agent_facts::SourceKind;
@@ -38,7 +38,7 @@ fn sample(number: u64, payload: Option<usize>) -> Arc<Sample> {
 fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
     Arc::new(Sample {
         topic: Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: format!("/{topic}").into(),
             dds_name: format!("rt/{topic}").into(),
             message_type: "a/msg/B".into(),
@@ -55,14 +55,14 @@ fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
     })
 }
 
-fn given(to: &[u64], number: u64, payload: Option<usize>) -> Given {
+fn given(to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
     given_of("points", to, number, payload)
 }
 
-fn given_of(topic: &str, to: &[u64], number: u64, payload: Option<usize>) -> Given {
-    Given {
+fn given_of(topic: &str, to: &[u64], number: u64, payload: Option<usize>) -> Dispatch {
+    Dispatch {
         to: to.into(),
-        news: News::Sample(sample_of(topic, number, payload)),
+        outcome: SampleOutcome::Sample(sample_of(topic, number, payload)),
     }
 }
 
@@ -82,8 +82,8 @@ fn each_reader_gets_what_is_for_it_and_bytes_only_when_asked() {
     let mut arrivals = all.open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest));
     let mut payloads = all.open(request(Depth::Payloads, 1 << 16, Overflow::DropOldest));
     let (arrivals, payloads) = (arrivals.as_mut().unwrap(), payloads.as_mut().unwrap());
-    let wishes = all.take_changed().unwrap();
-    assert_eq!(wishes.len(), 2);
+    let sample_requests = all.take_changed().unwrap();
+    assert_eq!(sample_requests.len(), 2);
     all.deliver(
         vec![given(&[1, 2], 1, Some(5)), given(&[2], 2, Some(6))],
         Some(Timestamp(9)),
@@ -251,8 +251,11 @@ fn dropping_a_subscription_closes_its_interest_and_makes_room_for_another() {
     all.deliver(vec![given(&[4], 1, Some(1000))], None);
     readers.pop();
     assert_eq!((all.facts().open, all.facts().queued_bytes), (3, 0));
-    let wishes = all.take_changed().unwrap();
-    assert_eq!(wishes.iter().map(|wish| wish.id).max(), Some(3));
+    let sample_requests = all.take_changed().unwrap();
+    assert_eq!(
+        sample_requests.iter().map(|request| request.id).max(),
+        Some(3)
+    );
     assert!(all.take_changed().is_none());
     assert!(open().is_ok());
     assert_eq!(all.facts().refused, 1);

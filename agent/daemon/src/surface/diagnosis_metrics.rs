@@ -9,11 +9,12 @@ use super::metric_sink::{Label, MetricSink};
 use crate::series_name::series_name;
 use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::snapshot::Snapshot;
+use ros2probe_wire::DomainId;
 
 /// What one finding adds to a family.
 type Count = fn(&Diagnosis) -> usize;
 /// How many of something on each topic.
-type PerTopic<'a> = BTreeMap<(u32, Cow<'a, str>), usize>;
+type PerTopic<'a> = BTreeMap<(DomainId, Cow<'a, str>), usize>;
 
 /// One family of each kind of finding.
 pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
@@ -98,7 +99,7 @@ pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::
     })
 }
 
-fn series(topic: &TopicKey) -> (u32, Cow<'_, str>) {
+fn series(topic: &TopicKey) -> (DomainId, Cow<'_, str>) {
     let name = series_name(topic.kind, &topic.name, &topic.dds_name);
     (topic.domain_id, name)
 }

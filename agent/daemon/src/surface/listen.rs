@@ -4,7 +4,7 @@
 use std::io;
 use std::net::{SocketAddr, TcpListener};
 
-use socket2::SockRef;
+use rustix::net::sockopt;
 
 /// What the kernel doubles, and each connection takes at most.
 const SEND_BUFFER: usize = 128 << 10;
@@ -14,7 +14,7 @@ pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     let listener = TcpListener::bind(address)?;
     listener.set_nonblocking(true)?;
     // Connections have it from their listener.
-    SockRef::from(&listener).set_send_buffer_size(SEND_BUFFER)?;
+    sockopt::set_socket_send_buffer_size(&listener, SEND_BUFFER)?;
     Ok(listener)
 }
 
@@ -31,7 +31,7 @@ mod tests {
         let client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
         listener.set_nonblocking(false).unwrap();
         let (server, _) = listener.accept().unwrap();
-        let room = SockRef::from(&server).send_buffer_size().unwrap();
+        let room = sockopt::socket_send_buffer_size(&server).unwrap();
         assert_eq!(room, 2 * SEND_BUFFER);
         // As it grows while something is sent.
         server
@@ -39,7 +39,7 @@ mod tests {
             .unwrap();
         let sent = io::copy(&mut io::repeat(7), &mut &server);
         assert!(sent.is_err());
-        let room = SockRef::from(&server).send_buffer_size().unwrap();
+        let room = sockopt::socket_send_buffer_size(&server).unwrap();
         assert_eq!(room, 2 * SEND_BUFFER);
         drop(client);
     }

@@ -15,6 +15,8 @@ use ros2probe_model::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
     WatchState,
 };
+use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::DomainId;
 
 /// Unknown writers with series of their own.
 const MAX_UNKNOWN_WRITERS: usize = 32;
@@ -49,10 +51,10 @@ impl<'a> TopicRows<'a> {
     /// Topics that are measured come first; services and other plumbing are shown when measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
-        let mut rows: BTreeMap<(u32, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
+        let mut rows: BTreeMap<(DomainId, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
         let mut hidden = 0;
         let shown = |facts: &&TopicFacts| {
-            facts.measurement.is_some() || matches!(facts.kind, "topic" | "dds")
+            facts.measurement.is_some() || matches!(facts.kind, TopicKind::Topic | TopicKind::Dds)
         };
         let (measured, others): (Vec<&TopicFacts>, Vec<&TopicFacts>) = snapshot
             .topics
@@ -69,7 +71,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: Some(facts),
                         watched: false,
@@ -97,7 +99,7 @@ impl<'a> TopicRows<'a> {
                 rows.insert(
                     key,
                     TopicRow {
-                        domain_id,
+                        domain_id: domain_id.0,
                         name,
                         facts: None,
                         watched: true,
@@ -128,7 +130,7 @@ impl<'a> TopicRow<'a> {
 
 /// The graph.
 pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
-    let mut domains: BTreeMap<u32, (usize, usize, usize)> = BTreeMap::new();
+    let mut domains: BTreeMap<DomainId, (usize, usize, usize)> = BTreeMap::new();
     for participant in &snapshot.participants {
         let counts = domains.entry(participant.domain_id).or_default();
         counts.0 += 1;
@@ -138,7 +140,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         domains.entry(node.domain_id).or_default().2 += 1;
     }
     if domains.is_empty() {
-        domains.insert(0, (0, 0, 0));
+        domains.insert(DomainId(0), (0, 0, 0));
     }
     sink.family(&metric::PARTICIPANTS, |family| {
         per_domain(family, &domains, |counts| counts.0)
@@ -165,13 +167,16 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
         })
     })?;
     sink.family(&metric::TOPICS, |family| {
-        let mut kinds: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+        let mut kinds: BTreeMap<(DomainId, TopicKind), usize> = BTreeMap::new();
         for topic in snapshot.topics.iter().filter(|topic| !topic.vanished) {
             *kinds.entry((topic.domain_id, topic.kind)).or_default() += 1;
         }
         kinds.iter().try_for_each(|((domain_id, kind), count)| {
             family.sample(
-                &[Label::Number((*domain_id).into()), Label::Text(kind)],
+                &[
+                    Label::Number((*domain_id).into()),
+                    Label::Text(kind.label()),
+                ],
                 *count,
             )
         })
@@ -223,7 +228,7 @@ fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
 
 fn per_domain(
     family: &mut Family<'_, '_>,
-    domains: &BTreeMap<u32, (usize, usize, usize)>,
+    domains: &BTreeMap<DomainId, (usize, usize, usize)>,
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
     domains.iter().try_for_each(|(domain_id, counts)| {
@@ -379,9 +384,9 @@ fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     })?;
     sink.family(&metric::TOPIC_PAIRS, |family| {
         for row in rows {
-            for count in row.facts.iter().flat_map(|facts| &facts.passages) {
+            for count in row.facts.iter().flat_map(|facts| &facts.transports) {
                 let [domain_id, topic] = row.labels();
-                let passage = Label::Text(count.passage.label());
+                let passage = Label::Text(count.transport.label());
                 family.sample(&[domain_id, topic, passage], count.pairs)?;
             }
         }
@@ -446,7 +451,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     family.info(&[
         domain_id,
         topic,
-        Label::Text(facts.kind),
+        Label::Text(facts.kind.label()),
         Label::Text(&message_types),
         Label::Text(&reliability),
         Label::Text(&durability),

@@ -3,6 +3,7 @@
 //! Written by a thread of its own, the latest list only; who adds a watch does not wait for the
 //! disk. A file that cannot be used is kept aside and never ends the agent.
 
+use ros2probe_wire::DomainId;
 use std::io;
 use std::mem;
 use std::path::PathBuf;
@@ -12,7 +13,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::config::watch::{Expectations, MAX_DOMAIN, Retain, Watch, check_pattern, check_trace};
+use crate::config::watch::{Expectations, Retain, Watch, check_pattern, check_trace};
 use crate::config::{Limit, check_globs};
 use crate::state::{Form, Found, Newer, StateDirectory, from_json};
 
@@ -125,7 +126,10 @@ impl TryFrom<Line> for Watch {
 
     fn try_from(line: Line) -> Result<Self, String> {
         check_pattern(&line.topic).map_err(|error| format!("`{}` {error}", line.topic))?;
-        if let Some(domain_id) = line.domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+        if let Some(domain_id) = line
+            .domain_id
+            .filter(|domain_id| *domain_id > DomainId::MAX.0)
+        {
             return Err(format!("there is no domain {domain_id}"));
         }
         let expectations = Expectations {
@@ -139,7 +143,7 @@ impl TryFrom<Line> for Watch {
         check_trace(line.trace)?;
         Ok(Self {
             pattern: line.topic,
-            domain_id: line.domain_id,
+            domain_id: line.domain_id.map(DomainId),
             expectations,
             per_subscriber: line.per_subscriber,
             trace: line.trace,
@@ -159,7 +163,7 @@ impl From<&Watch> for Line {
         } = watch.expectations;
         Self {
             topic: watch.pattern.clone(),
-            domain_id: watch.domain_id,
+            domain_id: watch.domain_id.map(|id| id.0),
             per_subscriber: watch.per_subscriber,
             trace: watch.trace,
             retain: watch.retain,
@@ -274,7 +278,7 @@ mod tests {
 
     fn watches() -> Vec<Watch> {
         let expecting = Watch {
-            domain_id: Some(5),
+            domain_id: Some(DomainId(5)),
             per_subscriber: true,
             trace: 0.5,
             retain: Retain::Last,

@@ -1,5 +1,6 @@
 //! One topic: do its writers and readers understand each other, and has each one somebody?
 
+use ros2probe_wire::DomainId;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -13,6 +14,7 @@ use super::matching::{self, Offer, Policies, Policy, Verdict};
 use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
 use crate::discovery::{Discovery, Endpoint};
 use crate::topic::Topic;
+use crate::topic_kind::TopicKind;
 
 /// Incompatible pairs listed of one topic.
 const PAIRS_PER_TOPIC: usize = 32;
@@ -21,14 +23,14 @@ const MAX_NAMED: usize = 16;
 
 /// Looks at topics, with what it has to know of the whole.
 #[derive(Debug)]
-pub(super) struct Lookout<'a> {
+pub(super) struct EndpointExaminer<'a> {
     discovery: &'a Discovery,
-    half_known: BTreeSet<u32>,
+    half_known: BTreeSet<DomainId>,
 }
 
 /// An endpoint without a counterpart: a finding once it lasts.
 #[derive(Debug)]
-pub(super) struct Lonely {
+pub(super) struct UnmatchedEndpoint {
     pub(super) guid: Guid,
     pub(super) diagnosis: Diagnosis,
 }
@@ -43,7 +45,7 @@ struct Group<'a> {
     unmatched: Option<Unmatched>,
 }
 
-impl<'a> Lookout<'a> {
+impl<'a> EndpointExaminer<'a> {
     pub(super) fn new(discovery: &'a Discovery) -> Self {
         let half_known = half_known(discovery);
         Self {
@@ -53,7 +55,7 @@ impl<'a> Lookout<'a> {
     }
 
     /// Adds what is found; gives who is alone.
-    pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<Lonely> {
+    pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<UnmatchedEndpoint> {
         let naming = &topic.naming;
         let key = || TopicKey {
             domain_id: topic.domain_id,
@@ -70,7 +72,7 @@ impl<'a> Lookout<'a> {
         }
         let groups = writers.iter().map(|group| (Role::Writer, group));
         let groups = groups.chain(readers.iter().map(|group| (Role::Reader, group)));
-        let mut lonely = Vec::new();
+        let mut unmatched = Vec::new();
         for (role, group) in groups {
             let Some(reason) = group.unmatched else {
                 continue;
@@ -89,19 +91,19 @@ impl<'a> Lookout<'a> {
                         reason,
                     },
                 };
-                lonely.push(Lonely {
+                unmatched.push(UnmatchedEndpoint {
                     guid: *guid,
                     diagnosis,
                 });
             }
         }
-        lonely
+        unmatched
     }
 
     fn endpoint(&self, guid: Guid) -> Option<(&'a Endpoint, VendorId)> {
         let endpoint = self.discovery.endpoints().get(&guid)?;
         let participant = self.discovery.participants().get(&guid.prefix)?;
-        Some((endpoint, participant.portrait.vendor))
+        Some((endpoint, participant.proxy.vendor))
     }
 
     fn groups(&self, guids: &[Guid]) -> Vec<Group<'a>> {
@@ -247,7 +249,7 @@ fn list(
 /// node's `transition_event`, hidden topics, and the topics of services and actions.
 fn is_about_hearing(topic: &Topic) -> bool {
     let naming = &topic.naming;
-    naming.kind == "topic"
+    naming.kind == TopicKind::Topic
         && !naming.hidden
         && !matches!(&*naming.name, "/rosout" | "/parameter_events")
         && !naming.name.ends_with("/transition_event")

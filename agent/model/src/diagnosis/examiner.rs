@@ -4,15 +4,15 @@ use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
-use super::endpoints::{Lonely, Lookout};
+use super::endpoints::{EndpointExaminer, UnmatchedEndpoint};
 use super::{Diagnoses, Diagnosis, QosPairs, nodes};
 use crate::discovery::Discovery;
 use crate::size::Size;
 use crate::topic::Topics;
 
-const SECOND: u64 = 1_000_000_000;
 /// How long an endpoint is alone before that is a finding: nodes start one after another.
 pub(super) const PATIENCE: u64 = 5 * SECOND;
 /// Most findings kept of each kind.
@@ -103,12 +103,12 @@ impl Examiner {
         }
         self.revision = Some(discovery.revision());
         let mut findings = Findings::new();
-        let lookout = Lookout::new(discovery);
+        let endpoints = EndpointExaminer::new(discovery);
         let mut alone = HashMap::new();
         let mut due = None;
         for (_, topic) in topics.iter() {
-            for lonely in lookout.examine(topic, &mut findings) {
-                let Lonely { guid, diagnosis } = lonely;
+            for unmatched in endpoints.examine(topic, &mut findings) {
+                let UnmatchedEndpoint { guid, diagnosis } = unmatched;
                 let since = self.alone.get(&guid).copied().unwrap_or(now);
                 alone.insert(guid, since);
                 let end = Timestamp(since.0.saturating_add(PATIENCE));
@@ -213,10 +213,10 @@ impl Findings {
 
 /// Domains of which it is known that not everything is known: a ROS participant lives there of
 /// which no endpoint was announced in the agent's hearing, although each has some.
-pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<u32> {
+pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {
-        participant.portrait.enclave.is_some() && participant.endpoints.is_empty()
+        participant.proxy.enclave.is_some() && participant.endpoints.is_empty()
     });
     silent.map(|participant| participant.domain_id).collect()
 }
@@ -228,7 +228,7 @@ mod tests {
     #[test]
     fn a_finding_keeps_the_time_when_it_was_found_also_when_it_says_something_else() {
         let duplicate = |node: &str, participants: Vec<Guid>| Diagnosis::DuplicateNode {
-            domain_id: 0,
+            domain_id: DomainId(0),
             node: node.into(),
             participants,
         };

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::Diagnosis;
 use super::examiner::Findings;
@@ -12,7 +12,7 @@ use crate::discovery::{Discovery, Node, Participant};
 
 /// One node with whom it belongs to.
 #[derive(Clone, Copy, Debug)]
-struct Placed<'a> {
+struct HostedNode<'a> {
     prefix: GuidPrefix,
     participant: &'a Participant,
     node: &'a Node,
@@ -20,7 +20,7 @@ struct Placed<'a> {
 
 /// Adds what is found.
 pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
-    let mut names: BTreeMap<&Arc<str>, Vec<Placed<'_>>> = BTreeMap::new();
+    let mut names: BTreeMap<&Arc<str>, Vec<HostedNode<'_>>> = BTreeMap::new();
     for (prefix, participant) in discovery.participants() {
         // Who was there before the agent's start and was not heard since may be its own successor.
         if participant.restored.is_some() {
@@ -28,7 +28,7 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
         }
         for node in participant.nodes.iter().filter(|node| !is_hidden(node)) {
             let prefix = *prefix;
-            names.entry(&node.name).or_default().push(Placed {
+            names.entry(&node.name).or_default().push(HostedNode {
                 prefix,
                 participant,
                 node,
@@ -41,9 +41,11 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
             nodes.chunk_by(|one, other| one.participant.domain_id == other.participant.domain_id);
         for nodes in domains.filter(|nodes| nodes.len() > 1) {
             findings.add(Diagnosis::DuplicateNode {
-                domain_id: nodes.first().map_or(0, |each| each.participant.domain_id),
+                domain_id: nodes
+                    .first()
+                    .map_or(DomainId(0), |each| each.participant.domain_id),
                 node: Arc::clone(name),
-                participants: nodes.iter().map(Placed::guid).collect(),
+                participants: nodes.iter().map(HostedNode::guid).collect(),
             });
         }
         several_domains(name, nodes, discovery, findings);
@@ -55,15 +57,15 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
 /// are a fleet as it should be.
 fn several_domains(
     name: &Arc<str>,
-    nodes: &[Placed<'_>],
+    nodes: &[HostedNode<'_>],
     discovery: &Discovery,
     findings: &mut Findings,
 ) {
-    let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<u32>)> = BTreeMap::new();
-    let lonely = nodes.len() == 1;
+    let mut machines: BTreeMap<BTreeSet<IpAddr>, (Guid, BTreeSet<DomainId>)> = BTreeMap::new();
+    let unmatched = nodes.len() == 1;
     for placed in nodes {
         let mut domains = placed.domains(discovery);
-        let machine = if lonely { None } else { placed.machine() };
+        let machine = if unmatched { None } else { placed.machine() };
         if let Some(machine) = machine {
             let (guid, all) = machines
                 .entry(machine)
@@ -82,7 +84,7 @@ fn several_domains(
     }
 }
 
-fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<u32>) -> Diagnosis {
+fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<DomainId>) -> Diagnosis {
     Diagnosis::NodeInSeveralDomains {
         node: Arc::clone(name),
         participant,
@@ -90,13 +92,13 @@ fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<u32>) -> Diagn
     }
 }
 
-impl Placed<'_> {
+impl HostedNode<'_> {
     fn guid(&self) -> Guid {
         Guid::new(self.prefix, EntityId::PARTICIPANT)
     }
 
     /// Domains of its participant and of the endpoints it has.
-    fn domains(&self, discovery: &Discovery) -> BTreeSet<u32> {
+    fn domains(&self, discovery: &Discovery) -> BTreeSet<DomainId> {
         let guids = self.node.writers.iter().chain(&self.node.readers);
         // Its own participant's are where the participant is.
         let foreign = guids.filter(|guid| guid.prefix != self.prefix);

@@ -8,13 +8,11 @@ use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::{Locator, VendorId};
-use ros2probe_wire::{Duration, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
-use super::worth::Worth;
+use super::priority::Priority;
 
-/// Highest domain (RTPS 2.5, 9.6.1.4: the port numbers end there).
-pub(super) const MAX_DOMAIN: u32 = 232;
 /// Addresses kept of one participant and kind.
 pub(super) const ADDRESSES: usize = 16;
 
@@ -49,7 +47,7 @@ pub struct Origin {
 
 /// What a participant says about itself, as far as it is shown.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Portrait {
+pub struct ParticipantProxy {
     /// Implementation.
     pub vendor: VendorId,
     /// ROS enclave.
@@ -81,13 +79,13 @@ pub struct Addresses {
 #[derive(Debug)]
 pub struct Participant {
     /// What it says.
-    pub portrait: Portrait,
+    pub proxy: ParticipantProxy,
     /// Where it is reached.
     pub addresses: Addresses,
     /// Known from before the agent's start, restored then, and not heard since.
     pub restored: Option<Timestamp>,
     /// Its domain.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// First announcement.
     pub first_seen: Timestamp,
     /// Last sign of life.
@@ -97,7 +95,7 @@ pub struct Participant {
     /// Its nodes.
     pub nodes: Vec<Node>,
     /// Its announcements of readers were seen from the first on.
-    pub readers_told: bool,
+    pub all_readers_announced: bool,
     /// Its endpoints whose topics are watched by their exact names.
     pub(super) watched: usize,
     /// A socket of this host sends for it.
@@ -126,7 +124,7 @@ pub struct Endpoint {
     /// Writer or reader.
     pub role: Role,
     /// Domain of its participant.
-    pub domain_id: u32,
+    pub domain_id: DomainId,
     /// DDS topic.
     pub topic: Arc<str>,
     /// ROS type.
@@ -145,7 +143,7 @@ pub struct Endpoint {
     pub(super) watched: bool,
 }
 
-impl Portrait {
+impl ParticipantProxy {
     pub(super) fn of(announcement: &ParticipantAnnouncement) -> Self {
         let low_bits = || announcement.process_id_low_bits().map(u32::from);
         Self {
@@ -187,8 +185,8 @@ impl Participant {
     }
 
     /// What it is worth when there is no room.
-    pub(super) const fn worth(&self) -> Worth {
-        Worth {
+    pub(super) const fn priority(&self) -> Priority {
+        Priority {
             watched: self.watched > 0,
             local: self.local,
             sends: self.sends,
@@ -249,7 +247,7 @@ impl Participant {
     pub(super) fn lists(&self) -> Lists {
         // A new list does not compile before it has a place here.
         let Self {
-            portrait: _,
+            proxy: _,
             addresses,
             restored: _,
             domain_id: _,
@@ -257,7 +255,7 @@ impl Participant {
             last_seen: _,
             endpoints,
             nodes,
-            readers_told: _,
+            all_readers_announced: _,
             domain_source: _,
             nodes_from: _,
             watched: _,
@@ -280,22 +278,22 @@ impl Participant {
 /// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,
 /// 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p), else 0. Ports from 32768 on are
 /// mostly ephemeral ones and tell nothing.
-pub(super) fn domain(announced: Option<u32>, origin: &Origin) -> (u32, DomainSource) {
+pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
     const EPHEMERAL: u16 = 32_768;
-    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= MAX_DOMAIN) {
+    if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {
         return (domain_id, DomainSource::Announced);
     }
     let Some(offset) = origin.port.checked_sub(7400) else {
-        return (0, DomainSource::Assumed);
+        return (DomainId(0), DomainSource::Assumed);
     };
-    let (domain_id, rest) = (u32::from(offset / 250), offset % 250);
+    let (domain_id, rest) = (DomainId(u32::from(offset / 250)), offset % 250);
     let [first, .., a, _, _, _] = origin.destination;
     let is_multicast = first == 0xff || first == 0 && a & 0xf0 == 0xe0;
-    if is_multicast && rest == 0 && domain_id <= MAX_DOMAIN {
+    if is_multicast && rest == 0 && domain_id <= DomainId::MAX {
         return (domain_id, DomainSource::MulticastPort);
     }
     if rest >= 10 && rest % 2 == 0 && origin.port < EPHEMERAL {
         return (domain_id, DomainSource::UnicastPort);
     }
-    (0, DomainSource::Assumed)
+    (DomainId(0), DomainSource::Assumed)
 }

@@ -15,12 +15,10 @@ use ros2probe_wire::qos::{
     Liveliness, Ownership, Presentation, Qos, Reliability,
 };
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
-use super::facts::{
-    Addresses, DomainSource, Endpoint, MAX_DOMAIN, Node, Participant, Portrait, named,
-};
+use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
 use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
 
 /// Everybody that was there.
@@ -167,21 +165,21 @@ impl Remembered {
         participant: &Participant,
         endpoints: Vec<RememberedEndpoint>,
     ) -> Self {
-        let portrait = &participant.portrait;
+        let proxy = &participant.proxy;
         let text = |text: &Option<Box<str>>| text.as_deref().map(str::to_owned);
-        let [first, second] = portrait.vendor.0;
+        let [first, second] = proxy.vendor.0;
         Self {
             prefix: prefix.to_string(),
             vendor: format!("{first:02x}{second:02x}"),
-            domain_id: participant.domain_id,
+            domain_id: participant.domain_id.0,
             domain_source: participant.domain_source,
-            enclave: text(&portrait.enclave),
-            host: text(&portrait.host),
-            process_name: text(&portrait.process_name),
-            process_id: portrait.process_id,
-            lease: nanoseconds(portrait.lease),
-            secured: portrait.secured,
-            shared_memory: portrait.shared_memory,
+            enclave: text(&proxy.enclave),
+            host: text(&proxy.host),
+            process_name: text(&proxy.process_name),
+            process_id: proxy.process_id,
+            lease: nanoseconds(proxy.lease),
+            secured: proxy.secured,
+            shared_memory: proxy.shared_memory,
             addresses: participant.addresses.clone(),
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
@@ -195,13 +193,13 @@ impl Remembered {
         let prefix = GuidPrefix(hexadecimal(&self.prefix)?);
         let texts = [&self.enclave, &self.host, &self.process_name];
         let all_plain = texts.into_iter().flatten().all(|text| is_plain(text));
-        if self.domain_id > MAX_DOMAIN || !all_plain {
+        if self.domain_id > DomainId::MAX.0 || !all_plain {
             return None;
         }
         let text = |text: &Option<String>| text.as_deref().map(Into::into);
         let nodes_from = self.nodes_from.as_ref();
         let participant = Participant {
-            portrait: Portrait {
+            proxy: ParticipantProxy {
                 vendor: VendorId(hexadecimal(&self.vendor)?),
                 enclave: text(&self.enclave),
                 host: text(&self.host),
@@ -213,13 +211,13 @@ impl Remembered {
             },
             addresses: self.addresses.clone(),
             restored: Some(now),
-            domain_id: self.domain_id,
+            domain_id: DomainId(self.domain_id),
             first_seen: now,
             last_seen: now,
             endpoints: BTreeSet::new(),
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
             // Readers may have come while nobody looked.
-            readers_told: false,
+            all_readers_announced: false,
             watched: 0,
             local: false,
             sends: false,
@@ -284,7 +282,7 @@ impl RememberedEndpoint {
     fn endpoint(
         &self,
         prefix: GuidPrefix,
-        domain_id: u32,
+        domain_id: DomainId,
         now: Timestamp,
     ) -> Option<(Guid, Endpoint)> {
         let guid = guid(&self.guid, prefix)?;
@@ -438,7 +436,7 @@ mod tests {
         qos.representations = vec![DataRepresentation::XCDR2];
         let endpoint = Endpoint {
             role: Role::Writer,
-            domain_id: 0,
+            domain_id: DomainId(0),
             topic: "rt/points".into(),
             message_type: "std_msgs/msg/String".into(),
             type_hash: None,
@@ -450,7 +448,10 @@ mod tests {
         };
         let back = |kept: &serde_json::Value| {
             let kept: RememberedEndpoint = serde_json::from_value(kept.clone()).unwrap();
-            kept.endpoint(prefix, 0, Timestamp(2)).unwrap().1.qos
+            kept.endpoint(prefix, DomainId(0), Timestamp(2))
+                .unwrap()
+                .1
+                .qos
         };
         let mut kept = serde_json::to_value(RememberedEndpoint::of(guid, &endpoint)).unwrap();
         assert_eq!(back(&kept), qos);

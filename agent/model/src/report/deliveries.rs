@@ -7,9 +7,9 @@ use ros2probe_wire::{EntityId, Guid, Timestamp};
 use crate::delivery::{Delivery, Receiver, Totals};
 use crate::observer::Observer;
 use crate::receivers::readers;
+use crate::routes::KnownRoute;
 use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Direction, SocketFacts};
 use crate::topic::Topic;
-use crate::ways::Known;
 
 /// Nodes by their endpoints.
 type Nodes<'a> = HashMap<Guid, &'a str>;
@@ -17,7 +17,7 @@ type Nodes<'a> = HashMap<Guid, &'a str>;
 /// What became of a topic's samples, of live writers and of those that have gone.
 pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
     let mut sum = topic.retired_totals.as_deref().cloned().unwrap_or_default();
-    for writer in topic.writers.iter().chain(&topic.beside) {
+    for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
         let measured = observer.profiler.get(*writer);
         if let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) {
             sum.add(subscribers.totals());
@@ -33,14 +33,14 @@ pub(super) fn deliveries(
     nodes: &Nodes<'_>,
 ) -> Vec<DeliveryFacts> {
     let mut facts = Vec::new();
-    for writer in topic.writers.iter().chain(&topic.beside) {
+    for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
         let measured = observer.profiler.get(*writer);
         let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) else {
             continue;
         };
         let deliveries = subscribers.deliveries();
-        facts.extend(deliveries.map(|(delivery, ways)| {
-            delivery_facts(observer, topic, nodes, *writer, (delivery, &ways))
+        facts.extend(deliveries.map(|(delivery, routes)| {
+            delivery_facts(observer, topic, nodes, *writer, (delivery, &routes))
         }));
     }
     facts.sort_by(|one, other| {
@@ -59,12 +59,12 @@ fn delivery_facts(
     topic: &Topic,
     nodes: &Nodes<'_>,
     writer: Guid,
-    (delivery, ways): (&Delivery, &[&Known]),
+    (delivery, routes): (&Delivery, &[&KnownRoute]),
 ) -> DeliveryFacts {
     let main = delivery.main();
     let owner = match delivery.receiver() {
         Receiver::Participant(prefix) => Some(prefix),
-        Receiver::Way(_) => ways.first().and_then(|known| known.owner),
+        Receiver::Route(_) => routes.first().and_then(|known| known.owner),
     };
     let mut readers: Vec<_> = owner
         .map(|prefix| readers(topic, prefix).collect())
@@ -74,7 +74,7 @@ fn delivery_facts(
         .iter()
         .filter_map(|reader| nodes.get(reader).copied())
         .collect();
-    let mut sockets: Vec<_> = ways.iter().map(|known| known.way.socket).collect();
+    let mut sockets: Vec<_> = routes.iter().map(|known| known.route.socket).collect();
     sockets.retain(|socket| *socket != 0);
     sockets.sort_unstable();
     sockets.dedup();
@@ -95,7 +95,7 @@ fn delivery_facts(
     DeliveryFacts {
         writer,
         direction: delivery.direction(),
-        destination: main.place.socket_address(),
+        destination: main.destination.socket_address(),
         subscriber,
         participant,
         readers,
@@ -126,8 +126,8 @@ pub(super) fn acknowledgements(
             continue;
         };
         let next = measured.writer.next();
-        let told = subscribers.acknowledgements(*writer, next, now);
-        facts.extend(told.map(|fact| AcknowledgementFacts {
+        let acknowledged = subscribers.acknowledgements(*writer, next, now);
+        facts.extend(acknowledged.map(|fact| AcknowledgementFacts {
             node: nodes.get(&fact.reader).map(|node| (*node).to_owned()),
             ..fact
         }));
@@ -142,9 +142,9 @@ pub(super) fn sockets(observer: &Observer) -> Vec<SocketFacts> {
         let Some(subscribers) = &measured.subscribers else {
             continue;
         };
-        for (delivery, ways) in subscribers.deliveries() {
+        for (delivery, routes) in subscribers.deliveries() {
             if delivery.direction() == Direction::Received {
-                cookies.extend(ways.iter().map(|known| known.way.socket));
+                cookies.extend(routes.iter().map(|known| known.route.socket));
             }
         }
     }

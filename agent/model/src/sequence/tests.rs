@@ -1,6 +1,5 @@
 use super::*;
-
-const SECOND: u64 = 1_000_000_000;
+use ros2probe_wire::time::SECOND;
 
 /// A sequence with virtual time and the verdicts in lists.
 #[derive(Default)]
@@ -26,20 +25,20 @@ impl Bench {
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
         let (source, now) = (source.map(Timestamp), Timestamp(self.now));
         match self.sequence.recognise(number, source, REACH, now) {
-            Belief::Live => {}
-            Belief::Doubted { .. } => {
-                if !self.sequence.complete_doubted(number) {
+            RunMembership::Live => {}
+            RunMembership::Unconfirmed { .. } => {
+                if !self.sequence.complete_unconfirmed(number) {
                     self.duplicates.push(number);
                 }
                 return;
             }
-            Belief::Believed(run) => self.sequence.accept(&run, now, &mut |settled| {
+            RunMembership::Confirmed(run) => self.sequence.accept(&run, now, &mut |settled| {
                 note(settled, lost, irrelevant);
             }),
         }
         let arrival = self.sequence.receive(
             number,
-            Manner::Reliable,
+            RepairMode::Reliable,
             Timestamp(self.now),
             &mut |settled| note(settled, lost, irrelevant),
         );
@@ -346,13 +345,12 @@ fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
 
 #[test]
 fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
-    const SECOND: u64 = 1_000_000_000;
     let mut sequence = Sequence::default();
     let mut lost = 0;
     let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));
     for step in 1..10_000_u64 {
         let now = Timestamp(step * SECOND / 10);
-        sequence.receive(2 * step, Manner::BestEffort, now, &mut count);
+        sequence.receive(2 * step, RepairMode::BestEffort, now, &mut count);
         sequence.advance(now, (SECOND, SECOND), Some(100), &mut count);
         let [.., checkpoints, _] = sequence.sizes();
         assert!(checkpoints.entries <= checkpoints.cap, "{checkpoints:?}");

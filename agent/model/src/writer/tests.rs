@@ -1,9 +1,8 @@
 use ros2probe_wire::record::kind;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 
 use super::*;
 
-const MILLISECOND: u64 = 1_000_000;
-const SECOND: u64 = 1000 * MILLISECOND;
 const START: u64 = 1_795_143_000 * SECOND;
 
 /// One writer with everything around it, in virtual time.
@@ -37,13 +36,13 @@ impl Bench {
             time: self.now,
             ..record
         };
-        let mut scene = Scene {
+        let mut context = MeasurementContext {
             now: Timestamp(self.now),
             budget: &mut self.budget,
             journal: &mut self.journal,
-            calendar: Calendar::default(),
+            wall_clock: WallClock::default(),
         };
-        self.writer.record(&record, self.opened, &mut scene)
+        self.writer.record(&record, self.opened, &mut context)
     }
 
     fn data(&mut self, number: u64) -> &mut Self {
@@ -61,13 +60,13 @@ impl Bench {
         let end = self.now + milliseconds * MILLISECOND;
         while self.now < end {
             self.now = (self.now + 100 * MILLISECOND).min(end);
-            let mut scene = Scene {
+            let mut context = MeasurementContext {
                 now: Timestamp(self.now),
                 budget: &mut self.budget,
                 journal: &mut self.journal,
-                calendar: Calendar::default(),
+                wall_clock: WallClock::default(),
             };
-            self.writer.advance(&mut scene);
+            self.writer.advance(&mut context);
         }
         self
     }
@@ -154,7 +153,9 @@ fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
 #[test]
 fn a_sample_that_began_before_the_kernel_was_told_of_its_writer_is_no_loss_when_fragments_lack() {
     let mut bench = Bench::new(Traits::default());
-    bench.writer.doubt(Timestamp(bench.now + 200 * MILLISECOND));
+    bench
+        .writer
+        .allow_incomplete(Timestamp(bench.now + 200 * MILLISECOND));
     bench.fragments(1, 1..=4).fragments(1, 8..=10).wait(300);
     bench.fragments(2, 1..=9).fragments(3, 1..=10).wait(5000);
     let facts = bench.facts();
@@ -465,7 +466,7 @@ fn when_a_writer_is_no_longer_seen_in_its_process_shared_memory_counts_at_once()
         bench.put(in_its_process(data(number))).wait(10);
     }
     bench.put(in_shared_memory(data(3)));
-    bench.writer.seen_exactly_no_longer();
+    bench.writer.end_exact_view();
     for number in [3, 5, 6] {
         bench.put(in_shared_memory(data(number))).wait(10);
     }
@@ -583,7 +584,7 @@ fn a_sample_under_way_when_its_process_is_seen_no_longer_is_given_by_looking() {
             .copied()
             .map(in_shared_memory)
             .collect();
-        let end = |bench: &mut Bench| bench.writer.seen_exactly_no_longer();
+        let end = |bench: &mut Bench| bench.writer.end_exact_view();
         let fewest = every_sample_is_given_or_missed(&exact, &looked, end, false);
         assert_eq!(fewest, [1; 4], "{ends}");
     }

@@ -3,14 +3,16 @@
 //! Participants say what DDS implementations say, at a bounded rate. What the sender knows is exact:
 //! a lease that it could not renew in time is one that ran out.
 
+mod member;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
 
 use super::storm::Dice;
-use super::{Carrier, PARTICIPANT, PUBLICATIONS_WRITER, Parameters, SPDP_WRITER};
-use super::{SUBSCRIPTIONS_WRITER, data, text_of};
+use super::{Carrier, PARTICIPANT, SPDP_WRITER};
+use member::{Member, announcer, entity, guid, role};
 
 /// Datagrams a second, at most.
 const PACE: f64 = 2500.0;
@@ -74,18 +76,6 @@ pub struct Crowd<C> {
     ticked: Instant,
     owed: [f64; 3],
     next_topic: usize,
-}
-
-struct Member {
-    prefix: [u8; 12],
-    slot: usize,
-    lease: Duration,
-    node: String,
-    endpoints: BTreeMap<[u8; 4], String>,
-    /// Numbers of announcements of writers, readers and nodes.
-    numbers: [u32; 3],
-    entity: u16,
-    seen: Instant,
 }
 
 impl<C: Carrier> Crowd<C> {
@@ -465,153 +455,4 @@ impl<C: Carrier> Crowd<C> {
         };
         format!("rt/robot/part_{slot}/{part}")
     }
-}
-
-impl Member {
-    fn stays(&self) -> bool {
-        self.slot < STAYING
-    }
-
-    fn is_late(&self) -> bool {
-        self.seen.elapsed() > self.lease.mul_f64(LATE)
-    }
-
-    /// When its lease ends.
-    fn ends(&self) -> Instant {
-        self.seen + self.lease
-    }
-
-    fn add(&mut self, kind: u8, topic: String) -> [u8; 4] {
-        self.entity += 1;
-        let entity = entity(self.entity, kind);
-        self.endpoints.insert(entity, topic);
-        entity
-    }
-
-    fn next_number(&mut self, entity: [u8; 4]) -> u32 {
-        let number = &mut self.numbers[usize::from(entity[3] == 4)];
-        *number += 1;
-        *number
-    }
-
-    fn number_endpoints(&mut self) {
-        for entity in self.endpoints.keys() {
-            self.numbers[usize::from(entity[3] == 4)] += 1;
-        }
-    }
-
-    /// All that it has to say, as to one that has just come.
-    fn introduction(&self) -> Vec<Vec<u8>> {
-        let mut messages = vec![self.announcement()];
-        let mut numbers = self.numbers;
-        for entity in self.endpoints.keys().rev() {
-            let number = &mut numbers[usize::from(entity[3] == 4)];
-            messages.push(self.endpoint(*entity, *number));
-            *number -= 1;
-        }
-        messages.push(self.entities());
-        messages
-    }
-
-    fn announcement(&self) -> Vec<u8> {
-        let lease = u32::try_from(self.lease.as_secs()).unwrap_or(u32::MAX);
-        let mut list = Parameters::new();
-        list.add(0x15, &[2, 3, 0, 0]);
-        list.add(0x16, &[1, 0x0f, 0, 0]);
-        list.add(0x50, &[&self.prefix[..], &PARTICIPANT].concat());
-        list.add(0x02, &[lease.to_le_bytes(), [0; 4]].concat());
-        list.add(0x0f, &[0; 4]);
-        self.message(SPDP_WRITER, 1, &list.finish())
-    }
-
-    fn endpoint(&self, entity: [u8; 4], number: u32) -> Vec<u8> {
-        let topic = self.endpoints.get(&entity).map_or("", String::as_str);
-        let kind = match entity {
-            ENTITIES_WRITER | ENTITIES_READER => ENTITIES_TYPE,
-            _ => TYPE,
-        };
-        let mut list = Parameters::new();
-        list.add(0x5a, &[&self.prefix[..], &entity].concat());
-        list.add_text(0x05, topic);
-        list.add_text(0x07, kind);
-        list.add(0x1a, &[1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
-        self.message(announcer(entity), number, &list.finish())
-    }
-
-    /// `ros_discovery_info` with 16-byte gids: one node that has all.
-    fn entities(&self) -> Vec<u8> {
-        let mut bytes = vec![0, 1, 0, 0];
-        bytes.extend_from_slice(&self.prefix);
-        bytes.extend_from_slice(&PARTICIPANT);
-        bytes.extend_from_slice(&1_u32.to_le_bytes());
-        for text in ["/", &self.node] {
-            bytes.extend_from_slice(&text_of(text));
-        }
-        for kind in [4, 3] {
-            let own: Vec<_> = self.endpoints.keys().filter(|it| it[3] == kind).collect();
-            let count = u32::try_from(own.len()).unwrap_or(0);
-            bytes.extend_from_slice(&count.to_le_bytes());
-            for entity in own {
-                bytes.extend_from_slice(&self.prefix);
-                bytes.extend_from_slice(entity);
-            }
-        }
-        self.message(ENTITIES_WRITER, 1, &bytes)
-    }
-
-    /// A farewell, as Cyclone DDS (key) or Fast DDS (key hash) puts it.
-    fn disposal(&self, writer: [u8; 4], number: u32, entity: [u8; 4], by_key: bool) -> Vec<u8> {
-        let guid = [&self.prefix[..], &entity].concat();
-        let mut inline = Vec::new();
-        let mut parameter = |id: u16, value: &[u8]| {
-            inline.extend_from_slice(&id.to_le_bytes());
-            inline.extend_from_slice(&u16::try_from(value.len()).unwrap_or(0).to_le_bytes());
-            inline.extend_from_slice(value);
-        };
-        if !by_key {
-            parameter(0x70, &guid);
-        }
-        parameter(0x71, &[0, 0, 0, 3]);
-        parameter(1, &[]);
-        if by_key {
-            let mut key = Parameters::new();
-            key.add(if entity == PARTICIPANT { 0x50 } else { 0x5a }, &guid);
-            inline.extend_from_slice(&key.finish());
-        }
-        let mut message = self.message(writer, number, &inline);
-        // Inline QoS; and a key in the place of data, or nothing there.
-        message[21] = if by_key { 0x0b } else { 0x03 };
-        message
-    }
-
-    fn message(&self, writer: [u8; 4], number: u32, payload: &[u8]) -> Vec<u8> {
-        let mut bytes = [&b"RTPS\x02\x03\x01\x0f"[..], &self.prefix].concat();
-        data(&mut bytes, writer, number, payload);
-        bytes
-    }
-}
-
-fn entity(number: u16, kind: u8) -> [u8; 4] {
-    let [high, low] = number.to_be_bytes();
-    [0, high, low, kind]
-}
-
-/// Who announces an endpoint.
-fn announcer(entity: [u8; 4]) -> [u8; 4] {
-    if entity[3] == 3 {
-        PUBLICATIONS_WRITER
-    } else {
-        SUBSCRIPTIONS_WRITER
-    }
-}
-
-fn role(entity: [u8; 4]) -> &'static str {
-    if entity[3] == 3 { "writer" } else { "reader" }
-}
-
-/// As the agent writes it.
-fn guid(prefix: &[u8; 12], entity: [u8; 4]) -> String {
-    let hexadecimal =
-        |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };
-    format!("{}.{}", hexadecimal(prefix), hexadecimal(&entity))
 }

@@ -7,7 +7,7 @@ use std::os::fd::{AsRawFd as _, FromRawFd as _, OwnedFd};
 use std::sync::atomic::{AtomicU16, Ordering};
 
 use anyhow::{Context as _, Result};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use super::{Carrier, DISCOVERY_PORT, path};
 use crate::harness::network::Namespace;

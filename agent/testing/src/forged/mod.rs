@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use crate::harness::network::Namespace;
 

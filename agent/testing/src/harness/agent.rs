@@ -11,6 +11,7 @@ use anyhow::{Context as _, Result, bail};
 
 use super::network::Namespace;
 use super::process::Process;
+use super::soak::dropped;
 
 /// The metrics listener's built-in address: every host is its own, so the port is free.
 pub const METRICS: &str = "http://127.0.0.1:17400";
@@ -24,6 +25,8 @@ const PATIENCE: Duration = Duration::from_secs(30);
 const START: Duration = Duration::from_secs(60);
 /// A gap of a best-effort stream is settled a second after it opened, and some more.
 const STILL: Duration = Duration::from_millis(1800);
+/// As long as that where the agent says that it lost records or frames: some may never be counted.
+const STILL_WITHOUT_SOME: Duration = Duration::from_secs(6);
 /// The page of an agent that had its turn on the CPU.
 const FRESH: f64 = 0.4;
 
@@ -131,7 +134,8 @@ impl<'a> Agent<'a> {
             }
             let all = page.sum("ros2_topic_messages_total", &label) >= messages as f64;
             let in_time = Instant::now() < deadline;
-            if since.elapsed() >= STILL && (all || !in_time) {
+            let is_lossy = dropped(&page) > 0.0 && since.elapsed() >= STILL_WITHOUT_SOME;
+            if since.elapsed() >= STILL && (all || is_lossy || !in_time) {
                 return Ok(page);
             }
             if Instant::now() > deadline + STILL {

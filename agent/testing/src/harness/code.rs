@@ -6,7 +6,7 @@ use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 
 use anyhow::{Context as _, Result};
-use ros2probe::capture::uprobe::library;
+use ros2probe_capture::uprobe::library;
 
 use super::process::Process;
 

@@ -216,64 +216,26 @@ impl Frame {
         else {
             bail!("not {} columns", COLUMNS.len());
         };
-        let [mut writers, mut readers] = [writers, readers].map(values);
-        let [mut numbers, mut bits] = [numbers, bits].map(values);
-        let [mut starts, mut counts, mut sizes, mut fragment_sizes] =
-            [starts, counts, sizes, fragment_sizes].map(values);
+        let mut cells = Cells {
+            writers: values(writers),
+            readers: values(readers),
+            numbers: values(numbers),
+            bits: values(bits),
+            starts: values(starts),
+            counts: values(counts),
+            sizes: values(sizes),
+            fragment_sizes: values(fragment_sizes),
+        };
         let mut submessages = Vec::new();
         for kind in values(kinds) {
-            let mut number = || next(&mut numbers);
-            let content = match kind {
-                DATA => Content::Data(number()?),
-                DATA_FRAG => {
-                    let size: u32 = next(&mut sizes)?;
-                    let fragment_size: u32 = next(&mut fragment_sizes)?;
-                    Content::Fragments {
-                        number: number()?,
-                        first: next(&mut starts)?,
-                        count: next(&mut counts)?,
-                        of: size.div_ceil(fragment_size),
-                    }
-                }
-                HEARTBEAT => {
-                    number()?;
-                    Content::Heartbeat { last: number()? }
-                }
-                ACKNACK => {
-                    let (first, bits) = (number()?, next::<u64>(&mut bits)?);
-                    Content::Request {
-                        first,
-                        end: first + bits,
-                    }
-                }
-                NACK_FRAG | HEARTBEAT_FRAG => {
-                    number()?;
-                    Content::Other
-                }
-                GAP => {
-                    number()?;
-                    number()?;
-                    next::<u64>(&mut bits)?;
-                    Content::Other
-                }
-                _ => continue,
-            };
-            let entity = |id: Option<&str>| -> Result<String> {
-                let id = id.context("an entity id is missing")?;
-                Ok(id.trim_start_matches("0x").to_owned())
-            };
-            submessages.push(Submessage {
-                writer: entity(writers.next())?,
-                reader: entity(readers.next())?,
-                content,
-            });
+            submessages.extend(cells.submessage(kind)?);
         }
         // What was not used up was given to the wrong submessage.
         ensure!(
-            writers.next().is_none()
-                && numbers.next().is_none()
-                && bits.next().is_none()
-                && starts.next().is_none(),
+            cells.writers.next().is_none()
+                && cells.numbers.next().is_none()
+                && cells.bits.next().is_none()
+                && cells.starts.next().is_none(),
             "values are left over"
         );
         Ok(Frame {
@@ -288,8 +250,80 @@ impl Frame {
     }
 }
 
-fn values(cell: &str) -> impl Iterator<Item = &str> {
-    cell.split(',').filter(|value| !value.is_empty())
+/// What is left of the columns that hold a value for each submessage that has such a field.
+struct Cells<'a> {
+    writers: Values<'a>,
+    readers: Values<'a>,
+    numbers: Values<'a>,
+    bits: Values<'a>,
+    starts: Values<'a>,
+    counts: Values<'a>,
+    sizes: Values<'a>,
+    fragment_sizes: Values<'a>,
+}
+
+type Values<'a> = std::vec::IntoIter<&'a str>;
+
+impl Cells<'_> {
+    /// The next submessage, if its kind names a writer.
+    fn submessage(&mut self, kind: &str) -> Result<Option<Submessage>> {
+        let Some(content) = self.content(kind)? else {
+            return Ok(None);
+        };
+        let entity = |id: Option<&str>| -> Result<String> {
+            let id = id.context("an entity id is missing")?;
+            Ok(id.trim_start_matches("0x").to_owned())
+        };
+        Ok(Some(Submessage {
+            writer: entity(self.writers.next())?,
+            reader: entity(self.readers.next())?,
+            content,
+        }))
+    }
+
+    fn content(&mut self, kind: &str) -> Result<Option<Content>> {
+        let mut number = || next(&mut self.numbers);
+        Ok(Some(match kind {
+            DATA => Content::Data(number()?),
+            DATA_FRAG => {
+                let size: u32 = next(&mut self.sizes)?;
+                let fragment_size: u32 = next(&mut self.fragment_sizes)?;
+                Content::Fragments {
+                    number: number()?,
+                    first: next(&mut self.starts)?,
+                    count: next(&mut self.counts)?,
+                    of: size.div_ceil(fragment_size),
+                }
+            }
+            HEARTBEAT => {
+                number()?;
+                Content::Heartbeat { last: number()? }
+            }
+            ACKNACK => {
+                let (first, bits) = (number()?, next::<u64>(&mut self.bits)?);
+                Content::Request {
+                    first,
+                    end: first + bits,
+                }
+            }
+            NACK_FRAG | HEARTBEAT_FRAG => {
+                number()?;
+                Content::Other
+            }
+            GAP => {
+                number()?;
+                number()?;
+                next::<u64>(&mut self.bits)?;
+                Content::Other
+            }
+            _ => return Ok(None),
+        }))
+    }
+}
+
+fn values(cell: &str) -> Values<'_> {
+    let values = cell.split(',').filter(|value| !value.is_empty());
+    values.collect::<Vec<_>>().into_iter()
 }
 
 fn next<'a, T: std::str::FromStr>(values: &mut impl Iterator<Item = &'a str>) -> Result<T> {

@@ -9,14 +9,14 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow, bail, ensure};
-use ros2probe::capture::live::LiveSource;
-use ros2probe::capture::netns;
-use ros2probe::capture::reassembly::Limits;
-use ros2probe::config::{Config, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::journal::{DeliveryLoss, Loss};
-use ros2probe::model::observer::{self, Observer};
-use ros2probe::model::snapshot::Snapshot;
+use ros2probe_capture::live::LiveSource;
+use ros2probe_capture::netns;
+use ros2probe_capture::reassembly::Limits;
+use ros2probe_daemon::config::{Config, Watchlist};
+use ros2probe_model::input::Input;
+use ros2probe_model::journal::{DeliveryLoss, Loss};
+use ros2probe_model::observer::{self, Observer};
+use ros2probe_model::snapshot::Snapshot;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::filter::Counter;
 
@@ -150,7 +150,7 @@ fn watch(network: Option<&Path>, config: &Config, shared: &Shared) -> Result<Tes
         Some(network) => netns::within(network, open)??,
         None => open()?,
     };
-    source.start(ros2probe::privilege::spawn_source);
+    source.start(ros2probe_daemon::privilege::spawn_source);
     let mut observer = Observer::new(observer::Settings::default());
     observer.input(Input::Watchlist(Arc::new(Watchlist::new(
         config.watches.clone(),

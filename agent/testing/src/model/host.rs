@@ -3,20 +3,20 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
-use ros2probe::config::{Watch, Watchlist};
-use ros2probe::model::cause::LossCause;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::{
+use ros2probe_daemon::config::{Watch, Watchlist};
+use ros2probe_model::cause::LossCause;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,
 };
 use ros2probe_wire::record::{flag, guid_words, kind};
+pub use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 use super::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 
-pub const MILLISECOND: u64 = 1_000_000;
 pub const START: u64 = 1_795_143_000_000 * MILLISECOND;
 pub const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 pub const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);

@@ -9,6 +9,7 @@ use std::rc::Rc;
 use proptest::prelude::*;
 use ros2probe_wire::Guid;
 use ros2probe_wire::record::{Sample, Verdict, kind};
+use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use tempfile::TempDir;
 
@@ -16,8 +17,6 @@ use super::super::cpu_allowance::{SAVINGS, SHARE};
 use super::super::directories::Scope;
 use super::super::image::{PortImage, SegmentImage};
 use super::*;
-
-const MILLISECOND: u64 = 1_000_000;
 
 fn writer() -> Guid {
     let mut bytes = [9; 16];

@@ -166,8 +166,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     let _second = Counted::start(&link, 2, "second")?;
     disk.wait_for_write("failed", failed)?;
     disk.state(&["/first"])?;
-    let lines = scene.log().matches("state cannot be written").count();
-    ensure!(lines == 1, "{}", scene.log());
+    ensure!(scene.log().matches("state cannot be written").count() == 1);
     counted.check(&scene.agent)?;
     let written = disk.writes("written")?;
     disk.make_room()?;
@@ -184,28 +183,48 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
         ),
     )?;
 
+    a_disk_that_is_read_only(&disk, &link, &mut counted)?;
+    directories_that_are_gone(&disk, &link, &mut counted)?;
+    directories_of_another_user(&disk, &link, &mut counted)?;
+    counted.check(&scene.agent)?;
+    let took = scene.end()?;
+    outcome(
+        "state and recordings that belong to somebody else",
+        &format!("refused and counted until they belong to the agent; ended in {took:?}"),
+    )
+}
+
+/// A disk that is remounted read-only, and back.
+fn a_disk_that_is_read_only(disk: &Disk<'_, '_>, link: &Link, counted: &mut Counted) -> Result<()> {
     disk.remount("ro")?;
     disk.refuses("Read-only file system")?;
     let failed = disk.writes("failed")?;
-    let _third = Counted::start(&link, 3, "third")?;
+    let _third = Counted::start(link, 3, "third")?;
     disk.wait_for_write("failed", failed)?;
     disk.remount("rw")?;
     let written = disk.writes("written")?;
     disk.wait_for_write("written", written)?;
     disk.state(&["/third"])?;
-    disk.accepts(&mut counted, "writable")?;
+    disk.accepts(counted, "writable")?;
     outcome(
         "disk remounted read-only, and back",
         "refused and counted, then all works again",
-    )?;
+    )
+}
 
+/// Directories that are removed while the agent runs.
+fn directories_that_are_gone(
+    disk: &Disk<'_, '_>,
+    link: &Link,
+    counted: &mut Counted,
+) -> Result<()> {
     fs::remove_dir_all(disk.root.join("state"))?;
     fs::remove_dir_all(disk.root.join("bags"))?;
     let failed = disk.writes("failed")?;
-    let _fourth = Counted::start(&link, 4, "fourth")?;
+    let _fourth = Counted::start(link, 4, "fourth")?;
     disk.wait_for_write("failed", failed)?;
     // Bags make themselves a place.
-    disk.accepts(&mut counted, "again")?;
+    disk.accepts(counted, "again")?;
     fs::create_dir(disk.root.join("state"))?;
     let written = disk.writes("written")?;
     disk.wait_for_write("written", written)?;
@@ -213,8 +232,15 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     outcome(
         "state and recordings removed while it runs",
         "state writes fail and are counted until the directory is there again; the place for bags is made anew",
-    )?;
+    )
+}
 
+/// Directories that belong to another user for a while.
+fn directories_of_another_user(
+    disk: &Disk<'_, '_>,
+    link: &Link,
+    counted: &mut Counted,
+) -> Result<()> {
     let belong_to = |user: u32| -> Result<()> {
         for directory in ["state", "bags"] {
             let directory = disk.root.join(directory);
@@ -226,19 +252,13 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     belong_to(65534)?;
     disk.refuses("Permission denied")?;
     let failed = disk.writes("failed")?;
-    let _fifth = Counted::start(&link, 5, "fifth")?;
+    let _fifth = Counted::start(link, 5, "fifth")?;
     disk.wait_for_write("failed", failed)?;
     belong_to(0)?;
     let written = disk.writes("written")?;
     disk.wait_for_write("written", written)?;
     disk.state(&["/fifth"])?;
-    disk.accepts(&mut counted, "own")?;
-    counted.check(&scene.agent)?;
-    let took = scene.end()?;
-    outcome(
-        "state and recordings that belong to somebody else",
-        &format!("refused and counted until they belong to the agent; ended in {took:?}"),
-    )
+    disk.accepts(counted, "own")
 }
 
 fn writes(page: &Scrape, outcome: &'static str) -> f64 {

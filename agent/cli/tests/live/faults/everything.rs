@@ -70,18 +70,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let mut real = Real::start(&link, span)?;
     scene.node_is_known("/driver")?;
     scene.node_is_known("/camera")?;
-    for (name, topics) in RECORDINGS {
-        let body = format!(r#"{{"name": "{name}"{topics}}}"#);
-        let (status, begun) = on_the_socket(&doors, "POST", "/recordings", &body)?;
-        ensure!(status == 201, "{status} {begun}");
-    }
-    let mut silent = Vec::new();
-    for _ in 0..12 {
-        let mut stream = doors.api()?;
-        let path = "/samples?all=true&hidden=true&payload=true&queue_bytes=16777216";
-        stream.write_all(doors.request(path).as_bytes())?;
-        silent.push(stream);
-    }
+    let silent = recordings_and_silent_readers(&doors)?;
     // What no socket waits for, the hook at the sockets does not see. It is never read.
     let _sink = link.robot.hold(|| sink(&link.robot))??;
 
@@ -91,42 +80,15 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let clients = Clients::start(&doors);
     let askers = askers(&doors);
     real.go()?;
-    let mut peak = 0;
-    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
-    let mut is_sent = false;
-    while !is_sent {
-        // Once more when all is sent.
-        is_sent = began.elapsed() >= span;
-        if is_sent {
-            real.wait_sent()?;
-        }
-        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
-        peak = peak.max(group.needed()?);
-        let page = page(&doors)?;
-        participants = participants.max(filled(&page, "participants"));
-        endpoints = endpoints.max(filled(&page, "endpoints"));
-        std::thread::sleep(Duration::from_millis(200));
-    }
+    let Highest {
+        mut peak,
+        participants,
+        endpoints,
+    } = observe(span, &group, &doors, &mut real)?;
     let took = began.elapsed();
     let cpu = Usage::of(scene.pid())?.since(&before).cpu;
     let waited = group.throttled()?.saturating_sub(throttled);
-    let mut answered = Vec::new();
-    for asker in askers {
-        let (what, answers) = asker.end()?;
-        let refused = answers.refused.join("; ");
-        // An unoptimized agent may fall behind, and says so.
-        let may_refuse = long().is_none() && what == "/readyz";
-        ensure!(
-            (refused.is_empty() || may_refuse) && answers.count > 0,
-            "{what}: {refused}"
-        );
-        let longest = answers.longest;
-        ensure!(
-            longest < LONGEST[usize::from(long().is_none())],
-            "{what}: {longest:?}"
-        );
-        answered.push(format!("{} {what} in {longest:.1?} at most", answers.count));
-    }
+    let answered = answers(askers)?;
     let done = clients.end()?;
     let mut sent = 0;
     for storm in storms {
@@ -141,13 +103,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
         "{peak} bytes with what sockets take"
     );
     ensure!(sent > 5_000, "{sent} datagrams are no storm");
-    // What was refused has names.
-    for limit in [
-        "ros2probe_limit_reached_total",
-        "ros2probe_table_evictions_total",
-    ] {
-        ensure!(page.sum(limit, &[]) > 0.0, "{limit}: nothing was refused");
-    }
+    what_was_refused_has_names(&page)?;
     let counted = real.check(&page)?;
     let mut recorded = 0;
     for (name, _) in RECORDINGS {
@@ -173,6 +129,89 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
             answered.join(", "),
         ),
     )
+}
+
+/// The highest values of a span.
+struct Highest {
+    /// Bytes that the group needed.
+    peak: u64,
+    /// How much of these tables was used, of 1.
+    participants: f64,
+    endpoints: f64,
+}
+
+/// Looks until all is sent, and once more.
+fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> Result<Highest> {
+    let began = Instant::now();
+    let mut peak = 0;
+    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
+    let mut is_sent = false;
+    while !is_sent {
+        is_sent = began.elapsed() >= span;
+        if is_sent {
+            real.wait_sent()?;
+        }
+        ensure!(group.kills()? == 0, "killed after {:?}", began.elapsed());
+        peak = peak.max(group.needed()?);
+        let page = page(doors)?;
+        participants = participants.max(filled(&page, "participants"));
+        endpoints = endpoints.max(filled(&page, "endpoints"));
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    Ok(Highest {
+        peak,
+        participants,
+        endpoints,
+    })
+}
+
+/// Begins all recordings, and streams of samples that are never read.
+fn recordings_and_silent_readers(doors: &Doors) -> Result<Vec<std::net::TcpStream>> {
+    for (name, topics) in RECORDINGS {
+        let body = format!(r#"{{"name": "{name}"{topics}}}"#);
+        let (status, begun) = on_the_socket(doors, "POST", "/recordings", &body)?;
+        ensure!(status == 201, "{status} {begun}");
+    }
+    let mut silent = Vec::new();
+    for _ in 0..12 {
+        let mut stream = doors.api()?;
+        let path = "/samples?all=true&hidden=true&payload=true&queue_bytes=16777216";
+        stream.write_all(doors.request(path).as_bytes())?;
+        silent.push(stream);
+    }
+    Ok(silent)
+}
+
+/// How often each was answered and how long it took at most; none was refused or waited too long.
+fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
+    let mut answered = Vec::new();
+    for asker in askers {
+        let (what, answers) = asker.end()?;
+        let refused = answers.refused.join("; ");
+        // An unoptimized agent may fall behind, and says so.
+        let may_refuse = long().is_none() && what == "/readyz";
+        ensure!(
+            (refused.is_empty() || may_refuse) && answers.count > 0,
+            "{what}: {refused}"
+        );
+        let longest = answers.longest;
+        ensure!(
+            longest < LONGEST[usize::from(long().is_none())],
+            "{what}: {longest:?}"
+        );
+        answered.push(format!("{} {what} in {longest:.1?} at most", answers.count));
+    }
+    Ok(answered)
+}
+
+fn what_was_refused_has_names(page: &Scrape) -> Result<()> {
+    for limit in [
+        "ros2probe_limit_reached_total",
+        "ros2probe_table_evictions_total",
+    ] {
+        ensure!(page.sum(limit, &[]) > 0.0, "{limit}: nothing was refused");
+    }
+    Ok(())
 }
 
 /// Announcements of every kind with fields that are new each time, and messages with much in them.

@@ -9,7 +9,8 @@ use ros2probe::bag::read;
 use ros2probe::recording::Report;
 use serde_json::Value;
 
-use super::{metadata, read_by_others};
+use super::metadata;
+use ros2probe_testing::bag_readers::read_by_others;
 use ros2probe_testing::truth::{self, Scenario};
 
 fn convert(capture: &Path, bag: &Path, options: &[&str]) -> Output {

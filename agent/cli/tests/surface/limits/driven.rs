@@ -5,49 +5,49 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "INTEREST_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "the_interest_map_takes_so_many_and_refuses_the_next",
     ],
     [
         "PARTICIPANT_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "so_many_participants_are_followed_and_the_next_is_refused",
     ],
     [
         "UNKNOWN_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others",
     ],
     [
         "UNKNOWN_CAPTURE_BYTES",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "an_unknown_writer_is_captured_up_to_its_bytes_and_again_after_many_others",
     ],
     [
         "UNKNOWN_BYTES_PER_SECOND",
         "agent/capture/src/live.rs",
-        "agent/cli/tests/kernel/filter.rs",
+        "agent/capture/tests/kernel/filter.rs",
         "an_unknown_writer_is_captured_until_its_budget_ends_then_metered_then_only_counted",
     ],
     [
         "FLOW_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "a_fragmented_datagram_is_forgotten_after_so_many_others_began",
     ],
     [
         "RUN_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "runs_beyond_the_table_are_a_record_for_each_fragment",
     ],
     [
         "INTERFACE_CAPACITY",
         "wire/src/filter.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "so_many_interfaces_are_judged_and_the_next_is_refused",
     ],
     [
@@ -117,7 +117,7 @@ pub const FIXED: &[[&str; 4]] = &[
         "nodes_of_unknown_participants_keep_within_their_bytes",
     ],
     [
-        "PLACES",
+        "MAX_ADDRESSES",
         "agent/model/src/receivers.rs",
         "agent/cli/tests/model/bounds.rs",
         "one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone",
@@ -142,13 +142,13 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "BUDGET",
-        "agent/model/src/pieces.rs",
-        "agent/model/src/pieces.rs",
+        "agent/model/src/discovery_fragments.rs",
+        "agent/model/src/discovery_fragments.rs",
         "large_samples_that_never_end_keep_within_the_bytes",
     ],
     [
         "LIMIT",
-        "agent/model/src/ways.rs",
+        "agent/model/src/routes.rs",
         "agent/cli/tests/model/deliveries.rs",
         "a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted",
     ],
@@ -317,19 +317,19 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "CHUNK_BYTES",
         "agent/daemon/src/recording/service.rs",
-        "agent/cli/tests/surface/bag.rs",
+        "agent/bag/tests/bag/written.rs",
         "messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones",
     ],
     [
         "INDEX_BYTES",
         "agent/daemon/src/recording/service.rs",
-        "agent/cli/tests/surface/bag.rs",
+        "agent/bag/tests/bag/written.rs",
         "a_file_is_split_when_its_index_takes_what_it_may",
     ],
     [
         "EXPANDED",
         "agent/bag/src/read.rs",
-        "agent/cli/tests/surface/bag/cut.rs",
+        "agent/bag/tests/bag/cut.rs",
         "a_small_file_that_expands_to_gigabytes_is_refused_before_it_does",
     ],
     [
@@ -400,20 +400,20 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "KEPT",
-        "agent/model/src/sequence/doubt.rs",
-        "agent/model/src/sequence/doubt.rs",
+        "agent/model/src/sequence/unconfirmed.rs",
+        "agent/model/src/sequence/unconfirmed.rs",
         "the_oldest_numbers_of_a_long_run_are_forgotten",
     ],
     [
         "RUNS",
-        "agent/model/src/deaths.rs",
-        "agent/model/src/deaths.rs",
+        "agent/model/src/loss_causes.rs",
+        "agent/model/src/loss_causes.rs",
         "resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be",
     ],
     [
         "LIMIT",
-        "agent/model/src/cancelled.rs",
-        "agent/model/src/cancelled.rs",
+        "agent/model/src/undelivered.rs",
+        "agent/model/src/undelivered.rs",
         "arrivals_that_take_out_the_middle_of_what_had_no_room_stay_bounded",
     ],
     [
@@ -443,7 +443,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_TABS",
         "agent/daemon/src/surface/api/live/mod.rs",
-        "agent/cli/tests/surface/page.rs",
+        "agent/cli/tests/surface/page/stream.rs",
         "streams_are_limited_and_a_closed_one_is_noticed",
     ],
     [
@@ -455,7 +455,7 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_READERS",
         "agent/daemon/src/surface/api/messages/mod.rs",
-        "agent/cli/tests/surface/page.rs",
+        "agent/cli/tests/surface/page/messages.rs",
         "topics_whose_messages_are_decoded_are_limited",
     ],
     [
@@ -491,13 +491,13 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "SOCKET_CAPACITY",
         "wire/src/host.rs",
-        "agent/cli/tests/live/host_hook.rs",
+        "agent/capture/tests/kernel/host_hook.rs",
         "a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go",
     ],
     [
         "MAX_WAITING",
         "agent/capture/src/filter_reader.rs",
-        "agent/cli/tests/kernel/caps.rs",
+        "agent/capture/tests/kernel/caps.rs",
         "records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted",
     ],
     [

@@ -289,7 +289,7 @@ log: debug
     let points = config.watches.get(1).unwrap();
     assert_eq!(
         (points.pattern.as_str(), points.domain_id),
-        ("/points", Some(5))
+        ("/points", Some(DomainId(5)))
     );
     assert_eq!(points.expectations.max_rate_hz, Some(22.5));
     assert!((points.trace - 0.25).abs() < 1e-9);

@@ -1,3 +1,4 @@
+use ros2probe_wire::DomainId;
 use ros2probe_wire::{EntityId, GuidPrefix};
 
 use super::*;
@@ -17,7 +18,7 @@ fn writer(number: u8) -> Guid {
 
 fn topic(name: &str, message_type: &str) -> Arc<Topic> {
     Arc::new(Topic {
-        domain_id: 0,
+        domain_id: DomainId(0),
         name: name.into(),
         dds_name: format!("rt{name}").into(),
         message_type: message_type.into(),

@@ -19,6 +19,7 @@ use super::scope::Scope;
 use super::services::sorted;
 use ros2probe_api::services::{Action, ActionList};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -44,7 +45,7 @@ async fn list(
     let answer = ActionList {
         timestamp_seconds: snapshot.at.seconds(),
         actions: actions
-            .filter_map(|((domain_id, name), parts)| view(domain_id, name, &parts, &index))
+            .filter_map(|((domain_id, name), parts)| view(domain_id.0, name, &parts, &index))
             .collect(),
     };
     Ok(Json(answer).into_response())
@@ -54,7 +55,7 @@ async fn list(
 pub(super) fn actions(
     snapshot: &Snapshot,
     scope: Scope,
-) -> BTreeMap<(u32, String), Vec<&TopicFacts>> {
+) -> BTreeMap<(DomainId, String), Vec<&TopicFacts>> {
     let mut actions: BTreeMap<_, Vec<_>> = BTreeMap::new();
     let admitted = snapshot.topics.iter();
     for topic in admitted.filter(|topic| scope.admits(topic.domain_id)) {

@@ -4,6 +4,7 @@
 //! holds nobody up. What is overwritten before a slow client came to it is told as `lagged`. Streams
 //! are limited in number and end when the agent ends.
 
+use ros2probe_wire::DomainId;
 use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -289,7 +290,7 @@ impl Filter {
         named
             && self.topics.as_ref().is_none_or(|topics| {
                 matches!(record.attribute("topic"),
-                    Some(Value::Text(topic)) if !topics.matching(0, topic).is_empty())
+                    Some(Value::Text(topic)) if !topics.matching(DomainId(0), topic).is_empty())
             })
     }
 }

@@ -50,7 +50,7 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
         }
         diagnosis::Diagnosis::NodeInSeveralDomains { domains, .. } => {
             Diagnosis::NodeInSeveralDomains {
-                domains: Cow::Borrowed(domains),
+                domains: domains.iter().map(|id| id.0).collect(),
             }
         }
     };

@@ -19,6 +19,7 @@ use super::services::services;
 use ros2probe_api::Open;
 use ros2probe_api::graph::{Edge, EdgeKind, Graph, Vertex, VertexKind};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// What is drawn so far.
 #[derive(Debug, Default)]
@@ -54,13 +55,13 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
     for node in &snapshot.nodes {
         let is_hidden = node.name.split('/').any(|token| token.starts_with('_'));
         if scope.admits(node.domain_id) && (scope.shows_hidden() || !is_hidden) {
-            drawing.vertex(VertexKind::Node, node.domain_id, &node.name);
+            drawing.vertex(VertexKind::Node, node.domain_id.0, &node.name);
         }
     }
     for topic in &snapshot.topics {
         let is_topic = !matches!(
             topic.kind,
-            "service_request" | "service_reply" | "discovery"
+            TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
         );
         let is_shown = scope.admits(topic.domain_id) && (scope.shows_hidden() || !topic.hidden);
         if is_topic && is_shown && !topic.vanished {
@@ -68,10 +69,10 @@ fn graph(snapshot: &Snapshot, scope: Scope) -> Graph {
         }
     }
     for ((domain_id, name), halves) in services(snapshot, scope) {
-        drawing.joint(VertexKind::Service, domain_id, name, &halves.parties());
+        drawing.joint(VertexKind::Service, domain_id.0, name, &halves.parties());
     }
     for ((domain_id, name), parts) in actions(snapshot, scope) {
-        drawing.joint(VertexKind::Action, domain_id, &name, &parties(&parts));
+        drawing.joint(VertexKind::Action, domain_id.0, &name, &parties(&parts));
     }
     drawing.view(snapshot)
 }
@@ -105,7 +106,7 @@ impl Drawing {
     }
 
     fn topic(&mut self, facts: &TopicFacts) {
-        let domain_id = facts.domain_id;
+        let domain_id = facts.domain_id.0;
         let topic = self.vertex(VertexKind::Topic, domain_id, &facts.name);
         let participant = |guid: Guid| Guid::new(guid.prefix, EntityId::PARTICIPANT);
         for publisher in &facts.publishers {

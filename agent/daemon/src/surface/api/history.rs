@@ -38,7 +38,7 @@ pub(super) async fn show(
     let past = context.latest.past();
     let mut view = History {
         topic: topic.name.clone(),
-        domain_id: topic.domain_id,
+        domain_id: topic.domain_id.0,
         interval_seconds: 1,
         timestamp_seconds: state.known().at.seconds(),
         ..History::default()

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::{Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
 
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{
@@ -16,8 +16,8 @@ pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 #[derive(Debug)]
 pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
-    findings: HashMap<(u32, &'a str), Vec<&'a Diagnosis>>,
-    watches: HashMap<(u32, &'a str), Vec<Standing<'a>>>,
+    findings: HashMap<(DomainId, &'a str), Vec<&'a Diagnosis>>,
+    watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
 }
 
 /// Endpoints and their topics, by GUID.

@@ -19,6 +19,7 @@ use super::scope::Scope;
 use super::services::{Halves, services, sorted};
 use ros2probe_api::names::{Names, NodeName, ServiceName, TopicName};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_wire::DomainId;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(list))
@@ -43,14 +44,14 @@ async fn list(
 
 fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
     let participants = snapshot.participants.iter();
-    let mut nodes: BTreeMap<(u32, &str), usize> = BTreeMap::new();
+    let mut nodes: BTreeMap<(DomainId, &str), usize> = BTreeMap::new();
     for node in &snapshot.nodes {
         *nodes.entry((node.domain_id, &node.name)).or_default() += 1;
     }
     let nodes = nodes.into_iter().map(|((domain_id, name), instances)| {
         let hidden = name.split('/').any(|token| token.starts_with('_'));
         NodeName {
-            domain_id,
+            domain_id: domain_id.0,
             name: Cow::Borrowed(name),
             hidden,
             instances,
@@ -60,14 +61,14 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
         |domain_id, hidden: bool| scope.admits(domain_id) && (!hidden || scope.shows_hidden());
     let topics = snapshot.topics.iter().filter_map(topic);
     let mut topics: Vec<_> = topics
-        .filter(|topic| is_shown(topic.domain_id, topic.hidden))
+        .filter(|topic| is_shown(DomainId(topic.domain_id), topic.hidden))
         .collect();
     topics.sort_unstable_by(|one, other| {
         (one.domain_id, &one.name).cmp(&(other.domain_id, &other.name))
     });
     let services = services(snapshot, scope).into_iter();
     let services =
-        services.filter_map(|((domain_id, name), halves)| service(domain_id, name, &halves));
+        services.filter_map(|((domain_id, name), halves)| service(domain_id.0, name, &halves));
     Names {
         timestamp_seconds: snapshot.at.seconds(),
         participants: participants
@@ -75,9 +76,9 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
             .filter(|each| scope.admits(each.domain_id))
             .count(),
         unknown_writers: snapshot.unknown_writers.len(),
-        domains: participants.map(|each| each.domain_id).collect(),
+        domains: participants.map(|each| each.domain_id.0).collect(),
         nodes: nodes
-            .filter(|node| is_shown(node.domain_id, node.hidden))
+            .filter(|node| is_shown(DomainId(node.domain_id), node.hidden))
             .collect(),
         topics,
         services: services.collect(),
@@ -86,13 +87,10 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
 
 /// What `ros2` takes for a topic, while it has an endpoint.
 fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
-    let is_topic = matches!(
-        facts.kind,
-        "topic" | "service_event" | "action_feedback" | "action_status"
-    );
+    let is_topic = facts.kind.is_ros_topic();
     let (publishers, subscriptions) = (facts.publishers.len(), facts.subscriptions.len());
     (is_topic && publishers + subscriptions > 0).then_some(TopicName {
-        domain_id: facts.domain_id,
+        domain_id: facts.domain_id.0,
         name: Cow::Borrowed(&facts.name),
         hidden: facts.hidden,
         types: texts(&facts.message_types),

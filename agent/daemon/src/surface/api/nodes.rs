@@ -23,6 +23,7 @@ use ros2probe_api::diagnosis::Finding;
 use ros2probe_api::nodes::{Named, Node, NodeInstance, NodeList};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{NodeFacts, Snapshot};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Names with their types, sorted.
 #[derive(Debug, Default)]
@@ -165,7 +166,7 @@ impl<'a> NodeAnswers<'a> {
                 continue;
             }
             match (topic.kind, side) {
-                ("service_request" | "service_reply", Some(side)) => {
+                (TopicKind::ServiceRequest | TopicKind::ServiceReply, Some(side)) => {
                     let names = match side {
                         Side::Server => &mut services,
                         Side::Client => &mut clients,
@@ -177,7 +178,7 @@ impl<'a> NodeAnswers<'a> {
             }
         }
         Some(Node {
-            domain_id: first.domain_id,
+            domain_id: first.domain_id.0,
             name: Cow::Borrowed(&first.name),
             hidden: is_hidden(&first.name),
             instances: nodes.iter().map(|node| self.instance(node)).collect(),

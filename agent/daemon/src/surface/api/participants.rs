@@ -74,7 +74,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
     let counts = counts.get(&facts.guid.prefix);
     Participant {
         guid: facts.guid.to_string(),
-        domain_id: facts.domain_id,
+        domain_id: facts.domain_id.0,
         vendor: Cow::Borrowed(&facts.vendor),
         enclave: facts.enclave.as_deref().map(Cow::Borrowed),
         process: process(&facts.process),

@@ -9,6 +9,7 @@ use ros2probe_wire::{EntityId, Guid};
 use super::endpoint::printed;
 use ros2probe_api::services::Party;
 use ros2probe_model::snapshot::TopicFacts;
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Which end of a service or action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -33,10 +34,14 @@ impl Side {
     /// Of a writer or reader of this topic: a server reads requests and writes all else.
     pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
         match (topic.kind, is_writer) {
-            ("service_request", false) | ("service_reply", true) => Some(Self::Server),
-            ("service_request", true) | ("service_reply", false) => Some(Self::Client),
+            (TopicKind::ServiceRequest, false) | (TopicKind::ServiceReply, true) => {
+                Some(Self::Server)
+            }
+            (TopicKind::ServiceRequest, true) | (TopicKind::ServiceReply, false) => {
+                Some(Self::Client)
+            }
             // Whoever reads feedback may be a client, or only curious.
-            ("action_feedback" | "action_status", true) => Some(Self::Server),
+            (TopicKind::ActionFeedback | TopicKind::ActionStatus, true) => Some(Self::Server),
             _ => None,
         }
     }
@@ -91,7 +96,7 @@ pub(super) fn service_type(message_type: &str) -> &str {
 /// The action that a topic or service is a part of.
 pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     match topic.kind {
-        "topic" | "service_event" | "discovery" | "dds" => None,
+        TopicKind::Topic | TopicKind::ServiceEvent | TopicKind::Discovery | TopicKind::Dds => None,
         _ => RosName::parse(&topic.name).ok()?.action(),
     }
 }

@@ -81,12 +81,13 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessList {
 mod tests {
     use super::*;
     use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{Guid, Timestamp};
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
             guid: Guid::default(),
-            domain_id: 0,
+            domain_id: DomainId(0),
             vendor: String::new(),
             enclave: None,
             process: ProcessFacts {

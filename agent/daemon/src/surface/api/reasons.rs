@@ -9,7 +9,7 @@ use crate::config::Watchlist;
 use ros2probe_api::Open;
 use ros2probe_api::topics::{Reason, ReasonCode};
 use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::snapshot::{EndpointFacts, Measurement, Passage, Snapshot, TopicFacts};
+use ros2probe_model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts, Transport};
 
 /// What reasons are looked for in, besides the topic.
 #[derive(Debug)]
@@ -132,9 +132,9 @@ impl<'a> Circumstances<'a> {
     }
 
     fn unwatched(&self, topic: &'a TopicFacts) -> (ReasonCode, String) {
-        let name = match topic.kind {
-            "service_request" | "service_reply" => &topic.dds_name,
-            _ => &topic.name,
+        let name = match topic.kind.is_service() {
+            true => &topic.dds_name,
+            false => &topic.name,
         };
         let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
         if is_covered && !topic.hidden {
@@ -150,37 +150,37 @@ impl<'a> Circumstances<'a> {
 
     /// How messages pass, if no pair of publisher and subscriber uses the network.
     fn aside(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
-        let passages = topic.passages.iter();
+        let passages = topic.transports.iter();
         let most = passages.clone().max_by_key(|count| count.pairs)?;
         if passages
             .clone()
-            .any(|count| count.passage == Passage::Network)
+            .any(|count| count.transport == Transport::Network)
         {
             return None;
         }
         let detail = |how: &str| format!("{how}; nothing crosses the network");
-        Some(match most.passage {
-            Passage::Network => return None,
-            Passage::SharedMemory if self.looks_at_memory => {
+        Some(match most.transport {
+            Transport::Network => return None,
+            Transport::SharedMemory if self.looks_at_memory => {
                 let how = "messages pass through shared memory; none was seen lately";
                 (ReasonCode::SharedMemory, detail(how))
             }
-            Passage::SharedMemory => {
+            Transport::SharedMemory => {
                 let how = "messages pass through shared memory, which this agent does not read";
                 (ReasonCode::SharedMemory, detail(how))
             }
-            Passage::DataSharing => {
+            Transport::DataSharing => {
                 let how = "subscribers read the publisher's history in memory (data sharing)";
                 (ReasonCode::DataSharing, detail(how))
             }
-            Passage::SameProcess => (
+            Transport::SameProcess => (
                 ReasonCode::SameProcess,
                 detail(
                     "publisher and subscriber share \
                 one process",
                 ),
             ),
-            Passage::Iceoryx => (ReasonCode::Iceoryx, detail("messages pass through iceoryx")),
+            Transport::Iceoryx => (ReasonCode::Iceoryx, detail("messages pass through iceoryx")),
         })
     }
 

@@ -3,6 +3,7 @@
 //! They lie below the directory that the configuration names; a name is a file name and nothing
 //! else. Whoever wants a bag elsewhere records with `rp bag record`.
 
+use ros2probe_wire::DomainId;
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
@@ -21,7 +22,6 @@ use super::body::Body;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
 use crate::config::RecordingLimits;
-use crate::config::watch::MAX_DOMAIN;
 use crate::recording::{
     Command, FilterOptions, Recording, RecordingOptions, RecordingState, Refusal, Report,
 };
@@ -306,10 +306,11 @@ pub(super) fn find(context: &Context, name: &str) -> Result<Arc<Recording>, Prob
 
 fn wanted(request: RecordingRequest) -> Result<RecordingOptions, Problem> {
     let invalid = |detail: String| Problem::new(Code::InvalidRequest, detail);
-    if request.domain_id > MAX_DOMAIN {
+    if request.domain_id > DomainId::MAX.0 {
         let id = request.domain_id;
         return Err(invalid(format!(
-            "domain_id is {id}, must be at most {MAX_DOMAIN}"
+            "domain_id is {id}, must be at most {}",
+            DomainId::MAX
         )));
     }
     if request.max_bag_duration_seconds > MAX_DURATION {

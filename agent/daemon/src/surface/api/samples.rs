@@ -4,6 +4,7 @@
 //! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
 //! and is told, on a replay it is waited for. It holds nobody else up.
 
+use ros2probe_wire::DomainId;
 use std::collections::HashSet;
 use std::time::Duration;
 
@@ -26,7 +27,6 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::config::Access;
-use crate::config::watch::MAX_DOMAIN;
 use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
@@ -129,8 +129,11 @@ async fn samples(
         granted.require(Access::All)?;
     }
     let domain_id = wanted.domain_id;
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
-        let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
+        let detail = format!(
+            "domain_id is {domain_id}, must be at most {}",
+            DomainId::MAX
+        );
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let is_replay = context.latest.state().agent.source == SourceKind::Replay;
@@ -282,14 +285,14 @@ fn topics(
     most: usize,
 ) -> Vec<OpenTopic> {
     let topics = snapshot.topics.iter().filter(|topic| {
-        domain_id.is_none_or(|wanted| wanted == topic.domain_id)
+        domain_id.is_none_or(|wanted| wanted == topic.domain_id.0)
             && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
     });
     topics
         .take(most)
         .map(|topic| OpenTopic {
             topic: topic.name.clone(),
-            domain_id: topic.domain_id,
+            domain_id: topic.domain_id.0,
             types: topic.message_types.clone(),
         })
         .collect()

@@ -1,12 +1,10 @@
 //! What a listing is about: the query that all of them share, and how names are told apart.
 
+use ros2probe_wire::DomainId;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::problem::{Code, Problem};
-
-/// Highest domain there is.
-const MAX_DOMAIN: u32 = 232;
 
 /// What a listing covers.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
@@ -39,8 +37,8 @@ impl Scope {
         Ok(self)
     }
 
-    pub(super) fn admits(self, domain_id: u32) -> bool {
-        self.domain_id.is_none_or(|own| own == domain_id)
+    pub(super) fn admits(self, domain_id: DomainId) -> bool {
+        self.domain_id.is_none_or(|own| DomainId(own) == domain_id)
     }
 
     pub(super) fn shows_hidden(self) -> bool {
@@ -61,15 +59,18 @@ impl Domain {
         Ok(self)
     }
 
-    pub(super) fn admits(self, domain_id: u32) -> bool {
-        self.domain_id.is_none_or(|own| own == domain_id)
+    pub(super) fn admits(self, domain_id: DomainId) -> bool {
+        self.domain_id.is_none_or(|own| DomainId(own) == domain_id)
     }
 }
 
 fn check(domain_id: Option<u32>) -> Result<(), Problem> {
     match domain_id {
-        Some(domain_id) if domain_id > MAX_DOMAIN => {
-            let detail = format!("domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}");
+        Some(domain_id) if domain_id > DomainId::MAX.0 => {
+            let detail = format!(
+                "domain_id is {domain_id}, must be between 0 and {}",
+                DomainId::MAX
+            );
             Err(Problem::new(Code::MalformedRequest, detail))
         }
         _ => Ok(()),
@@ -81,7 +82,7 @@ fn check(domain_id: Option<u32>) -> Result<(), Problem> {
 /// # Errors
 /// There is none, which `missing` says better, or there are several.
 pub(super) fn only<T>(
-    found: Vec<(u32, T)>,
+    found: Vec<(DomainId, T)>,
     what: &str,
     missing: impl FnOnce() -> Problem,
 ) -> Result<T, Problem> {

@@ -19,6 +19,8 @@ use super::problem::Problem;
 use super::scope::Scope;
 use ros2probe_api::services::{Service, ServiceList};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::DomainId;
 
 /// A service's topics, as far as they are there.
 #[derive(Debug, Default)]
@@ -51,23 +53,26 @@ async fn list(
         timestamp_seconds: snapshot.at.seconds(),
         services: services(snapshot, scope)
             .into_iter()
-            .filter_map(|((domain_id, name), halves)| view(domain_id, name, &halves, &index))
+            .filter_map(|((domain_id, name), halves)| view(domain_id.0, name, &halves, &index))
             .collect(),
     };
     Ok(Json(answer).into_response())
 }
 
 /// Services by domain and name.
-pub(super) fn services(snapshot: &Snapshot, scope: Scope) -> BTreeMap<(u32, &str), Halves<'_>> {
+pub(super) fn services(
+    snapshot: &Snapshot,
+    scope: Scope,
+) -> BTreeMap<(DomainId, &str), Halves<'_>> {
     let mut services: BTreeMap<_, Halves<'_>> = BTreeMap::new();
     for topic in &snapshot.topics {
         let is_shown = scope.admits(topic.domain_id) && (!topic.hidden || scope.shows_hidden());
         let key = (topic.domain_id, topic.name.as_str());
         match topic.kind {
-            "service_request" if is_shown => {
+            TopicKind::ServiceRequest if is_shown => {
                 services.entry(key).or_default().requests = Some(topic);
             }
-            "service_reply" if is_shown => {
+            TopicKind::ServiceReply if is_shown => {
                 services.entry(key).or_default().replies = Some(topic);
             }
             _ => {}

@@ -32,8 +32,9 @@ use ros2probe_api::topics::{
     self, Acknowledgement, Delivery, Topic, TopicDetails, TopicList, Watching,
 };
 use ros2probe_model::snapshot::{
-    AcknowledgementFacts, DeliveryFacts, Passage, Snapshot, TopicFacts,
+    AcknowledgementFacts, DeliveryFacts, Snapshot, TopicFacts, Transport,
 };
+use ros2probe_model::topic_kind::TopicKind;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -59,7 +60,7 @@ async fn list(
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let answers = TopicAnswers::new(&state, &in_force);
     let topics = answers.snapshot.topics.iter().filter(|topic| {
-        let is_plain = matches!(topic.kind, "topic" | "dds") && !topic.hidden;
+        let is_plain = matches!(topic.kind, TopicKind::Topic | TopicKind::Dds) && !topic.hidden;
         scope.admits(topic.domain_id) && (is_plain || scope.shows_hidden())
     });
     let answer = TopicList {
@@ -188,10 +189,7 @@ pub(super) struct TopicParameter {
 
 /// By the ROS name of a topic; services and what is not ROS by their DDS names.
 fn is_called(topic: &TopicFacts, name: &str) -> bool {
-    let is_ros_topic = !matches!(
-        topic.kind,
-        "service_request" | "service_reply" | "discovery" | "dds"
-    );
+    let is_ros_topic = topic.kind.is_ros_topic();
     is_ros_topic && topic.name == name || name.strip_prefix('/') == Some(topic.dds_name.as_str())
 }
 
@@ -228,16 +226,16 @@ impl<'a> TopicAnswers<'a> {
         let endpoint = |facts| endpoint(facts, index);
         let findings = index.findings(facts).iter();
         let watches = index.watches(facts).iter();
-        let passages = facts.passages.iter().map(|count| topics::Passage {
-            passage: count.passage.label().into(),
+        let passages = facts.transports.iter().map(|count| topics::Passage {
+            passage: count.transport.label().into(),
             pairs: count.pairs,
-            view: (count.passage == Passage::SharedMemory).then(|| self.view(facts).into()),
+            view: (count.transport == Transport::SharedMemory).then(|| self.view(facts).into()),
         });
         Topic {
-            domain_id: facts.domain_id,
+            domain_id: facts.domain_id.0,
             name: Cow::Borrowed(&facts.name),
             dds_name: Cow::Borrowed(&facts.dds_name),
-            kind: Cow::Borrowed(facts.kind),
+            kind: Cow::Borrowed(facts.kind.label()),
             hidden: facts.hidden,
             vanished: facts.vanished,
             message_types: texts(&facts.message_types),
@@ -281,10 +279,12 @@ impl<'a> TopicAnswers<'a> {
     }
 
     fn watching(&self, (watch, topic): Standing<'a>) -> Watching<'a> {
-        let entry = self.in_force.find(&watch.pattern, watch.domain_id);
+        let entry = self
+            .in_force
+            .find(&watch.pattern, watch.domain_id.map(|id| id.0));
         Watching {
             watch: Cow::Borrowed(&watch.pattern),
-            watch_domain_id: watch.domain_id,
+            watch_domain_id: watch.domain_id.map(|id| id.0),
             origin: entry.map(|entry| entry.origin.label().into()),
             state: topic.state.label().into(),
             violations: texts(&topic.violations),

@@ -21,13 +21,14 @@ use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::watch::{self, MAX_DOMAIN, Watch, check_pattern, check_trace};
+use crate::config::watch::{self, Watch, check_pattern, check_trace};
 use crate::watches::{self, Done, Entry, Refused};
 use ros2probe_api::watches::{
     Expectations, Origin, Retain, TopicState, WatchList, WatchRequest, WatchState, WatchedTopic,
 };
 use ros2probe_api::{Open, watches as answers};
 use ros2probe_model::snapshot::{self, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts};
+use ros2probe_wire::DomainId;
 
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
@@ -42,8 +43,11 @@ impl Domain {
     /// Refuses a domain that cannot be.
     fn checked(self) -> Result<Self, Problem> {
         match self.domain_id {
-            Some(domain_id) if domain_id > MAX_DOMAIN => {
-                let detail = format!("domain_id is {domain_id}, must be at most {MAX_DOMAIN}");
+            Some(domain_id) if domain_id > DomainId::MAX.0 => {
+                let detail = format!(
+                    "domain_id is {domain_id}, must be at most {}",
+                    DomainId::MAX
+                );
                 Err(Problem::new(Code::MalformedRequest, detail))
             }
             _ => Ok(self),
@@ -217,9 +221,10 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         }
         (one, other) => one.or(other),
     };
-    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > MAX_DOMAIN) {
+    if let Some(domain_id) = domain_id.filter(|domain_id| *domain_id > DomainId::MAX.0) {
         return invalid(format!(
-            "domain_id is {domain_id}, must be between 0 and {MAX_DOMAIN}"
+            "domain_id is {domain_id}, must be between 0 and {}",
+            DomainId::MAX
         ));
     }
     let expectations = watch::Expectations {
@@ -233,7 +238,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
     match expectations.check().and_then(|()| check_trace(trace)) {
         Ok(()) => Ok(Watch {
             pattern: topic,
-            domain_id,
+            domain_id: domain_id.map(DomainId),
             expectations,
             per_subscriber: settings.per_subscriber,
             trace,
@@ -251,10 +256,13 @@ fn answer(
     watch: &Watch,
     done: Result<Done, Refused>,
 ) -> Result<Response, Problem> {
-    let done = done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id))?;
+    let done =
+        done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
     // Gone again already: somebody else removes while this one adds.
-    let entry = in_force.find(&watch.pattern, watch.domain_id).cloned();
+    let entry = in_force
+        .find(&watch.pattern, watch.domain_id.map(|id| id.0))
+        .cloned();
     let entry = entry.unwrap_or_else(|| Entry {
         watch: Arc::new(watch.clone()),
         origin: watches::Origin::Api,
@@ -327,7 +335,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
     };
     answers::Watch {
         topic: watch.pattern.clone(),
-        domain_id: watch.domain_id,
+        domain_id: watch.domain_id.map(|id| id.0),
         origin: Open::Known(match entry.origin {
             watches::Origin::Config => Origin::Config,
             watches::Origin::CommandLine => Origin::CommandLine,
@@ -356,7 +364,7 @@ pub(super) fn expectations(expectations: &watch::Expectations) -> Expectations {
 }
 
 fn state(watch: &Watch, snapshot: &Snapshot, facts: &WatchFacts) -> WatchState {
-    let measured = |topic: &str, domain_id: u32| {
+    let measured = |topic: &str, domain_id: DomainId| {
         let mut topics = snapshot.topics.iter();
         topics.any(|facts| facts.domain_id == domain_id && facts.name == topic)
     };
@@ -378,7 +386,7 @@ fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<WatchedTopic> {
         let mut measurement = snapshot.topics.iter().filter(same);
         let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
         WatchedTopic {
-            domain_id: watched.domain_id,
+            domain_id: watched.domain_id.0,
             topic: watched.topic.clone(),
             state: Open::Known(match watched.state {
                 snapshot::WatchState::Ok => TopicState::Ok,

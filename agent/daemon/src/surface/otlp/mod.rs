@@ -21,5 +21,5 @@ mod traces;
 pub use exporter::{Exporter, StartError};
 pub use exports::{Exports, Outcome, Reason, Signal};
 pub use resource::Host;
-pub use settings::{Settings, SettingsError, endpoint};
+pub use settings::{Settings, SettingsError};
 pub use traces::{SpanQueue, SpanSink};

@@ -11,13 +11,11 @@ use tonic::metadata::{AsciiMetadataKey, AsciiMetadataValue, MetadataMap};
 
 use super::exports::Signal;
 use super::resource::{Host, resource};
-use crate::config::{Compression, Endpoint, OtlpSettings};
+use crate::config::{Compression, Endpoint, OtlpSettings, otlp_endpoint};
 
 /// How often metrics are exported, and how long an answer may take, where nobody says.
 const INTERVAL: Duration = Duration::from_secs(15);
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// Where receivers listen.
-const PORT: u16 = 4317;
 /// Longest file of headers.
 const HEADERS_BYTES: u64 = 1 << 20;
 
@@ -182,7 +180,7 @@ fn target(
             None => return Ok(None),
         },
     };
-    let Some(endpoint) = endpoint(&value) else {
+    let Some(endpoint) = otlp_endpoint(&value) else {
         return Err(SettingsError::Endpoint { name, value });
     };
     if endpoint.scheme_str() == Some("https") && !cfg!(feature = "tls") {
@@ -209,27 +207,6 @@ fn target(
         timeout: timeout.unwrap_or(TIMEOUT),
         gzip,
     }))
-}
-
-/// An URL as gRPC takes it: scheme and authority. What comes after them is OTLP over HTTP's.
-#[must_use]
-pub fn endpoint(text: &str) -> Option<Uri> {
-    let uri: Uri = text.parse().ok()?;
-    let scheme = uri
-        .scheme_str()
-        .filter(|scheme| ["http", "https"].contains(scheme))?;
-    let authority = uri.authority()?;
-    let authority = match authority.port_u16() {
-        Some(_) => authority.to_string(),
-        None if authority.as_str().contains('@') || authority.host().is_empty() => return None,
-        None => format!("{}:{PORT}", authority.host()),
-    };
-    Uri::builder()
-        .scheme(scheme)
-        .authority(authority)
-        .path_and_query("/")
-        .build()
-        .ok()
 }
 
 /// The file's headers if it has any, else the environment's.
@@ -476,28 +453,5 @@ otlp:
         let headers = settings.events.unwrap().headers;
         assert_eq!(headers.get("authorization").unwrap(), "Bearer a:b=");
         assert!(!format!("{headers:?}").contains("Bearer"), "not in a log");
-    }
-
-    #[test]
-    fn endpoints_are_urls_with_a_host() {
-        let taken = |text: &str| endpoint(text).map(|uri| uri.to_string());
-        for (text, uri) in [
-            ("http://collector", "http://collector:4317/"),
-            ("http://[::1]:9/v1/metrics", "http://[::1]:9/"),
-            ("https://otlp.example", "https://otlp.example:4317/"),
-        ] {
-            assert_eq!(taken(text).as_deref(), Some(uri));
-        }
-        for text in [
-            "",
-            "collector",
-            "collector:4317",
-            "ftp://a",
-            "http://",
-            "/a",
-            "grpc://a:1",
-        ] {
-            assert_eq!(taken(text), None, "{text}");
-        }
     }
 }

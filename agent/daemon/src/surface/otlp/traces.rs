@@ -22,7 +22,7 @@ use super::exports::{Exports, Reason, Signal};
 use super::points::{attribute, key_value, scope};
 use super::signal_sender::SignalSender;
 use ros2probe_model::identity::Identity;
-use ros2probe_model::trace::{Span, Spans, Stage};
+use ros2probe_model::trace::{Span, SpanStage, Spans};
 
 /// Spans that wait here, and in one request.
 const WAITING: usize = 4096;
@@ -159,21 +159,21 @@ impl Tracing {
 
     fn exported(&self, span: &Span) -> Exported {
         let (operation, kind) = match span.stage {
-            Stage::Send => ("send", SpanKind::Producer),
-            Stage::Receive => ("receive", SpanKind::Consumer),
-            Stage::Settle(_) => ("settle", SpanKind::Client),
+            SpanStage::Send => ("send", SpanKind::Producer),
+            SpanStage::Receive => ("receive", SpanKind::Consumer),
+            SpanStage::Settle(_) => ("settle", SpanKind::Client),
         };
         let message = &span.message;
         let parent = match span.stage {
-            Stage::Send => Vec::new(),
-            Stage::Receive | Stage::Settle(_) => self.id(span, Stage::Send),
+            SpanStage::Send => Vec::new(),
+            SpanStage::Receive | SpanStage::Settle(_) => self.id(span, SpanStage::Send),
         };
         Exported {
             trace_id: message.trace_id.to_be_bytes().to_vec(),
             span_id: self.id(span, span.stage),
             parent_span_id: parent,
             flags: FLAGS,
-            name: format!("{operation} {}", message.subject.topic),
+            name: format!("{operation} {}", message.description.topic),
             kind: kind.into(),
             start_time_unix_nano: span.begin.0,
             end_time_unix_nano: span.end.0,
@@ -183,18 +183,18 @@ impl Tracing {
     }
 
     /// Of the message's span at this stage.
-    fn id(&self, span: &Span, stage: Stage) -> Vec<u8> {
+    fn id(&self, span: &Span, stage: SpanStage) -> Vec<u8> {
         let mut identity = Identity::of(match stage {
-            Stage::Send => b"send",
-            Stage::Receive => b"receive",
-            Stage::Settle(_) => b"settle",
+            SpanStage::Send => b"send",
+            SpanStage::Receive => b"receive",
+            SpanStage::Settle(_) => b"settle",
         });
         identity.add(&span.message.trace_id.to_be_bytes());
         match stage {
-            Stage::Send => {}
+            SpanStage::Send => {}
             // Each host that it comes to receives it.
-            Stage::Receive => identity.add(&self.host.to_be_bytes()),
-            Stage::Settle(reader) => identity.add(&reader.to_bytes()),
+            SpanStage::Receive => identity.add(&self.host.to_be_bytes()),
+            SpanStage::Settle(reader) => identity.add(&reader.to_bytes()),
         }
         let bits = identity.bits() as u64;
         bits.to_be_bytes().to_vec()
@@ -212,32 +212,32 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
         )
     };
     let client = match span.stage {
-        Stage::Settle(reader) => reader,
-        Stage::Send | Stage::Receive => writer,
+        SpanStage::Settle(reader) => reader,
+        SpanStage::Send | SpanStage::Receive => writer,
     };
     let mut attributes = vec![
         attribute("messaging.system", "dds"),
         attribute("messaging.operation.name", operation),
         attribute("messaging.operation.type", operation),
-        attribute("messaging.destination.name", &*message.subject.topic),
+        attribute("messaging.destination.name", &*message.description.topic),
         attribute("messaging.client.id", client.to_string()),
         attribute("messaging.message.id", format!("{writer}/{number}")),
         int("messaging.message.body.size", message.size.into()),
-        int("domain_id", message.subject.domain_id.into()),
+        int("domain_id", message.description.domain_id.into()),
         attribute("writer", writer.to_string()),
         int("sequence_number", number),
-        attribute("message_type", &*message.subject.message_type),
+        attribute("message_type", &*message.description.message_type),
     ];
     if let Some(time) = message.source.timestamp() {
         attributes.push(int("source_timestamp_unix_nano", time.0));
     }
     let (address, port) = match span.stage {
-        Stage::Settle(reader) => {
+        SpanStage::Settle(reader) => {
             attributes.push(attribute("reader", reader.to_string()));
             return attributes;
         }
-        Stage::Send => ("network.peer.address", "network.peer.port"),
-        Stage::Receive => ("network.local.address", "network.local.port"),
+        SpanStage::Send => ("network.peer.address", "network.peer.port"),
+        SpanStage::Receive => ("network.local.address", "network.local.port"),
     };
     let to = message.destination.socket_address();
     attributes.extend([
@@ -250,15 +250,16 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use std::sync::Arc;
 
     use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, Timestamp};
 
     use super::*;
-    use ros2probe_model::trace::{Message, Subject};
-    use ros2probe_model::way::Place;
+    use ros2probe_model::route::Destination;
+    use ros2probe_model::trace::{Message, WriterDescription};
 
-    fn span(stage: Stage) -> Span {
+    fn span(stage: SpanStage) -> Span {
         let writer = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3]));
         Span {
             stage,
@@ -266,8 +267,8 @@ mod tests {
                 writer,
                 sequence_number: 42,
                 trace_id: Message::identity(writer, 42),
-                subject: Arc::new(Subject {
-                    domain_id: 5,
+                description: Arc::new(WriterDescription {
+                    domain_id: DomainId(5),
                     topic: "/points".into(),
                     message_type: "sensor_msgs/msg/PointCloud2".into(),
                     reliable: true,
@@ -275,7 +276,7 @@ mod tests {
                 source: RtpsTime::default(),
                 size: 7,
                 fragments: 1,
-                destination: Place::default(),
+                destination: Destination::default(),
             },
             begin: Timestamp(10),
             end: Timestamp(20),
@@ -289,13 +290,13 @@ mod tests {
             Tracing::new(Resource::default(), 1),
             Tracing::new(Resource::default(), 2),
         );
-        let sent = one.exported(&span(Stage::Send));
-        assert_eq!(sent, two.exported(&span(Stage::Send)));
+        let sent = one.exported(&span(SpanStage::Send));
+        assert_eq!(sent, two.exported(&span(SpanStage::Send)));
         assert_eq!((sent.trace_id.len(), sent.span_id.len()), (16, 8));
         assert_eq!(sent.name, "send /points");
         assert!(sent.parent_span_id.is_empty());
-        let received = [&one, &two].map(|tracing| tracing.exported(&span(Stage::Receive)));
-        let settled = one.exported(&span(Stage::Settle(reader)));
+        let received = [&one, &two].map(|tracing| tracing.exported(&span(SpanStage::Receive)));
+        let settled = one.exported(&span(SpanStage::Settle(reader)));
         let [first, second] = &received;
         for child in [first, second, &settled] {
             assert_eq!(child.trace_id, sent.trace_id);
@@ -304,15 +305,15 @@ mod tests {
         }
         assert_ne!(first.span_id, second.span_id);
         assert_ne!(first.span_id, settled.span_id);
-        assert_eq!(settled, two.exported(&span(Stage::Settle(reader))));
+        assert_eq!(settled, two.exported(&span(SpanStage::Settle(reader))));
     }
 
     #[tokio::test]
     async fn the_queue_holds_so_many_and_says_how_many_it_refused() {
         let queue = SpanQueue::default();
         assert_eq!(queue.put(Vec::new()), 0);
-        assert_eq!(queue.put(vec![span(Stage::Send); WAITING - 1]), 0);
-        assert_eq!(queue.put(vec![span(Stage::Send); 3]), 2);
+        assert_eq!(queue.put(vec![span(SpanStage::Send); WAITING - 1]), 0);
+        assert_eq!(queue.put(vec![span(SpanStage::Send); 3]), 2);
         queue.filled().await;
         let mut taken = 0;
         while let more @ 1.. = queue.take().len() {

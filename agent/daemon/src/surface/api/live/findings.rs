@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::Guid;
+use ros2probe_wire::{DomainId, Guid};
 
 use super::line::{Finding, Severity};
 use super::structure::Ids;
@@ -161,7 +161,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
         let mut finding = in_words(all, diagnosis, &ends);
         finding.since = since.map(|since| since.seconds());
         if let Some(topic) = diagnosis.topic() {
-            finding.domain_id = Some(topic.domain_id);
+            finding.domain_id = Some(topic.domain_id.0);
             finding.topic = all.ids.topic(topic.domain_id, &topic.dds_name);
         }
         finding
@@ -227,7 +227,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         } => {
             let text = format!("Several nodes bear the name {node}");
             Finding {
-                domain_id: Some(*domain_id),
+                domain_id: Some(domain_id.0),
                 node: all.ids.node(*domain_id, node),
                 ..finding(
                     kind,
@@ -273,11 +273,11 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             }
         }
         Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
-            let listed: Vec<_> = domains.iter().map(u32::to_string).collect();
+            let listed: Vec<_> = domains.iter().map(DomainId::to_string).collect();
             let text = format!("{node} is in several domains: {}", listed.join(", "));
             let first = domains.first().copied();
             Finding {
-                domain_id: first,
+                domain_id: first.map(|id| id.0),
                 node: first.and_then(|domain_id| all.ids.node(domain_id, node)),
                 ..finding(kind, Severity::Warning, node, text)
             }
@@ -325,7 +325,7 @@ fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
                 .find(|facts| facts.domain_id == topic.domain_id && facts.name == topic.topic);
             let about = format!("{}|{}|{}", topic.domain_id, topic.topic, watch.pattern);
             list.push(Finding {
-                domain_id: Some(topic.domain_id),
+                domain_id: Some(topic.domain_id.0),
                 topic: facts.and_then(|facts| all.ids.topic(facts.domain_id, &facts.dds_name)),
                 ..finding(kind, Severity::Error, &about, text)
             });
@@ -345,7 +345,7 @@ fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
         let text = format!("{} loses messages{place}", topic.name);
         let about = format!("{}|{}", topic.domain_id, topic.dds_name);
         let loss = Finding {
-            domain_id: Some(topic.domain_id),
+            domain_id: Some(topic.domain_id.0),
             topic: all.ids.topic(topic.domain_id, &topic.dds_name),
             since: began(all.past, known),
             ..finding("loss", Severity::Error, &about, text)
@@ -473,7 +473,7 @@ mod tests {
     #[test]
     fn of_more_findings_than_are_sent_the_worst_are() {
         let list = (0..2 * MOST).map(|number| Diagnosis::DuplicateNode {
-            domain_id: 0,
+            domain_id: DomainId(0),
             node: format!("/node_{number}").into(),
             participants: Vec::new(),
         });

@@ -33,7 +33,7 @@ use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::events::Reader;
 use line::{End, Events, Line, Open, Replay};
-use ros2probe_model::snapshot::Passage;
+use ros2probe_model::snapshot::Transport;
 use shared_lines::SharedLines;
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
@@ -190,7 +190,7 @@ impl Stream {
                 interval_seconds: 1,
                 history_seconds: context.live.history.as_secs(),
                 flags: &values::FLAGS,
-                passages: Passage::ALL.map(Passage::label).into(),
+                passages: Transport::ALL.map(Transport::label).into(),
                 replay,
             };
             Line::Open(open).write(lines);

@@ -3,19 +3,20 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::Hash;
 
-use ros2probe_wire::{EntityId, Guid};
+use ros2probe_wire::{DomainId, EntityId, Guid};
 
 use super::super::index::Index;
 use super::line::{Endpoint, Graph, Node, Participant, Topic};
 use crate::watches::{InForce, Origin};
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts};
+use ros2probe_model::topic_kind::TopicKind;
 
 /// Numbers that stand for names.
 #[derive(Debug, Default)]
 pub(super) struct Ids {
     participants: Numbers<Guid>,
-    nodes: Numbers<(u32, String)>,
-    topics: Numbers<(u32, String)>,
+    nodes: Numbers<(DomainId, String)>,
+    topics: Numbers<(DomainId, String)>,
 }
 
 /// Each key's number, counted up and never used again.
@@ -53,7 +54,7 @@ impl<K: Eq + Hash> Numbers<K> {
 }
 
 impl Ids {
-    pub(super) fn topic(&self, domain_id: u32, dds_name: &str) -> Option<u32> {
+    pub(super) fn topic(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         let key = (domain_id, dds_name.to_owned());
         self.topics.known.get(&key).map(|(number, _)| *number)
     }
@@ -67,7 +68,7 @@ impl Ids {
             .collect()
     }
 
-    pub(super) fn node(&self, domain_id: u32, name: &str) -> Option<u32> {
+    pub(super) fn node(&self, domain_id: DomainId, name: &str) -> Option<u32> {
         let key = (domain_id, name.to_owned());
         self.nodes.known.get(&key).map(|(number, _)| *number)
     }
@@ -86,7 +87,7 @@ impl Ids {
             graph.participants.push(Participant(
                 self.participants.number(facts.guid, round),
                 facts.guid,
-                facts.domain_id,
+                facts.domain_id.0,
                 &facts.vendor,
                 process.host.as_deref(),
                 process.id,
@@ -94,7 +95,7 @@ impl Ids {
                 process.cgroup.as_deref(),
             ));
         }
-        let mut nodes: BTreeMap<(u32, &str), Vec<u32>> = BTreeMap::new();
+        let mut nodes: BTreeMap<(DomainId, &str), Vec<u32>> = BTreeMap::new();
         for facts in &snapshot.nodes {
             let participant = self.participants.number(facts.participant, round);
             let participants = nodes.entry((facts.domain_id, &facts.name)).or_default();
@@ -105,7 +106,7 @@ impl Ids {
             let hidden = name.split('/').any(|token| token.starts_with('_'));
             graph
                 .nodes
-                .push(Node(id, domain_id, name, participants, hidden.into()));
+                .push(Node(id, domain_id.0, name, participants, hidden.into()));
         }
         for facts in snapshot.topics.iter().filter(|topic| is_shown(topic)) {
             let key = (facts.domain_id, facts.dds_name.clone());
@@ -113,10 +114,10 @@ impl Ids {
             let watched = watched(facts, index, in_force);
             graph.topics.push(Topic(
                 id,
-                facts.domain_id,
+                facts.domain_id.0,
                 &facts.name,
                 &facts.dds_name,
-                facts.kind,
+                facts.kind.label(),
                 &facts.message_types,
                 facts.hidden.into(),
                 facts.vanished.into(),
@@ -124,11 +125,11 @@ impl Ids {
                 watched,
             ));
             for endpoint in &facts.publishers {
-                let row = self.endpoint(id, facts.domain_id, endpoint, round);
+                let row = self.endpoint(id, facts.domain_id.0, endpoint, round);
                 graph.publishers.push(row);
             }
             for endpoint in &facts.subscriptions {
-                let row = self.endpoint(id, facts.domain_id, endpoint, round);
+                let row = self.endpoint(id, facts.domain_id.0, endpoint, round);
                 graph.subscriptions.push(row);
             }
         }
@@ -147,7 +148,8 @@ impl Ids {
     ) -> Endpoint<'a> {
         let node = facts.node.as_deref();
         let node = node.map_or(0, |name| {
-            self.nodes.number((domain_id, name.to_owned()), round)
+            self.nodes
+                .number((DomainId(domain_id), name.to_owned()), round)
         });
         let participant = Guid::new(facts.guid.prefix, EntityId::PARTICIPANT);
         Endpoint(
@@ -155,7 +157,7 @@ impl Ids {
             node,
             self.participants.number(participant, round),
             facts.guid,
-            facts.passages,
+            facts.transports,
             &facts.reliability,
             &facts.durability,
         )
@@ -166,7 +168,7 @@ impl Ids {
 pub(super) fn is_shown(topic: &TopicFacts) -> bool {
     !matches!(
         topic.kind,
-        "service_request" | "service_reply" | "discovery"
+        TopicKind::ServiceRequest | TopicKind::ServiceReply | TopicKind::Discovery
     )
 }
 
@@ -183,7 +185,7 @@ fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> 
             glob = 4;
             continue;
         }
-        let entry = in_force.find(&watch.pattern, watch.domain_id);
+        let entry = in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0));
         own = entry.map_or(own, |entry| match entry.origin {
             Origin::Config => 1,
             Origin::CommandLine => 2,

@@ -9,7 +9,7 @@ use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::history::{Past, Second};
-use ros2probe_model::snapshot::{Passage, Snapshot, TopicFacts, WatchState};
+use ros2probe_model::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
 
 /// Seconds and steps of what a stream begins with.
 const STEP: usize = 10;
@@ -130,12 +130,15 @@ impl Figures<'_> {
         let lost = known.and_then(|known| self.lost.get(&known));
         mark(Flag::Loss, lost.is_some_and(|lost| *lost > 0));
         let is_unseen = |passage| match passage {
-            Passage::Network => false,
-            Passage::SharedMemory => !self.sees_memory,
-            Passage::DataSharing | Passage::SameProcess | Passage::Iceoryx => true,
+            Transport::Network => false,
+            Transport::SharedMemory => !self.sees_memory,
+            Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
         };
-        let mut passages = topic.passages.iter();
-        mark(Flag::Unseen, passages.any(|each| is_unseen(each.passage)));
+        let mut transports = topic.transports.iter();
+        mark(
+            Flag::Unseen,
+            transports.any(|each| is_unseen(each.transport)),
+        );
         let is_sampled = measured.is_some_and(|measured| measured.sampled.is_some());
         mark(Flag::Sampled, is_sampled);
         let mut participants = topic

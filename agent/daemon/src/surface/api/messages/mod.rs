@@ -248,7 +248,9 @@ pub(super) async fn follow(
         let detail = format!("{MAX_READERS} topics are being read, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
-    let opened = context.subscriptions.open(request(choice, topic.domain_id));
+    let opened = context
+        .subscriptions
+        .open(request(choice, topic.domain_id.0));
     let subscription = opened.map_err(|refused: Refused| {
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
@@ -472,6 +474,7 @@ fn write(lines: &mut Vec<u8>, line: &Line) {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::DomainId;
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
@@ -479,7 +482,7 @@ mod tests {
     use crate::agent_facts::SourceKind;
     use crate::snapshot_cell::SnapshotCell;
     use crate::subscriptions::{Caps, Subscriptions};
-    use ros2probe_model::payloads::{Given, News, Topic};
+    use ros2probe_model::payloads::{Dispatch, SampleOutcome, Topic};
 
     #[test]
     fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
@@ -493,7 +496,7 @@ mod tests {
         let choice = Choice::parse("/points").unwrap();
         let mut subscription = all.open(request(choice, 0)).unwrap();
         let topic = Arc::new(Topic {
-            domain_id: 0,
+            domain_id: DomainId(0),
             name: "/points".into(),
             dds_name: "rt/points".into(),
             message_type: "a/msg/B".into(),
@@ -511,9 +514,9 @@ mod tests {
                 sampled: false,
                 payload: Some(vec![7; 1 << 20].into()),
             };
-            let news = News::Sample(Arc::new(sample));
+            let outcome = SampleOutcome::Sample(Arc::new(sample));
             let to = [1].into();
-            all.deliver(vec![Given { to, news }], None);
+            all.deliver(vec![Dispatch { to, outcome }], None);
         }
         assert!(all.facts().queued_bytes <= QUEUE_BYTES);
         let (mut missed, mut kept) = (0, Vec::new());

@@ -1,0 +1,44 @@
+//! Replacing a bag's metadata.yaml as a whole.
+
+use std::fs;
+use std::io::{self, Write as _};
+use std::path::Path;
+
+use super::metadata::{self, Metadata};
+use super::{Error, new_file, with_suffix};
+
+/// What a metadata.yaml has to survive.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub(super) enum Durability {
+    /// The end of this process.
+    Process,
+    /// The loss of power.
+    Power,
+}
+
+/// Writes the new text beside the file, then takes its place.
+pub(super) fn write_metadata(
+    directory: &Path,
+    metadata: &Metadata,
+    durability: Durability,
+) -> Result<(), Error> {
+    let path = directory.join(metadata::FILE_NAME);
+    let part = with_suffix(&path, "part");
+    let write = || {
+        // Left behind by one that was killed; made anew, so that nothing is written through a link.
+        match fs::remove_file(&part) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+            _ => {}
+        }
+        let mut file = new_file(&part)?;
+        file.write_all(metadata.file_text().as_bytes())?;
+        if durability == Durability::Power {
+            file.sync_data()?;
+        }
+        fs::rename(&part, &path)
+    };
+    write().map_err(|error| {
+        let _ = fs::remove_file(&part);
+        Error::writing(&path, error)
+    })
+}

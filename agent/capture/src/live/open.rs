@@ -1,0 +1,107 @@
+//! Opening the taps that the settings ask for, or the best that there are.
+
+use std::path::PathBuf;
+
+use super::super::host_tap::{HostTap, HostTapSettings};
+use super::super::interfaces::Selection;
+use super::super::netns;
+use super::super::shm::directories::Scope;
+use super::super::uprobe::Uprobe;
+use super::super::wire_tap::{WireTap, WireTapSettings};
+use super::CaptureError;
+use crate::error_chain::in_words;
+use crate::reassembly::Limits;
+use crate::settings::{CaptureSettings, ExactChoice, SourceChoice};
+
+/// A fragmented datagram fits in, however many network namespaces share the cap.
+const LEAST_REASSEMBLY: usize = 1 << 17;
+
+/// Whose shared memory belongs to what is looked at otherwise.
+pub(super) fn scope(settings: &CaptureSettings, host: bool) -> Scope {
+    match &settings.cgroup {
+        Some(cgroup) if host => Scope::Cgroup(cgroup.clone()),
+        _ if host => Scope::AllProcesses,
+        _ => {
+            let own = PathBuf::from("/proc/self/ns/net");
+            let networks = std::iter::once(own).chain(settings.network_namespaces.clone());
+            Scope::Networks(networks.collect())
+        }
+    }
+}
+
+/// The tap at the sockets, or why there is none.
+pub(super) fn open_host(
+    settings: &CaptureSettings,
+) -> Result<(Option<HostTap>, Option<String>), CaptureError> {
+    let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
+    match settings.source {
+        SourceChoice::Wire => return Ok((None, None)),
+        SourceChoice::Auto if named => {
+            let reason = "the configuration names interfaces (capture.interfaces)";
+            return Ok((None, Some(reason.to_owned())));
+        }
+        SourceChoice::Host | SourceChoice::Auto => {}
+    }
+    let opened = HostTap::open(&HostTapSettings {
+        cgroup: settings.cgroup.clone(),
+        ring_bytes: settings.ring_bytes,
+        record_ring_bytes: settings.record_ring_bytes,
+    });
+    match opened {
+        Ok(host) => Ok((Some(host), None)),
+        Err(error) if settings.source == SourceChoice::Host => Err(error.into()),
+        Err(error) => Ok((None, Some(in_words(&error)))),
+    }
+}
+
+/// The programs for messages into shared memory, or why there are none. Without them shared memory
+/// is looked at as usual.
+pub(super) fn open_exact(
+    settings: &CaptureSettings,
+    host: bool,
+) -> (Option<Uprobe>, Option<String>) {
+    if settings.shm.exact == ExactChoice::Off {
+        return (None, None);
+    }
+    if !host {
+        // Of processes, only control groups can be told apart where the programs run.
+        let reason = "it goes with looking at the host's sockets (capture.source)";
+        return (None, Some(reason.to_owned()));
+    }
+    let opened = Uprobe::open(
+        settings.cgroup.as_deref(),
+        settings.ring_bytes,
+        settings.record_ring_bytes,
+        settings.shm.exact == ExactChoice::Auto,
+    );
+    match opened {
+        Ok(exact) => (Some(exact), None),
+        Err(error) => (None, Some(in_words(&error))),
+    }
+}
+
+/// A tap for this namespace and one for each configured one.
+pub(super) fn open_wires(
+    settings: &CaptureSettings,
+    limits: Limits,
+    selection: Selection,
+) -> Result<Vec<WireTap>, CaptureError> {
+    // All of them together keep the cap.
+    let share = limits.bytes / (1 + settings.network_namespaces.len());
+    let limits = Limits {
+        bytes: share.max(LEAST_REASSEMBLY),
+        ..limits
+    };
+    let wire = WireTapSettings {
+        selection,
+        ring_bytes: settings.ring_bytes,
+        record_ring_bytes: settings.record_ring_bytes,
+        reassembly: limits,
+    };
+    let mut wires = vec![WireTap::open(&wire, 0, None)?];
+    for (number, path) in (1..).zip(&settings.network_namespaces) {
+        let open = || WireTap::open(&wire, number, Some(path.clone()));
+        wires.push(netns::within(path, open)??);
+    }
+    Ok(wires)
+}

@@ -1,0 +1,409 @@
+//! The kernel programs and user space make the same records of every capture.
+
+use super::*;
+
+/// One IP packet of a capture.
+pub(super) struct IpPacket {
+    pub(super) bytes: Vec<u8>,
+    pub(super) time: u64,
+}
+
+pub(super) fn captures() -> Vec<PathBuf> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let mut found = Vec::new();
+    for folder in [
+        "wire/tests/data",
+        "agent/testing/data",
+        "../shared/fixtures",
+    ] {
+        collect(&root.join(folder), &mut found);
+    }
+    assert!(
+        found.len() >= 3,
+        "the captures of the project itself are missing: {found:?}"
+    );
+    // Captures with a shortened frame length cannot be given to the kernel as frames.
+    found.retain(|path| !path.to_string_lossy().contains("snap256"));
+    // It has a datagram of 300 submessages, more than a program follows: user space gets its rest.
+    found.retain(|path| !path.to_string_lossy().contains("announced-late"));
+    found.sort();
+    found
+}
+
+fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
+    let Ok(entries) = std::fs::read_dir(folder) else {
+        return;
+    };
+    for path in entries.map(|entry| entry.unwrap().path()) {
+        // What Zenoh sends is no RTPS.
+        if path.ends_with("zenoh") {
+            continue;
+        }
+        if path.is_dir() {
+            collect(&path, found);
+        } else if path.to_string_lossy().ends_with(".pcap.gz") {
+            found.push(path);
+        }
+    }
+}
+
+pub(super) fn ip_packets(path: &Path) -> Vec<IpPacket> {
+    let mut reader = PcapReader::open(path).unwrap();
+    let mut packets = Vec::new();
+    while let Some(captured) = reader.next_packet().unwrap() {
+        let header = match captured.link {
+            Link::ETHERNET => 14,
+            Link::LINUX_SLL => 16,
+            Link::LINUX_SLL2 => 20,
+            other => panic!("{}: link type {other:?}", path.display()),
+        };
+        let parsed = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
+        let Some(packet) = parsed.packet else {
+            continue;
+        };
+        let bytes = &captured.bytes[header..];
+        let pieces = match packet.payload {
+            // A program run takes a page at most: show it as a link with a smaller MTU would.
+            Payload::Datagram(udp) if bytes.len() > 3000 => {
+                let id = u32::try_from(packets.len()).unwrap() % 60_000;
+                program_run::fragments(udp.payload, 2960, false, id)
+            }
+            _ => vec![bytes.to_vec()],
+        };
+        let time = captured.time.0;
+        packets.extend(pieces.into_iter().map(|bytes| IpPacket { bytes, time }));
+    }
+    packets
+}
+
+/// What user space makes of a packet: every datagram it completes, in whole.
+struct UserSpace {
+    reassembly: Reassembly,
+}
+
+impl UserSpace {
+    fn packet(&mut self, packet: &IpPacket, mut datagram: impl FnMut(&[u8], &Envelope)) {
+        let protocol = if packet.bytes[0] >> 4 == 4 {
+            0x0800
+        } else {
+            0x86dd
+        };
+        let len = u32::try_from(packet.bytes.len()).unwrap();
+        let parsed = frame::parse_cooked(protocol, PacketType::HOST, &packet.bytes, len);
+        let parsed = parsed.unwrap().unwrap();
+        let mut envelope = Envelope {
+            destination: parsed.destination,
+            interface: program_run::INTERFACE,
+            ..Envelope::default()
+        };
+        match parsed.payload {
+            Payload::Datagram(udp) => {
+                (envelope.source_port, envelope.destination_port) =
+                    (udp.source_port, udp.destination_port);
+                datagram(udp.payload, &envelope);
+            }
+            Payload::Fragment(fragment) => {
+                let at = ros2probe_wire::Timestamp(packet.time);
+                let key = FlowKey::new(0, program_run::INTERFACE, false, &parsed, &fragment);
+                if let Some(whole) = self.reassembly.fragment(at, key, &fragment) {
+                    (envelope.source_port, envelope.destination_port) =
+                        (whole.source_port, whole.destination_port);
+                    envelope.fragmented = true;
+                    datagram(whole.payload(), &envelope);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+fn user_space() -> UserSpace {
+    UserSpace {
+        reassembly: Reassembly::new(Limits {
+            bytes: 64 << 20,
+            ..Limits::default()
+        }),
+    }
+}
+
+/// The filter's verdict on a whole datagram, stated once more and plainly.
+fn expected(
+    payload: &[u8],
+    envelope: &Envelope,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> (bool, Vec<Record>) {
+    let (mut capture, mut records) = (false, Vec::new());
+    walk::datagram(payload, envelope, None, |found| {
+        let record = found.record;
+        let endpoint = match walk::fate(&record) {
+            Fate::Ignore => return,
+            Fate::Capture => return capture = true,
+            Fate::Writer => record.writer(),
+            Fate::Reader => record.reader(),
+        };
+        match interest.get(&endpoint) {
+            Some(Verdict::Meter) => records.push(record),
+            Some(Verdict::Capture) => capture = true,
+            Some(Verdict::Ignore) | None => {}
+        }
+    });
+    (capture, if capture { Vec::new() } else { records })
+}
+
+/// All user endpoints that a capture mentions as sender.
+fn endpoints(packets: &[IpPacket]) -> BTreeSet<Guid> {
+    let mut found = BTreeSet::new();
+    let mut user = user_space();
+    for packet in packets {
+        user.packet(packet, |payload, envelope| {
+            walk::datagram(payload, envelope, None, |each| {
+                match walk::fate(&each.record) {
+                    Fate::Writer => drop(found.insert(each.record.writer())),
+                    Fate::Reader => drop(found.insert(each.record.reader())),
+                    _ => {}
+                }
+            });
+        });
+    }
+    found
+}
+
+fn comparable(record: Record) -> Record {
+    Record {
+        time: 0,
+        datagram: 0,
+        elapsed: 0,
+        flags: record.flags & !flag::AHEAD,
+        ..record
+    }
+}
+
+fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
+    let packets = ip_packets(path);
+    let mut kernel = Kernel::load();
+    kernel.set_interest(interest);
+    let (mut user, mut records, mut captures) = (user_space(), 0, 0);
+    let mut runs = Runs::default();
+    for (number, packet) in packets.iter().enumerate() {
+        let Seen {
+            kept,
+            records: found,
+        } = kernel.frame(&packet.bytes);
+        let mut wanted = Vec::new();
+        let mut captured = false;
+        let mut finished = false;
+        user.packet(packet, |payload, envelope| {
+            let (capture, records) = expected(payload, envelope, interest);
+            captured = capture;
+            let joins = records.len() == 1 || !envelope.fragmented;
+            records
+                .into_iter()
+                .for_each(|record| runs.give(record, joins, &mut wanted));
+            finished = true;
+        });
+        if finished {
+            assert_eq!(kept, captured, "{} packet {number}: kept", path.display());
+            captures += usize::from(kept);
+        }
+        let found: Vec<_> = found.into_iter().map(comparable).collect();
+        let wanted: Vec<_> = wanted.into_iter().map(comparable).collect();
+        assert_eq!(found, wanted, "{} packet {number}: records", path.display());
+        records += found.len();
+    }
+    let mut stalled: Vec<_> = kernel.take_stalled().into_iter().map(comparable).collect();
+    let mut wanted: Vec<_> = runs.0.into_values().map(comparable).collect();
+    stalled.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
+    wanted.sort_by_key(|record| (record.writer, record.destination, record.sequence_number));
+    assert_eq!(stalled, wanted, "{}: runs left over", path.display());
+    (records + stalled.len(), captures)
+}
+
+/// Fragments that follow each other, joined as the filter joins them: by stream, one CPU.
+#[derive(Default)]
+struct Runs(BTreeMap<([u32; 4], [u32; 4], u16), Record>);
+
+impl Runs {
+    fn give(&mut self, record: Record, joins: bool, out: &mut Vec<Record>) {
+        if record.kind != kind::DATA_FRAG {
+            return out.push(record);
+        }
+        let key = (record.writer, record.destination, record.destination_port);
+        if let Some(mut run) = self.0.remove(&key) {
+            if joins && run.extend(&record) {
+                if run.ends_sample() {
+                    out.push(run);
+                } else {
+                    self.0.insert(key, run);
+                }
+                return;
+            }
+            out.push(run);
+        }
+        if joins && record.fragment_start == 1 && !record.ends_sample() {
+            self.0.insert(key, record);
+        } else {
+            out.push(record);
+        }
+    }
+}
+
+#[test]
+fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
+    for path in captures() {
+        let all = endpoints(&ip_packets(&path));
+        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
+        let (records, captured) = compare(&path, &meter_all);
+        assert!(captured > 0, "{}: no discovery seen", path.display());
+        println!("{}: {records} records, {captured} captured", path.display());
+
+        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
+        let mixed = all
+            .iter()
+            .copied()
+            .zip(verdicts.into_iter().cycle())
+            .collect();
+        compare(&path, &mixed);
+    }
+}
+
+/// A datagram as sockets see it: one IP packet, however many fragments it came in.
+struct Datagram {
+    packet: Vec<u8>,
+    payload: Vec<u8>,
+    envelope: Envelope,
+}
+
+fn datagrams(packets: &[IpPacket]) -> Vec<Datagram> {
+    let (mut user, mut found) = (user_space(), Vec::new());
+    for packet in packets {
+        user.packet(packet, |payload, envelope| {
+            let mut envelope = Envelope {
+                host: true,
+                ..*envelope
+            };
+            let packet = if envelope.fragmented {
+                envelope.fragmented = false;
+                envelope.source_port = 7411;
+                envelope.destination_port = 7411;
+                envelope.destination = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 255, 255, 10, 99, 0, 2];
+                program_run::datagram(payload)
+            } else {
+                packet.bytes.clone()
+            };
+            found.push(Datagram {
+                packet,
+                payload: payload.to_vec(),
+                envelope,
+            });
+        });
+    }
+    // A program run takes a page at most; longer ones pass real sockets in `live/host_hook`.
+    found.retain(|datagram| datagram.packet.len() <= 3000);
+    found
+}
+
+/// What the host hook says of a datagram besides what [`comparable`] leaves out.
+fn of_any_socket(record: Record) -> Record {
+    assert_ne!(record.flags & flag::HOST, 0);
+    assert_ne!((record.socket, record.datagram), (0, 0));
+    Record {
+        socket: 0,
+        ..comparable(record)
+    }
+}
+
+fn compare_host(
+    path: &Path,
+    kernel: &mut Kernel,
+    hook: Hook,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> (usize, usize) {
+    kernel.set_interest(interest);
+    let (mut records, mut captures) = (0, 0);
+    let mut copied = kernel.counter(Counter::CopiesNotCaptured);
+    for (number, datagram) in datagrams(&ip_packets(path)).into_iter().enumerate() {
+        let case = format!("{} {hook:?} datagram {number}", path.display());
+        let envelope = Envelope {
+            outgoing: hook == Hook::Egress,
+            ..datagram.envelope
+        };
+        let seen = kernel.datagram(&datagram.packet);
+        let (capture, mut wanted) = expected(&datagram.payload, &envelope, interest);
+        if let Some((piece, bytes)) = &seen.captured {
+            assert!(capture, "{case}: captured");
+            assert!(*bytes == datagram.payload, "{case}: captured bytes");
+            assert_eq!(piece.destination_port, envelope.destination_port, "{case}");
+            assert_eq!(piece.source_port, envelope.source_port, "{case}");
+            captures += 1;
+        } else if capture {
+            // The run before was within a millisecond, however long ago the captured one was.
+            copied += 1;
+            assert_eq!(kernel.counter(Counter::CopiesNotCaptured), copied, "{case}");
+            let metered = interest.iter().map(|(guid, verdict)| match verdict {
+                Verdict::Capture => (*guid, Verdict::Meter),
+                verdict => (*guid, *verdict),
+            });
+            wanted = metered_records(&datagram.payload, &envelope, &metered.collect());
+        }
+        // Each run has a socket of its own, so fragments join within one datagram only.
+        let (mut runs, mut joined) = (Runs::default(), Vec::new());
+        for record in wanted {
+            runs.give(record, true, &mut joined);
+        }
+        joined.extend(runs.0.into_values());
+        let key = |record: &Record| (record.writer, record.sequence_number, record.kind);
+        let mut found: Vec<_> = seen.records.into_iter().map(of_any_socket).collect();
+        let mut joined: Vec<_> = joined.into_iter().map(comparable).collect();
+        found.sort_by_key(key);
+        joined.sort_by_key(key);
+        assert_eq!(found, joined, "{case}: records");
+        records += found.len();
+    }
+    kernel.forget_interest(interest);
+    (records, captures)
+}
+
+/// The records of everything that is metered, whatever else is in the datagram.
+fn metered_records(
+    payload: &[u8],
+    envelope: &Envelope,
+    interest: &BTreeMap<Guid, Verdict>,
+) -> Vec<Record> {
+    let mut records = Vec::new();
+    walk::datagram(payload, envelope, None, |found| {
+        let endpoint = match walk::fate(&found.record) {
+            Fate::Ignore | Fate::Capture => return,
+            Fate::Writer => found.record.writer(),
+            Fate::Reader => found.record.reader(),
+        };
+        if interest.get(&endpoint) == Some(&Verdict::Meter) {
+            records.push(found.record);
+        }
+    });
+    records
+}
+
+#[test]
+fn the_host_hook_makes_the_same_records_of_every_capture_in_both_directions() {
+    // The kernel takes half a second to verify a program: once is enough.
+    let mut kernels = [Hook::Ingress, Hook::Egress].map(|hook| (hook, Kernel::load_hook(hook)));
+    for path in captures() {
+        let all = endpoints(&ip_packets(&path));
+        let meter_all = all.iter().map(|guid| (*guid, Verdict::Meter)).collect();
+        let verdicts = [Verdict::Ignore, Verdict::Meter, Verdict::Capture];
+        let mixed = all
+            .iter()
+            .copied()
+            .zip(verdicts.into_iter().cycle())
+            .collect();
+        for (hook, kernel) in &mut kernels {
+            let (records, captured) = compare_host(&path, kernel, *hook, &meter_all);
+            assert!(captured > 0, "{}: no discovery seen", path.display());
+            println!(
+                "{} {hook:?}: {records} records, {captured} captured",
+                path.display()
+            );
+            compare_host(&path, kernel, *hook, &mixed);
+        }
+    }
+}

@@ -1,0 +1,277 @@
+//! The probe on the way into shared memory, on a program that hands messages over as Fast DDS does:
+//! what the kernel reads in its memory is what was handed over, in one piece and in a list of
+//! buffers, however that is cut. Needs root and a kernel with uprobes.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs::File;
+use std::os::unix::fs::MetadataExt as _;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
+use ros2probe_capture::piece_assembler::PieceAssembler;
+use ros2probe_capture::uprobe::library;
+use ros2probe_testing::forged::{SAMPLES_WRITER, Talker};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_wire::filter::{Budget, Counter};
+use ros2probe_wire::record::{Record, Verdict, flag};
+use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+
+const PATIENCE: Duration = Duration::from_secs(10);
+const EXACT: u16 = flag::SHM | flag::EXACT;
+
+/// A process that hands messages over, a filter that looks at it, and whom it pretends to be.
+struct Handing {
+    filter: Filter,
+    probe: Option<Probe>,
+    _probes: Probes,
+    program: PathBuf,
+    sender: Process,
+    host: Namespace,
+    talker: Talker,
+}
+
+impl Handing {
+    fn new(form: Form) -> Result<Handing> {
+        let host = Namespace::alone()?;
+        let within = File::open(host.cgroup())?.metadata()?.ino();
+        let (mut filter, mut probes) =
+            Filter::load_uprobe(&FilterSettings::default(), Some(within))?;
+        let program = harness::peer::built(match form {
+            Form::Whole => "handed",
+            Form::List => "handed-list",
+        })?;
+        let file = File::open(&program)?;
+        let entry = library::find(&file)?;
+        ensure!(entry.form == form, "{entry:?}");
+        let probe = Some(probes.attach(&file, entry.offset, entry.form)?);
+        let mut sender = Process::start(&host.on_network(), &program, [""; 0])?;
+        sender.wait_for("ready", PATIENCE)?;
+        let talker = Talker::new(1, "/points");
+        for budget in [Budget::CaptureBytes, Budget::Records] {
+            filter.set_unknown_budget(budget, 1 << 20)?;
+        }
+        Ok(Handing {
+            filter,
+            probe,
+            _probes: probes,
+            program,
+            sender,
+            host,
+            talker,
+        })
+    }
+
+    /// Hands a message over, cut into buffers of these lengths.
+    fn hand(&mut self, message: &[u8], lengths: &[usize]) -> Result<()> {
+        assert_eq!(lengths.iter().sum::<usize>(), message.len());
+        hand(&mut self.sender, message, lengths)
+    }
+
+    fn meter(&mut self) -> Result<()> {
+        let prefix = GuidPrefix(self.talker.prefix);
+        let writer = Guid::new(prefix, EntityId(SAMPLES_WRITER));
+        Ok(self.filter.set_interest(writer, Some(Verdict::Meter))?)
+    }
+
+    fn records(&mut self) -> Vec<Record> {
+        std::iter::from_fn(|| self.filter.next_record()).collect()
+    }
+
+    /// Whole messages, as they were captured.
+    fn captured(&mut self) -> Vec<Vec<u8>> {
+        let (mut wholes, mut messages) = (PieceAssembler::default(), Vec::new());
+        while let Some(captured) = self.filter.next_piece() {
+            let (piece, bytes) = captured.read().unwrap();
+            assert_eq!((piece.flags, piece.socket), (EXACT, 0));
+            if let Some((_, whole)) = wholes.piece(&piece, bytes) {
+                messages.push(whole.into_owned());
+            }
+        }
+        messages
+    }
+
+    fn counts(&self) -> Result<BTreeMap<&'static str, u64>> {
+        let counters = self.filter.counters()?;
+        let named = counters
+            .into_iter()
+            .map(|(one, count)| (one.label(), count));
+        Ok(named.collect())
+    }
+}
+
+fn hand(sender: &mut Process, message: &[u8], lengths: &[usize]) -> Result<()> {
+    let mut line = String::new();
+    for length in lengths {
+        write!(line, "{length} ")?;
+    }
+    line.push(':');
+    for byte in message {
+        write!(line, "{byte:02x}")?;
+    }
+    sender.write_line(&line)?;
+    sender.wait_for("handed", PATIENCE)
+}
+
+/// Ways to cut a message of this length. Fast DDS cuts before payloads and their padding.
+fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
+    if form == Form::Whole {
+        return vec![vec![length]];
+    }
+    let every = |step: usize| {
+        let starts = (0..length).step_by(step);
+        starts.map(|at| step.min(length - at)).collect()
+    };
+    let behind = |at: usize| vec![at, 0, length - at];
+    vec![
+        vec![length],
+        every(4),
+        every(13),
+        every(20),
+        behind(20),
+        behind(44),
+        vec![44, length - 45, 1],
+        vec![1, length - 1],
+    ]
+}
+
+#[test]
+fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()> {
+    for form in [Form::Whole, Form::List] {
+        let mut handing = Handing::new(form)?;
+        handing.meter()?;
+        let mut expected = Vec::new();
+        for size in [9, 10, 12, 13, 320] {
+            for cut in cuts(
+                form,
+                handing.talker.message(SAMPLES_WRITER, 1, &[0; 320]).len() - 320 + size,
+            ) {
+                let mut message = handing.talker.sample(size);
+                // INFO_TS before, so that there is a time to be found.
+                let time = [9, 1, 8, 0, 1, 0, 0, 0, 2, 0, 0, 0];
+                let at = 20;
+                message.splice(at..at, time);
+                let mut cut = cut;
+                if let Some(last) = cut.last_mut() {
+                    *last += time.len();
+                }
+                handing.hand(&message, &cut)?;
+                walk::datagram(&message, &Envelope::default(), None, |found| {
+                    expected.push(found.record);
+                });
+            }
+        }
+        let records = handing.records();
+        assert_eq!(records.len(), expected.len(), "{:?}", handing.counts()?);
+        for (record, expected) in records.iter().zip(&expected) {
+            // Without an address user space says IPv6.
+            let flags = (expected.flags & !flag::IPV6) | EXACT;
+            let time = record.time;
+            assert!(time > 0);
+            assert_eq!(
+                *record,
+                Record {
+                    time,
+                    flags,
+                    ..*expected
+                }
+            );
+        }
+        assert!(handing.captured().is_empty());
+    }
+    Ok(())
+}
+
+#[test]
+fn what_is_captured_is_whole() -> Result<()> {
+    for form in [Form::Whole, Form::List] {
+        let mut handing = Handing::new(form)?;
+        let mut expected: Vec<Vec<u8>> = Vec::new();
+        let introduction = handing.talker.introduction("talker");
+        for message in introduction {
+            for cut in cuts(form, message.len()) {
+                handing.hand(&message, &cut)?;
+                expected.push(message.clone());
+            }
+        }
+        // Nobody has announced it: captured, too.
+        let long = handing.talker.message(SAMPLES_WRITER, 1, &vec![7; 65_000]);
+        let cut = match form {
+            Form::Whole => vec![long.len()],
+            Form::List => vec![44, 1, 40_000, long.len() - 40_045],
+        };
+        handing.hand(&long, &cut)?;
+        expected.push(long);
+        let captured = handing.captured();
+        assert_eq!(captured.len(), expected.len(), "{:?}", handing.counts()?);
+        assert!(captured == expected);
+        assert_eq!(handing.records(), []);
+    }
+    Ok(())
+}
+
+#[test]
+fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> Result<()> {
+    for form in [Form::Whole, Form::List] {
+        let mut handing = Handing::new(form)?;
+        handing.meter()?;
+        // A length of 0 says that the submessage goes on to the end.
+        let mut long = handing.talker.message(SAMPLES_WRITER, 5, &vec![7; 40_000]);
+        long.splice(22..24, [0, 0]);
+        long.extend(vec![7; 100_000]);
+        let cut = match form {
+            Form::Whole => vec![long.len()],
+            Form::List => vec![44, long.len() - 44],
+        };
+        handing.hand(&long, &cut)?;
+        let records = handing.records();
+        let found: Vec<_> = records
+            .iter()
+            .map(|record| (record.sequence_number, record.payload_len))
+            .collect();
+        assert_eq!(found, [(5, 140_000)]);
+        handing.sender.write_line("nowhere")?;
+        handing.sender.wait_for("handed", PATIENCE)?;
+        handing.hand(b"none of RTPS, and yet a message", &[31])?;
+        handing.hand(b"short", &[5])?;
+        let counts = handing.counts()?;
+        let count = |counter: Counter| counts.get(counter.label()).copied();
+        assert_eq!(count(Counter::Unreadable), Some(1), "{counts:?}");
+        assert_eq!(count(Counter::Malformed), Some(2), "{counts:?}");
+        assert_eq!(count(Counter::Messages), Some(1), "{counts:?}");
+        assert_eq!(count(Counter::Contended), Some(0), "{counts:?}");
+    }
+    Ok(())
+}
+
+#[test]
+fn processes_of_other_control_groups_and_those_behind_the_probe_s_end_are_not_seen() -> Result<()> {
+    let mut handing = Handing::new(Form::Whole)?;
+    handing.meter()?;
+    let message = handing.talker.sample(100);
+    let elsewhere = handing.host.outside();
+    let mut stranger = Process::start(&elsewhere, &handing.program, [""; 0])?;
+    stranger.wait_for("ready", PATIENCE)?;
+    hand(&mut stranger, &message, &[message.len()])?;
+    assert_eq!(handing.records(), []);
+    handing.hand(&message, &[message.len()])?;
+    assert_eq!(handing.records().len(), 1);
+    handing.probe = None;
+    handing.hand(&message, &[message.len()])?;
+    assert_eq!(handing.records(), []);
+    // Those of tests that run beside this one are in the same file.
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        let code = harness::code::at_function(&handing.sender, &handing.program)?;
+        if code.in_memory == code.in_file {
+            return Ok(());
+        }
+        ensure!(Instant::now() < deadline, "{code:?}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}

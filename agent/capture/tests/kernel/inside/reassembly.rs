@@ -1,0 +1,229 @@
+//! Datagrams that the kernel gives up reassembling.
+
+use super::*;
+
+/// Makes the kernel of a host give up on fragments after a second.
+fn hurry(host: &Namespace) {
+    netns::within(&forged::path(host), || {
+        for path in ["ipv4/ipfrag_time", "ipv6/ip6frag_time"] {
+            std::fs::write(format!("/proc/sys/net/{path}"), "1").unwrap();
+        }
+    })
+    .unwrap();
+}
+
+/// Long enough for a kernel in a hurry to give up.
+const GIVEN_UP: Duration = Duration::from_millis(2500);
+
+#[test]
+fn a_datagram_that_lacks_its_last_fragment_is_named() {
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let (mut talker, writer) = talker(1);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    let before = observed.counted(Counter::NotReassembled);
+    wire.carry(&talker.sample(30_000)).unwrap();
+    wire.shuffle = |packets| drop(packets.pop());
+    for _ in 2..=4 {
+        wire.carry(&talker.sample(30_000)).unwrap();
+    }
+    wire.shuffle = |packets| drop(packets.remove(3));
+    wire.carry(&talker.sample(5_000)).unwrap();
+    wire.shuffle = |_| {};
+    wire.carry(&talker.sample(30_000)).unwrap();
+    let found = observed.records(writer, GIVEN_UP);
+    let mut numbers: Vec<_> = found.iter().map(|record| record.sequence_number).collect();
+    numbers.sort_unstable();
+    assert_eq!(numbers, [2, 3, 4, 5]);
+    for record in found {
+        assert_eq!(record.kind, kind::DATA);
+        assert_eq!(
+            record.flags & !flag::STAMP,
+            flag::FRAGMENTED | flag::NOT_REASSEMBLED
+        );
+        assert_eq!(record.destination_port, forged::DISCOVERY_PORT);
+        let destination: [u8; 16] = zerocopy::transmute!(record.destination);
+        assert_eq!(destination[12..], link.monitor.address().octets());
+        assert_eq!(record.socket, 0);
+        let payload = if record.sequence_number == 5 {
+            5_000
+        } else {
+            30_000
+        };
+        assert_eq!(record.payload_len, payload);
+    }
+    assert!(observed.counted(Counter::NotReassembled) >= before + 4);
+}
+
+#[test]
+fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let (mut talker, writer) = talker(2);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    let before = observed.counted(Counter::NotReassembledUnnamed);
+    wire.shuffle = |packets| drop(packets.remove(0));
+    for _ in 0..5 {
+        wire.carry(&talker.sample(30_000)).unwrap();
+    }
+    assert_eq!(observed.records(writer, GIVEN_UP), []);
+    // Other tests may lose some at the same time, but not one per fragment.
+    let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
+    assert!((5..20).contains(&unnamed), "{unnamed}");
+}
+
+#[test]
+fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
+    static HELD: Mutex<Vec<Vec<u8>>> = Mutex::new(Vec::new());
+    let mut observed = Observed::new();
+    let link = Link::new().unwrap();
+    hurry(&link.monitor);
+    let limit = || std::fs::write("/proc/sys/net/ipv4/ipfrag_max_dist", "2").unwrap();
+    netns::within(&forged::path(&link.monitor), limit).unwrap();
+    let (mut talker, writer) = talker(8);
+    observed
+        .filter
+        .set_interest(writer, Some(Verdict::Meter))
+        .unwrap();
+    let mut wire = Wire::new(&link.robot, &link.monitor, INTERFACE).unwrap();
+    wire.shuffle = |packets| *HELD.lock().unwrap() = packets.split_off(2);
+    wire.carry(&talker.sample(20_000)).unwrap();
+    wire.shuffle = |packets| packets.truncate(1);
+    for _ in 2..=6 {
+        wire.carry(&talker.sample(20_000)).unwrap();
+    }
+    wire.shuffle = |packets| *packets = HELD.lock().unwrap().drain(..).collect();
+    wire.carry(&talker.sample(20_000)).unwrap();
+    let at_once = observed.records(writer, SETTLED);
+    assert_eq!(fragment_numbers(&at_once), FragmentNumbers::from([(1, 0)]));
+    let later = observed.records(writer, GIVEN_UP);
+    assert_eq!(
+        fragment_numbers(&later),
+        (2..=6).map(|number| (number, 0)).collect()
+    );
+    assert_eq!(at_once.len() + later.len(), 6);
+}
+
+#[test]
+fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
+    let (mut observed, link, mut talker, writer) = observed_link(12, Verdict::Meter);
+    let monitor = link.monitor.address();
+    for (family, from, to) in [
+        (
+            "ipv4/ipfrag",
+            format!("{}:0", link.robot.address()),
+            format!("{monitor}:7411"),
+        ),
+        (
+            "ipv6/ip6frag",
+            "[fd99::1]:0".to_owned(),
+            "[fd99::2]:7411".to_owned(),
+        ),
+    ] {
+        let _receiver = observed.socket(&link.monitor, &to);
+        let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+        // The receiver's link address has to be found first.
+        sender.carry(&talker.sample(100)).unwrap();
+        std::thread::sleep(SETTLED);
+        observed.records(writer, Duration::ZERO);
+        // Half of the first datagram takes all there is, and keeps it.
+        let limit = |bytes: &str| {
+            std::fs::write(format!("/proc/sys/net/{family}_low_thresh"), "1").unwrap();
+            std::fs::write(format!("/proc/sys/net/{family}_high_thresh"), bytes).unwrap();
+        };
+        netns::within(&forged::path(&link.monitor), || limit("40000")).unwrap();
+        let some = talker.sent() + 1;
+        for _ in 0..5 {
+            sender.carry(&talker.sample(60_000)).unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        let found = observed.records(writer, SETTLED);
+        let lost: Vec<_> = found
+            .iter()
+            .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
+            .collect();
+        // The first one is waited for; the others have found no room.
+        let expected: FragmentNumbers = (some + 1..some + 5)
+            .map(|number| (number.into(), 0))
+            .collect();
+        assert_eq!(
+            (fragment_numbers(lost.iter().copied()), lost.len()),
+            (expected, 4),
+            "{family}"
+        );
+        netns::within(&forged::path(&link.monitor), || limit("4000000")).unwrap();
+    }
+}
+
+#[test]
+fn over_ipv6_and_multicast_it_is_named_likewise() {
+    let group = Ipv4Addr::new(239, 255, 0, 8);
+    let (mut observed, link, mut talker, writer) = observed_link(3, Verdict::Meter);
+    hurry(&link.monitor);
+    let member = observed.socket(&link.monitor, &format!("{group}:7411"));
+    member
+        .join_multicast_v4(&group, &link.monitor.address())
+        .unwrap();
+    let last_v6 = "meta protocol ip6 frag more-fragments 0 frag frag-off > 0";
+    let last_v4 = "ip frag-off & 0x2000 == 0 ip frag-off & 0x1fff != 0";
+    let ways = [
+        (
+            "[fd99::1]:0".to_owned(),
+            "[fd99::2]:7411".to_owned(),
+            last_v6,
+            flag::IPV6,
+        ),
+        (
+            format!("{}:0", link.robot.address()),
+            format!("{group}:7411"),
+            last_v4,
+            0,
+        ),
+    ];
+    for (from, to, last_fragment, family) in ways {
+        let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
+        // The receiver's link address has to be found first.
+        sender.carry(&talker.sample(100)).unwrap();
+        std::thread::sleep(SETTLED);
+        observed.records(writer, Duration::ZERO);
+        let lossy = Loss::of(&link.robot, last_fragment, 1000).unwrap();
+        let before = talker.sent();
+        for _ in 0..3 {
+            sender.carry(&talker.sample(60_000)).unwrap();
+        }
+        drop(lossy);
+        sender.carry(&talker.sample(60_000)).unwrap();
+        let mut found = observed.records(writer, GIVEN_UP);
+        found.retain(|record| record.flags & flag::NOT_REASSEMBLED != 0);
+        let expected: FragmentNumbers = (before + 1..before + 4)
+            .map(|number| (number.into(), 0))
+            .collect();
+        assert_eq!(
+            (fragment_numbers(&found), found.len()),
+            (expected, 3),
+            "{to}"
+        );
+        for record in found {
+            let flags = flag::FRAGMENTED | flag::NOT_REASSEMBLED | family;
+            assert_eq!(record.flags & !flag::STAMP, flags);
+            let destination: [u8; 16] = zerocopy::transmute!(record.destination);
+            let to: SocketAddr = to.parse().unwrap();
+            let expected = match to.ip() {
+                IpAddr::V4(address) => address.to_ipv6_mapped(),
+                IpAddr::V6(address) => address,
+            };
+            assert_eq!(destination, expected.octets());
+            assert_eq!(record.payload_len, 60_000);
+        }
+    }
+}

@@ -1,0 +1,15 @@
+//! The kernel programs, run by the kernel itself: on packets of a test, and on sockets in network
+//! namespaces. Needs root.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "a test that meets the unexpected has failed"
+)]
+
+mod caps;
+mod filter;
+mod handed;
+mod host_hook;
+mod inside;

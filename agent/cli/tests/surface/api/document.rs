@@ -1,0 +1,308 @@
+//! The OpenAPI document: it says what the agent accepts and answers.
+
+use super::*;
+
+#[test]
+fn the_checked_in_document_is_the_generated_one() {
+    let generated = ros2probe::surface::api::document()
+        .to_pretty_json()
+        .unwrap()
+        + "\n";
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/openapi.json");
+    if std::env::var_os("UPDATE_OPENAPI").is_some() {
+        std::fs::write(&path, &generated).unwrap();
+    }
+    assert_eq!(
+        std::fs::read_to_string(path).unwrap(),
+        generated,
+        "run `UPDATE_OPENAPI=1 cargo test -p ros2probe --test surface api::` and commit the result"
+    );
+}
+
+#[test]
+fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
+    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let topic = &document["paths"]["/watch/{topic}"]["post"]["parameters"][0]["schema"];
+    assert!(topic["pattern"].is_string(), "{topic}");
+    let validator = jsonschema::validator_for(topic).unwrap();
+    let long = format!("a{}", "/b".repeat(127));
+    for name in [
+        "a",
+        "a/b",
+        "_a/b_1",
+        "*",
+        "**",
+        "a/**/b",
+        "cam*/raw",
+        "*a*",
+        "*1",
+        "a*b*",
+        "",
+        "/a",
+        "a/",
+        "a//b",
+        "1a",
+        "a/1b",
+        "a**",
+        "**a",
+        "a b",
+        "a-b",
+        "a.b",
+        "\u{e9}",
+        "a*",
+        "**/**",
+        "*/*",
+        &long,
+        &format!("{long}c"),
+    ] {
+        let documented = validator.is_valid(&Value::from(name));
+        let accepted = ros2probe::config::watch::check_pattern(&format!("/{name}")).is_ok();
+        assert_eq!(documented, accepted, "{name}");
+    }
+    assert_expectations_are_documented(&document);
+}
+
+/// Limits of an expectation are those of the configuration, and the agent refuses what is beyond.
+fn assert_expectations_are_documented(document: &Value) {
+    let schema = ros2probe::config::Config::schema();
+    let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
+    let body = &document["components"]["schemas"]["WatchRequest"]["properties"];
+    let (mut low, mut high) = (Expectations::default(), Expectations::default());
+    for (key, place) in [
+        ("min_rate_hz", (&mut low.min_rate_hz, &mut high.min_rate_hz)),
+        ("max_rate_hz", (&mut low.max_rate_hz, &mut high.max_rate_hz)),
+        (
+            "max_loss_ratio",
+            (&mut low.max_loss_ratio, &mut high.max_loss_ratio),
+        ),
+        (
+            "max_latency_ms",
+            (&mut low.max_latency_ms, &mut high.max_latency_ms),
+        ),
+        (
+            "max_silence_s",
+            (&mut low.max_silence_s, &mut high.max_silence_s),
+        ),
+    ] {
+        for (limit, place) in [("minimum", place.0), ("maximum", place.1)] {
+            let value = configured[key][limit].as_f64();
+            assert!(value.is_some(), "{key} {limit}: {configured}");
+            assert_eq!(body[key][limit].as_f64(), value, "{key} {limit}");
+            *place = value;
+        }
+    }
+    assert_eq!((low.check(), high.check()), (Ok(()), Ok(())));
+    let beyond = |change: fn(&mut Expectations)| {
+        let mut wrong = Expectations::default();
+        change(&mut wrong);
+        wrong.check().is_err()
+    };
+    assert!(beyond(|wrong| wrong.min_rate_hz = Some(-0.1)));
+    assert!(beyond(|wrong| wrong.max_rate_hz = Some(1_000_000.1)));
+    assert!(beyond(|wrong| wrong.max_loss_ratio = Some(1.1)));
+    assert!(beyond(|wrong| wrong.max_latency_ms = Some(3_600_000.1)));
+    assert!(beyond(|wrong| wrong.max_silence_s = Some(0.0)));
+    assert!(beyond(|wrong| wrong.max_silence_s = Some(f64::NAN)));
+    assert!(beyond(
+        |wrong| (wrong.min_rate_hz, wrong.max_rate_hz) = (Some(2.0), Some(1.0))
+    ));
+}
+
+/// Text of so many characters that the parameter may have.
+fn filler(parameter: &str, length: usize) -> String {
+    let mut text = String::new();
+    match parameter {
+        "topic" | "exclude" => {
+            while text.len() < length {
+                let left = length - text.len();
+                // The last name has two characters at least.
+                let part = if left <= 202 { left } else { 200 };
+                text += &format!("/{}", "a".repeat(part - 1));
+                if text.len() < length {
+                    text.pop();
+                    text.push(',');
+                }
+            }
+            text
+        }
+        "name" if length <= 1025 => {
+            // Blanks around a name do not count.
+            format!("{}ros2.message.lost", "+".repeat(length - 17))
+        }
+        _ => "a".repeat(length),
+    }
+}
+
+/// The status of an answer that may have no end.
+fn status(agent: &LocalAgent, method: &str, path: &str, body: &str) -> u16 {
+    use std::io::{Read as _, Write as _};
+    let mut stream = TcpStream::connect(agent.api).unwrap();
+    stream
+        .set_read_timeout(Some(local_agent::PATIENCE))
+        .unwrap();
+    let (api, length) = (agent.api, body.len());
+    let head = format!(
+        "{method} {path} HTTP/1.1\r\nHost: {api}\r\nContent-Type: application/json\r\n\
+         Content-Length: {length}\r\n\r\n{body}"
+    );
+    stream.write_all(head.as_bytes()).unwrap();
+    let mut answer = [0; 16];
+    stream.read_exact(&mut answer).unwrap();
+    let answer = String::from_utf8(answer.to_vec()).unwrap();
+    answer.split(' ').nth(1).unwrap().parse().unwrap()
+}
+
+#[test]
+fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    let bags = directory.path().join("bags");
+    let text = format!(
+        "recordings: {{directory: {}, reserve_percent: 0, reserve_bytes: 0}}\nlimits: {{recordings: 64}}\n",
+        bags.display()
+    );
+    std::fs::write(&config, text).unwrap();
+    let mut agent = LocalAgent::start(
+        &mut rp(),
+        &["--config", config.to_str().unwrap(), "--speed", "max"],
+    );
+    agent.wait_for_log("ready");
+    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let mut checked = 0;
+    let mut check = |what: &str, allowed: u16, beyond: u16| {
+        assert!(
+            !matches!(allowed, 400 | 422),
+            "{what}: the bound is refused: {allowed}"
+        );
+        assert!(matches!(beyond, 400 | 422), "{what}: beyond it: {beyond}");
+        checked += 1;
+    };
+    bounds_of_queries(&agent, &document, &mut check);
+    bounds_of_bodies(&agent, &document, &mut check);
+    eprintln!("{checked} bounds");
+    assert!(checked >= 30, "{checked}");
+}
+
+/// What is checked, the status at the bound, and the status beyond it.
+type Check<'a> = &'a mut dyn FnMut(&str, u16, u16);
+
+fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {
+    for (path, item) in document["paths"].as_object().unwrap() {
+        let Some(parameters) = item["get"]["parameters"].as_array() else {
+            continue;
+        };
+        let path = path
+            .replace("{topic}", "chatter")
+            .replace("{node}", "talker");
+        for parameter in parameters
+            .iter()
+            .filter(|parameter| parameter["in"] == "query")
+        {
+            let (name, schema) = (parameter["name"].as_str().unwrap(), &parameter["schema"]);
+            let ask = |value: &str| {
+                // Without a topic nothing is wanted.
+                let topic = match (path.as_str(), name) {
+                    ("/samples", "exclude" | "exclude_regex" | "domain_id" | "queue_bytes") => {
+                        "topic=/a&"
+                    }
+                    _ => "",
+                };
+                status(agent, "GET", &format!("{path}?{topic}{name}={value}"), "")
+            };
+            let what = format!("{path} {name}");
+            if let Some(maximum) = schema["maximum"].as_i64() {
+                check(
+                    &what,
+                    ask(&maximum.to_string()),
+                    ask(&(maximum + 1).to_string()),
+                );
+            }
+            if let Some(minimum) = schema["minimum"].as_i64() {
+                check(
+                    &what,
+                    ask(&minimum.to_string()),
+                    ask(&(minimum - 1).to_string()),
+                );
+            }
+            if let Some(longest) = schema["maxLength"].as_u64() {
+                let longest = usize::try_from(longest).unwrap();
+                check(
+                    &what,
+                    ask(&filler(name, longest)),
+                    ask(&filler(name, longest + 1)),
+                );
+            }
+        }
+    }
+}
+
+fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
+    for (method, path, schema) in [
+        ("POST", "/recordings", "RecordingRequest"),
+        ("PUT", "/watch/a", "WatchRequest"),
+    ] {
+        let properties = &document["components"]["schemas"][schema]["properties"];
+        for (name, schema) in properties.as_object().unwrap() {
+            let ask = |value: Value| {
+                let body = serde_json::json!({ name.as_str(): value }).to_string();
+                status(agent, method, path, &body)
+            };
+            let what = format!("{path} {name}");
+            for (bound, step) in [("maximum", 1.0), ("minimum", -1.0)] {
+                if let Some(value) = schema[bound].as_f64() {
+                    // Whole numbers stay whole.
+                    let beyond = schema[bound].as_i64().map_or_else(
+                        || Value::from(value + step),
+                        |value| Value::from(value + if step > 0.0 { 1 } else { -1 }),
+                    );
+                    check(&what, ask(schema[bound].clone()), ask(beyond));
+                }
+            }
+            if let Some(longest) = schema["maxLength"].as_u64() {
+                let longest = usize::try_from(longest).unwrap();
+                let text = |length| Value::from("a".repeat(length));
+                check(&what, ask(text(longest)), ask(text(longest + 1)));
+            }
+        }
+    }
+}
+
+/// The program of a Python package in a place of its own.
+fn schemathesis() -> Command {
+    let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
+    let program = target.join("tools/schemathesis/bin/st");
+    assert!(
+        program.exists(),
+        "{} is missing: run `.ci/prerequisites.sh test`",
+        program.display()
+    );
+    Command::new(program)
+}
+
+#[test]
+fn no_request_that_can_be_thought_of_gets_an_answer_that_is_not_documented() {
+    let directory = tempfile::tempdir().unwrap();
+    let config = directory.path().join("config.yaml");
+    std::fs::write(&config, "watch: [/chatter, /listed]\n").unwrap();
+    let mut agent = LocalAgent::start(
+        &mut rp(),
+        &["--config", config.to_str().unwrap(), "--speed", "max"],
+    );
+    agent.wait_for_log("ready");
+    let document = format!("http://{}/openapi.json", agent.api);
+    // Streams do not end: how they are answered is tested elsewhere.
+    let output = schemathesis()
+        .arg("--config-file")
+        .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/schemathesis.toml"))
+        .args(["run", &document])
+        .args(["--checks", "all", "--seed", "1", "--max-examples", "10"])
+        .args(["--no-color", "--exclude-path", "/events"])
+        .args(["--exclude-path", "/samples", "--exclude-path", "/live"])
+        .args(["--exclude-path", "/topics/{topic}/messages"])
+        .current_dir(directory.path())
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stdout);
+    assert!(output.status.success(), "{said}\n{}", agent.log());
+    assert_eq!(ask(&agent, "GET", "/health", "", "").status, 200);
+}

@@ -1,0 +1,79 @@
+//! How a recording of many topics begins and is interrupted.
+
+use super::*;
+
+#[test]
+fn a_recording_of_many_topics_begins_and_ends_without_a_question_for_each() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+    agent.wait_for_metric("ros2_topics{domain_id=\"0\",kind=\"topic\"}", |topics| {
+        topics == MANY as f64
+    });
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    let began = recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    eprintln!("{MANY} topics: began after {began:?}, ended after {ended:?}");
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(began < Duration::from_secs(3), "began after {began:?}");
+    // It waits up to two seconds for messages on their way: a replay's clock is not that of now.
+    assert!(ended < Duration::from_secs(5), "ended after {ended:?}");
+    assert_eq!(messages(&bag).len(), MANY);
+}
+
+#[test]
+fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    // An agent that takes the request and never answers.
+    let socket = directory.path().join("api.sock");
+    let listener = UnixListener::bind(&socket).unwrap();
+    let bag = directory.path().join("bag");
+    let mut command = rp();
+    command
+        .args(["bag", "record", "-a", "--socket"])
+        .arg(&socket);
+    let mut recording = Recording::of(command.arg("-o").arg(&bag));
+    let asked = listener.accept().unwrap();
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(2), "{:#?}", recording.said);
+    assert!(ended < Duration::from_secs(5), "{ended:?}");
+    assert!(
+        recording.said[0].contains("no bag was made"),
+        "{:?}",
+        recording.said
+    );
+    assert!(!bag.exists());
+    drop(asked);
+}
+
+#[test]
+fn a_second_interrupt_ends_a_recording_at_once_with_its_report() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("many.pcap");
+    many_topics(&capture);
+    let agent = LocalAgent::replay(&mut rp(), &capture, &["--speed", "1"]);
+    let bag = directory.path().join("bag");
+    let mut recording = Recording::start(agent.api, &bag, &[]);
+    recording.wait_for("Recording...");
+    std::thread::sleep(Duration::from_secs(2));
+    // The first one waits for messages on their way until a time that a replay never reaches.
+    recording.signal("-INT");
+    recording.wait_for("Completing the bag");
+    recording.signal("-INT");
+    let (status, ended) = recording.end();
+    assert_eq!(status.code(), Some(0), "{:#?}", recording.said);
+    assert!(ended < Duration::from_millis(1500), "{ended:?}");
+    let count: usize = messages(&bag).values().map(Vec::len).sum();
+    assert!(count > 0);
+    let report = format!("{count} messages in {}", bag.display());
+    assert!(
+        recording.said.iter().any(|line| line.ends_with(&report)),
+        "{:#?}",
+        recording.said
+    );
+}

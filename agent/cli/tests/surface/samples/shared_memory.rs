@@ -1,0 +1,142 @@
+//! Samples that were read from shared memory.
+
+use super::*;
+
+#[test]
+fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    robot.at += SECOND;
+    let large = payload(3000);
+    for start in [1, 2, 3] {
+        robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
+    }
+    // Looks at two ports may find them in another order, and twice.
+    for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
+        robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
+    }
+    let expected = [1, 2, 3].map(|number| (ALICE, number, Ok(large.clone())));
+    let given = robot.given();
+    let (whole, missed): (Vec<_>, Vec<_>) = given.into_iter().partition(|each| each.2.is_ok());
+    // The last fragment of 2 was seen while one was missing: it was given up then.
+    assert_eq!(whole, [expected[0].clone(), expected[2].clone()]);
+    assert_eq!(missed, [(ALICE, 2, Err(MissedReason::NotCaptured))]);
+    robot.receive(Message::from(ALICE).data(WRITER, 4, &payload(24)));
+    // A fragment was overwritten before it was read.
+    for start in [1, 3] {
+        robot.receive(Message::from(ALICE).fragment(WRITER, 5, start, 1000, &large));
+    }
+    let expected = [
+        (ALICE, 4, Ok(payload(24))),
+        (ALICE, 5, Err(MissedReason::NotCaptured)),
+    ];
+    assert_eq!(robot.given(), expected);
+}
+
+#[test]
+fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_for_them() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let look = |robot: &mut Robot, number| {
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
+    };
+    for number in [1, 2, 5] {
+        look(&mut robot, number);
+    }
+    let given = |number| (ALICE, number, Ok(small.clone()));
+    assert_eq!(robot.given(), [given(1), given(2), given(5)]);
+    let sent = robot.at;
+    let now = Timestamp(sent + SECOND / 20);
+    robot.observer.input(Input::Time(now));
+    assert!(robot.observer.dispatched_until(now).0 < sent);
+    // One of them comes late.
+    look(&mut robot, 3);
+    assert_eq!(robot.given(), [given(3)]);
+    let now = Timestamp(sent + SECOND);
+    robot.observer.input(Input::Time(now));
+    assert_eq!(robot.observer.dispatched_until(now), now);
+    let not_captured = (ALICE, 4, Err(MissedReason::NotCaptured));
+    assert_eq!(robot.given(), [not_captured]);
+    // The end of a capture waits for nothing.
+    look(&mut robot, 8);
+    robot.observer.input(Input::End);
+    assert_eq!(
+        robot.given(),
+        [given(8), (ALICE, 6, Err(MissedReason::NotCaptured))]
+    );
+}
+
+#[test]
+fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
+    let mut robot = Robot::new(Settings::default());
+    let reader = Guid::new(BOB, EntityId([0, 0, 0x12, 0x04]));
+    let subscription = forge::endpoint(reader, "rt/points", "a::msg::dds_::B_", true);
+    robot.put(Message::from(BOB).data(SEDP_READERS, 1, &subscription));
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    let mut times = BTreeMap::new();
+    // 3 is sent again, 5 was not seen.
+    for number in [1, 2, 4, 6, 3, 7] {
+        robot.receive(Message::from(ALICE).data(WRITER, number, &small));
+        times.insert(number, robot.at);
+    }
+    let now = Timestamp(robot.at + SECOND / 20);
+    robot.observer.input(Input::Time(now));
+    let end = Timestamp(robot.at + SECOND);
+    let mut given = Vec::new();
+    for now in [now, end] {
+        robot.observer.input(Input::Time(now));
+        for each in robot.observer.drain().samples {
+            match each.outcome {
+                SampleOutcome::Sample(sample) => {
+                    given.push((sample.sequence_number, Some(sample.time.0)));
+                }
+                SampleOutcome::Missed(missed) => given.push((missed.first, None)),
+            }
+        }
+    }
+    // A reader gets 4 with 3, and 6 when it came: it may have had 5.
+    let repaired = times[&3];
+    let expected = [
+        (1, Some(times[&1])),
+        (2, Some(times[&2])),
+        (3, Some(repaired)),
+        (4, Some(repaired + 1)),
+        (5, None),
+        (6, Some(repaired + 2)),
+        (7, Some(times[&7])),
+    ];
+    assert_eq!(given, expected);
+}
+
+#[test]
+fn the_last_samples_in_shared_memory_are_known_by_the_acknowledgement_of_their_reader() {
+    let mut robot = Robot::new(Settings::default());
+    robot.subscribe(&["/points"], Depth::Payloads);
+    let small = payload(24);
+    robot.receive(Message::from(ALICE).data(WRITER, 1, &small));
+    // INFO_DST and ACKNACK: all below 4.
+    let body = [
+        &[0, 0, 0x12, 0x04][..],
+        &WRITER.0,
+        &[0, 0, 0, 0, 4, 0, 0, 0],
+        &[0; 8],
+    ];
+    let acknowledgement = Message::from(BOB).submessage(0x0e, 0x01, &ALICE.0);
+    robot.receive(acknowledgement.submessage(0x06, 0x03, &body.concat()));
+    robot
+        .observer
+        .input(Input::Time(Timestamp(robot.at + SECOND / 20)));
+    robot
+        .observer
+        .input(Input::Time(Timestamp(robot.at + SECOND)));
+    let mut missed = 0;
+    for each in robot.observer.drain().samples {
+        if let SampleOutcome::Missed(each) = each.outcome {
+            assert_eq!(each.reason, MissedReason::NotCaptured);
+            missed += each.samples;
+        }
+    }
+    assert_eq!(missed, 2);
+}

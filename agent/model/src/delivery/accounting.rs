@@ -1,0 +1,127 @@
+//! What the decisions about a delivery's samples change: counters, causes, the journal.
+
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::Receiver;
+use crate::cause::LossCause;
+use crate::journal::{DeliveryLoss, Journal};
+use crate::loss_causes::LossCauses;
+use crate::reception::Decision;
+use crate::route::Route;
+use crate::snapshot::{Breakdown, Delivered, Direction};
+
+/// What is counted of all deliveries of a writer.
+#[derive(Clone, Debug, Default)]
+pub struct Totals {
+    /// At receivers.
+    pub received: Delivered,
+    /// On their way out.
+    pub sent: Delivered,
+    /// Where the time went.
+    pub breakdown: Option<Box<Breakdown>>,
+    /// Whether anything arrived, or left.
+    pub seen: [bool; 2],
+}
+
+impl Totals {
+    /// Those of one direction.
+    pub const fn of(&mut self, direction: Direction) -> &mut Delivered {
+        match direction {
+            Direction::Sent => &mut self.sent,
+            Direction::Received => &mut self.received,
+        }
+    }
+
+    /// Adds all of `other`.
+    pub fn add(&mut self, other: &Self) {
+        self.received.add(&other.received);
+        self.sent.add(&other.sent);
+        for (seen, also) in self.seen.iter_mut().zip(other.seen) {
+            *seen |= also;
+        }
+        if let Some(breakdown) = &other.breakdown {
+            self.breakdown.get_or_insert_default().add(breakdown);
+        }
+    }
+}
+
+/// What decisions change.
+pub(super) struct Accounting<'a> {
+    pub(super) tally: &'a mut Delivered,
+    pub(super) loss_causes: &'a mut LossCauses,
+    pub(super) totals: &'a mut Delivered,
+    pub(super) journal: &'a mut Journal,
+    pub(super) writer: Guid,
+    pub(super) receiver: Receiver,
+    pub(super) main: Route,
+    pub(super) at: Timestamp,
+    /// A loss stays pending until then.
+    pub(super) until: Option<Timestamp>,
+}
+
+impl Accounting<'_> {
+    pub(super) fn take(&mut self, decision: Decision) {
+        if self.main.direction == Direction::Sent {
+            return;
+        }
+        let (first, last) = match decision {
+            Decision::Lost { first, last, .. } => (first, last),
+            Decision::Irrelevant(number) => {
+                self.loss_causes.forget(number);
+                self.tally.irrelevant += 1;
+                self.totals.irrelevant += 1;
+                return;
+            }
+        };
+        let mut runs = Vec::new();
+        self.loss_causes.explain(first, last, |first, last, cause| {
+            runs.push((first, last, cause));
+        });
+        for (first, last, cause) in runs {
+            match cause {
+                Some(cause) => self.lose(cause, first, last),
+                None => self.wait(first, last),
+            }
+        }
+    }
+
+    /// Nothing is known yet of where these died.
+    pub(super) fn wait(&mut self, first: u64, last: u64) {
+        let Some(until) = self.until else {
+            self.lose(LossCause::BeforeHost, first, last);
+            return;
+        };
+        self.tally.pending += last - first + 1;
+        self.totals.pending += last - first + 1;
+        if let Some((first, last)) = self.loss_causes.wait(first, last, until) {
+            self.conclude(first, last);
+        }
+    }
+
+    /// What was pending died before it came to this host.
+    pub(super) fn conclude(&mut self, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.pending = self.tally.pending.saturating_sub(count);
+        self.totals.pending = self.totals.pending.saturating_sub(count);
+        self.lose(LossCause::BeforeHost, first, last);
+    }
+
+    pub(super) fn lose(&mut self, cause: LossCause, first: u64, last: u64) {
+        let count = last - first + 1;
+        self.tally.lose(cause, count);
+        self.totals.lose(cause, count);
+        self.journal.lose_delivery(DeliveryLoss {
+            at: self.at,
+            writer: self.writer,
+            participant: match self.receiver {
+                Receiver::Participant(prefix) => Some(prefix),
+                Receiver::Route(_) => None,
+            },
+            socket: self.main.socket,
+            destination: self.main.destination.socket_address(),
+            cause,
+            first,
+            last,
+        });
+    }
+}

@@ -1,0 +1,112 @@
+//! Whom an event of discovery is about, in the forms in which counters, journal and events keep it.
+
+use ros2probe_wire::DomainId;
+use std::sync::Arc;
+
+use ros2probe_wire::Guid;
+use ros2probe_wire::discovery::Role;
+
+use super::facts::{Endpoint, ParticipantProxy};
+use crate::churn::{Entity, Event};
+use crate::event::{EventKind, bounded, bounded_shared};
+
+/// One participant, endpoint or node.
+pub(super) struct DiscoveredEntity<'a> {
+    pub(super) domain_id: DomainId,
+    pub(super) guid: Guid,
+    details: EntityDetails<'a>,
+}
+
+/// What it is. An endpoint's names are shared, for it is often taken out before it is told of.
+enum EntityDetails<'a> {
+    Participant(&'a ParticipantProxy),
+    Endpoint(Role, Arc<str>, Arc<str>),
+    Node(&'a Arc<str>),
+}
+
+impl<'a> DiscoveredEntity<'a> {
+    pub(super) const fn participant(
+        domain_id: DomainId,
+        guid: Guid,
+        proxy: &'a ParticipantProxy,
+    ) -> Self {
+        Self {
+            domain_id,
+            guid,
+            details: EntityDetails::Participant(proxy),
+        }
+    }
+
+    pub(super) fn endpoint(guid: Guid, endpoint: &Endpoint) -> DiscoveredEntity<'static> {
+        let names = [&endpoint.topic, &endpoint.message_type];
+        let [topic, message_type] = names.map(Arc::clone);
+        DiscoveredEntity {
+            domain_id: endpoint.domain_id,
+            guid,
+            details: EntityDetails::Endpoint(endpoint.role, topic, message_type),
+        }
+    }
+
+    /// A node of this participant.
+    pub(super) const fn node(domain_id: DomainId, participant: Guid, name: &'a Arc<str>) -> Self {
+        Self {
+            domain_id,
+            guid: participant,
+            details: EntityDetails::Node(name),
+        }
+    }
+
+    pub(super) const fn entity(&self) -> Entity {
+        match self.details {
+            EntityDetails::Participant(_) => Entity::Participant,
+            EntityDetails::Endpoint(role, ..) => Entity::of(role),
+            EntityDetails::Node(_) => Entity::Node,
+        }
+    }
+
+    /// Topic of an endpoint, name of a node, empty for a participant.
+    pub(super) fn name(&self) -> Arc<str> {
+        match &self.details {
+            EntityDetails::Participant(_) => Arc::default(),
+            EntityDetails::Endpoint(_, topic, _) => Arc::clone(topic),
+            EntityDetails::Node(name) => Arc::clone(name),
+        }
+    }
+
+    /// This happened to it.
+    pub(super) fn event(&self, change: Event) -> EventKind {
+        let Self {
+            domain_id,
+            guid,
+            details,
+        } = self;
+        let (domain_id, guid) = (*domain_id, *guid);
+        match details {
+            EntityDetails::Participant(proxy) => {
+                let text = |text: &Option<Box<str>>| text.as_deref().map(bounded).map(Into::into);
+                EventKind::Participant {
+                    change,
+                    domain_id,
+                    guid,
+                    vendor: proxy.vendor,
+                    host: text(&proxy.host),
+                    process: text(&proxy.process_name),
+                }
+            }
+            EntityDetails::Endpoint(role, topic, message_type) => EventKind::Endpoint {
+                change,
+                domain_id,
+                guid,
+                role: *role,
+                topic: bounded_shared(topic),
+                message_type: bounded_shared(message_type),
+            },
+            EntityDetails::Node(name) => EventKind::Node {
+                change,
+                domain_id,
+                participant: guid,
+                name: bounded_shared(name),
+            },
+        }
+    }
+}

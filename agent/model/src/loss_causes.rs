@@ -1,0 +1,242 @@
+//! What is known to have died on this host of the samples of one receiver, and losses of which that
+//! may still become known.
+//!
+//! The kernel says at once when a socket had no room, and half a minute later when it gave up on
+//! IP fragments. A loss that may be of the second kind stays pending for that long.
+
+use std::collections::BTreeMap;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
+
+use super::cause::LossCause;
+use super::size::Size;
+
+/// Samples remembered of one receiver: a few seconds of a busy topic's losses.
+const SAMPLES: usize = 8192;
+/// Runs of pending samples of one receiver.
+const RUNS: usize = 1024;
+/// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
+pub const REASSEMBLY: u64 = 35 * SECOND;
+
+/// Both lists.
+#[derive(Debug, Default)]
+pub struct LossCauses {
+    known: BTreeMap<u64, KnownLoss>,
+    /// By the first of each run.
+    pending: BTreeMap<u64, Run>,
+}
+
+/// Where a sample, or part of it, died.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct KnownLoss {
+    /// Where, nearest to the reader.
+    pub cause: LossCause,
+    /// When the first part of it did.
+    pub at: Timestamp,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Run {
+    last: u64,
+    until: Timestamp,
+}
+
+impl LossCauses {
+    /// Entries and cap of both lists.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 2] {
+        // A new list does not compile before it has a place here.
+        let Self { known, pending } = self;
+        [
+            Size::new("loss_causes.known", known.len(), SAMPLES),
+            Size::new("loss_causes.pending", pending.len(), RUNS),
+        ]
+    }
+
+    /// Some or all of this sample died; whether an older one had to be forgotten for it.
+    pub fn note(&mut self, number: u64, cause: LossCause, at: Timestamp) -> bool {
+        let known_loss = self.known.entry(number).or_insert(KnownLoss { cause, at });
+        known_loss.cause = known_loss.cause.max(cause);
+        let is_full = self.known.len() > SAMPLES;
+        if is_full {
+            self.known.pop_first();
+        }
+        is_full
+    }
+
+    /// It came after all, or was excused.
+    pub fn forget(&mut self, number: u64) -> Option<KnownLoss> {
+        if self.known.is_empty() {
+            return None;
+        }
+        self.known.remove(&number)
+    }
+
+    /// Shows `first..=last` in runs that bear one cause; `None` = nothing known of them.
+    pub fn explain(
+        &mut self,
+        first: u64,
+        last: u64,
+        mut show: impl FnMut(u64, u64, Option<LossCause>),
+    ) {
+        let mut next = first;
+        while let Some((number, _)) = self.known.range(next..=last).next() {
+            let number = *number;
+            if number > next {
+                show(next, number - 1, None);
+            }
+            if let Some(known_loss) = self.known.remove(&number) {
+                show(number, number, Some(known_loss.cause));
+            }
+            next = number + 1;
+            if number == last {
+                return;
+            }
+        }
+        show(next, last, None);
+    }
+
+    /// All below are decided.
+    pub fn settled(&mut self, below: u64) {
+        if self
+            .known
+            .first_key_value()
+            .is_some_and(|(number, _)| *number < below)
+        {
+            self.known = self.known.split_off(&below);
+        }
+    }
+
+    /// The cause of these stays open until then. Gives what has to be decided now for it.
+    pub fn wait(&mut self, first: u64, last: u64, until: Timestamp) -> Option<(u64, u64)> {
+        if let Some((_, run)) = self.pending.range_mut(..first).next_back()
+            && run.last.checked_add(1) == Some(first)
+            && run.until == until
+        {
+            run.last = last;
+            return None;
+        }
+        self.pending.insert(first, Run { last, until });
+        if self.pending.len() <= RUNS {
+            return None;
+        }
+        self.pending
+            .pop_first()
+            .map(|(first, run)| (first, run.last))
+    }
+
+    /// Whether this one was pending; it is no more. One in the middle of a run stays where that would
+    /// make a run too many: its cause is decided with the others'.
+    pub fn resolve(&mut self, number: u64) -> bool {
+        let Some((first, run)) = self.pending.range(..=number).next_back() else {
+            return false;
+        };
+        let (first, run) = (*first, *run);
+        let splits = first < number && number < run.last;
+        if number > run.last || splits && self.pending.len() >= RUNS {
+            return false;
+        }
+        self.pending.remove(&first);
+        if first < number {
+            let last = number - 1;
+            self.pending.insert(first, Run { last, ..run });
+        }
+        if number < run.last {
+            self.pending.insert(number + 1, run);
+        }
+        true
+    }
+
+    /// What has been pending long enough.
+    pub fn due(&mut self, now: Timestamp) -> Vec<(u64, u64)> {
+        let mut due = Vec::new();
+        self.pending.retain(|first, run| {
+            let is_due = run.until <= now;
+            if is_due {
+                due.push((*first, run.last));
+            }
+            !is_due
+        });
+        due
+    }
+
+    /// Takes over what `other` knows.
+    pub fn absorb(&mut self, other: Self) {
+        for (number, known_loss) in other.known {
+            self.note(number, known_loss.cause, known_loss.at);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(seconds: u64) -> Timestamp {
+        Timestamp(seconds * 1_000_000_000)
+    }
+
+    fn explained(
+        loss_causes: &mut LossCauses,
+        first: u64,
+        last: u64,
+    ) -> Vec<(u64, u64, Option<LossCause>)> {
+        let mut runs = Vec::new();
+        loss_causes.explain(first, last, |first, last, cause| {
+            runs.push((first, last, cause));
+        });
+        runs
+    }
+
+    #[test]
+    fn the_cause_nearest_to_the_reader_is_borne() {
+        let mut loss_causes = LossCauses::default();
+        loss_causes.note(5, LossCause::Reassembly, at(1));
+        loss_causes.note(5, LossCause::SocketBuffer, at(2));
+        loss_causes.note(7, LossCause::SocketBuffer, at(2));
+        loss_causes.note(7, LossCause::Reassembly, at(3));
+        let socket = Some(LossCause::SocketBuffer);
+        assert_eq!(
+            explained(&mut loss_causes, 4, 7),
+            [(4, 4, None), (5, 5, socket), (6, 6, None), (7, 7, socket)]
+        );
+        assert_eq!(explained(&mut loss_causes, 4, 7), [(4, 7, None)]);
+    }
+
+    #[test]
+    fn what_is_pending_is_resolved_one_by_one() {
+        let mut loss_causes = LossCauses::default();
+        assert_eq!(loss_causes.wait(10, 12, at(5)), None);
+        assert_eq!(loss_causes.wait(13, 13, at(5)), None);
+        assert!(loss_causes.resolve(11) && !loss_causes.resolve(11) && !loss_causes.resolve(14));
+        assert!(loss_causes.due(at(4)).is_empty());
+        assert_eq!(loss_causes.due(at(5)), [(10, 10), (12, 13)]);
+        assert!(loss_causes.due(at(9)).is_empty());
+    }
+
+    #[test]
+    fn both_lists_are_bounded_and_what_is_pushed_out_is_told() {
+        let mut loss_causes = LossCauses::default();
+        let forgotten = (0..10_000)
+            .filter(|number| loss_causes.note(2 * number, LossCause::SocketBuffer, at(1)));
+        assert_eq!(forgotten.count(), 10_000 - SAMPLES);
+        let told = (0..2000).filter_map(|number| loss_causes.wait(2 * number, 2 * number, at(1)));
+        assert_eq!(told.count(), 2000 - RUNS);
+    }
+
+    #[test]
+    fn resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be() {
+        let mut loss_causes = LossCauses::default();
+        loss_causes.wait(1, 100_000, at(1));
+        let resolved = (1..50_000).filter(|number| loss_causes.resolve(2 * number));
+        assert_eq!(resolved.count(), RUNS - 1);
+        let [_, pending] = loss_causes.sizes();
+        assert_eq!(pending.entries, pending.cap);
+        // At the ends of a run there is no split, and a hole makes room for none.
+        assert!(loss_causes.resolve(1));
+        let left = loss_causes.due(at(1)).into_iter();
+        let left: u64 = left.map(|(first, last)| last - first + 1).sum();
+        assert_eq!(left, 100_000 - RUNS as u64);
+    }
+}

@@ -1,0 +1,197 @@
+//! Who announces which address.
+//!
+//! Bounded twice: of one participant the addresses that were announced last are kept, for who
+//! forges its announcements may name a new one each time; of all together likewise.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use ros2probe_wire::GuidPrefix;
+
+use crate::route::Destination;
+use crate::size::Size;
+
+/// All addresses.
+#[derive(Debug)]
+pub(super) struct AnnouncedAddresses {
+    announcers: HashMap<Destination, Announcer>,
+    /// By the age of the announcement.
+    ages: BTreeMap<u64, Destination>,
+    /// The same ages, by participant.
+    own: BTreeSet<(GuidPrefix, u64)>,
+    age: u64,
+    limit: usize,
+    each: usize,
+    evictions: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Announcer {
+    prefix: GuidPrefix,
+    previous: Option<GuidPrefix>,
+    /// Two participants announce it in turn.
+    contested: bool,
+    age: u64,
+}
+
+impl AnnouncedAddresses {
+    /// None; at most `limit`, and `each` of one participant.
+    pub(super) fn new(limit: usize, each: usize) -> Self {
+        Self {
+            announcers: HashMap::new(),
+            ages: BTreeMap::new(),
+            own: BTreeSet::new(),
+            age: 0,
+            limit,
+            each,
+            evictions: 0,
+        }
+    }
+
+    /// This participant announces this address; whether an answer may have changed.
+    pub(super) fn put(&mut self, prefix: GuidPrefix, destination: Destination) -> bool {
+        self.age += 1;
+        let before = self.announcers.get(&destination).copied();
+        let (previous, contested) = match before {
+            Some(before) if before.prefix == prefix => (before.previous, before.contested),
+            Some(before) => (
+                Some(before.prefix),
+                before.contested || before.previous == Some(prefix),
+            ),
+            None => (None, false),
+        };
+        if let Some(before) = before {
+            self.ages.remove(&before.age);
+            self.own.remove(&(before.prefix, before.age));
+        }
+        let age = self.age;
+        let announcer = Announcer {
+            prefix,
+            previous,
+            contested,
+            age,
+        };
+        self.announcers.insert(destination, announcer);
+        self.ages.insert(age, destination);
+        self.own.insert((prefix, age));
+        let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
+        let oldest = own().next().filter(|_| own().count() > self.each);
+        if let Some((_, age)) = oldest.copied() {
+            self.give_up(age);
+        }
+        if self.ages.len() > self.limit
+            && let Some((age, _)) = self.ages.first_key_value()
+        {
+            self.give_up(*age);
+        }
+        before.is_none_or(|before| before.prefix != prefix)
+    }
+
+    /// Forgets those of participants that are no more.
+    pub(super) fn retain(&mut self, is_there: impl Fn(&GuidPrefix) -> bool) {
+        self.announcers
+            .retain(|_, announcer| is_there(&announcer.prefix));
+        self.own.retain(|(prefix, _)| is_there(prefix));
+        let announcers = &self.announcers;
+        self.ages
+            .retain(|_, destination| announcers.contains_key(destination));
+    }
+
+    /// The participant that alone announces this address.
+    pub(super) fn owner(&self, destination: &Destination) -> Option<GuidPrefix> {
+        let announcer = self.announcers.get(destination)?;
+        (!announcer.contested).then_some(announcer.prefix)
+    }
+
+    /// Entries and cap of every table.
+    pub(super) fn sizes(&self) -> [Size; 4] {
+        // A new table does not compile before it has a place here.
+        let Self {
+            announcers,
+            ages,
+            own,
+            age: _,
+            limit,
+            each,
+            evictions: _,
+        } = self;
+        let chunks: Vec<_> = own.iter().map(|(prefix, _)| prefix).collect();
+        let of_one = chunks.chunk_by(|before, after| before == after);
+        let of_one = of_one.map(<[_]>::len).max().unwrap_or(0);
+        [
+            Size::new("receivers.addresses", announcers.len(), *limit),
+            Size::new("receivers.addresses.ages", ages.len(), *limit),
+            Size::new("receivers.addresses.own", own.len(), *limit),
+            Size::new("receivers.addresses.participant", of_one, *each),
+        ]
+    }
+
+    /// Entries, cap, and addresses given up because of a cap.
+    pub(super) fn size(&self) -> (usize, usize, u64) {
+        (self.announcers.len(), self.limit, self.evictions)
+    }
+
+    fn give_up(&mut self, age: u64) {
+        let announcer = self
+            .ages
+            .remove(&age)
+            .and_then(|destination| self.announcers.remove(&destination));
+        if let Some(announcer) = announcer {
+            self.own.remove(&(announcer.prefix, age));
+            self.evictions += 1;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ALICE: GuidPrefix = GuidPrefix([1; 12]);
+    const BOB: GuidPrefix = GuidPrefix([2; 12]);
+
+    fn at(port: u16) -> Destination {
+        Destination {
+            port,
+            ..Destination::default()
+        }
+    }
+
+    #[test]
+    fn a_participant_whose_address_is_another_each_time_pushes_out_its_own_alone() {
+        let mut addresses = AnnouncedAddresses::new(100, 16);
+        addresses.put(BOB, at(7411));
+        (8000..9000).for_each(|port| assert!(addresses.put(ALICE, at(port))));
+        assert_eq!(addresses.size(), (17, 100, 1000 - 16));
+        assert_eq!(addresses.owner(&at(7411)), Some(BOB));
+        assert_eq!(addresses.owner(&at(8999)), Some(ALICE));
+        assert_eq!(addresses.owner(&at(8000)), None);
+        assert_eq!((addresses.ages.len(), addresses.own.len()), (17, 17));
+    }
+
+    #[test]
+    fn of_all_participants_together_the_oldest_address_goes_first() {
+        let mut addresses = AnnouncedAddresses::new(4, 2);
+        for number in 0..100 {
+            let prefix = GuidPrefix([number; 12]);
+            addresses.put(prefix, at(number.into()));
+            addresses.put(BOB, at(7411));
+        }
+        assert_eq!(addresses.size(), (4, 4, 97));
+        assert_eq!(addresses.owner(&at(7411)), Some(BOB));
+        addresses.retain(|prefix| *prefix == BOB);
+        assert_eq!(addresses.size().0, 1);
+        assert_eq!((addresses.ages.len(), addresses.own.len()), (1, 1));
+    }
+
+    #[test]
+    fn an_address_that_two_announce_in_turn_is_nobody_s() {
+        let mut addresses = AnnouncedAddresses::new(4, 2);
+        addresses.put(ALICE, at(1));
+        assert!(addresses.put(BOB, at(1)));
+        assert_eq!(addresses.owner(&at(1)), Some(BOB));
+        assert!(!addresses.put(BOB, at(1)));
+        assert!(addresses.put(ALICE, at(1)));
+        assert_eq!(addresses.owner(&at(1)), None);
+        assert_eq!(addresses.size(), (1, 4, 0));
+    }
+}

@@ -1,0 +1,176 @@
+//! Numbers away from a writer's live run: a jump, a restart, or a forgery.
+//!
+//! One datagram proves nothing. The run is believed after a handful of datagrams that continue it
+//! while the live run stands still, or after a HEARTBEAT of a later datagram that agrees.
+
+use ros2probe_wire::Timestamp;
+
+use super::FAR;
+
+/// So many datagrams make a run believed.
+pub(super) const CONFIRMATIONS: u8 = 5;
+/// Numbers remembered of one run: a datagram may bring several.
+const KEPT: usize = 32;
+/// Copies of one datagram reach several sockets within this time.
+const COPIES: i64 = 5_000_000;
+
+/// The run, and what HEARTBEAT and GAP say beyond what is believed of them at once.
+#[derive(Debug, Default)]
+pub(super) struct UnconfirmedRun {
+    run: Run,
+    /// Datagrams that continued it since the live run last went on.
+    evidence: u8,
+    /// The first and the last of them.
+    since: Timestamp,
+    latest: Timestamp,
+    /// One past lastSN of a HEARTBEAT, and when it came.
+    claim: (u64, Timestamp),
+}
+
+/// Samples that were counted before their numbers were believed.
+#[derive(Clone, Debug, Default)]
+pub struct Run {
+    /// Numbers, and whether the sample came whole; in ascending order once believed.
+    pub numbers: Vec<(u64, bool)>,
+    /// What a GAP passed over on the way there.
+    pub(super) gap: (u64, u64),
+}
+
+impl UnconfirmedRun {
+    /// Most numbers that there may be.
+    pub(super) const CAP: usize = KEPT;
+
+    /// Numbers of the run.
+    pub(super) const fn len(&self) -> usize {
+        let Self {
+            run,
+            evidence: _,
+            since: _,
+            latest: _,
+            claim: _,
+        } = self;
+        let Run { numbers, gap: _ } = run;
+        numbers.len()
+    }
+
+    /// Takes in the number of a sample. Returns whether it opens a run, and whether it is new.
+    pub(super) fn note(&mut self, number: u64, now: Timestamp) -> (bool, bool) {
+        let numbers = &self.run.numbers;
+        if numbers.iter().any(|(known, _)| *known == number) {
+            return (false, false);
+        }
+        let last = numbers.last().map(|(last, _)| *last);
+        let opens = last.is_none_or(|last| last.abs_diff(number) > FAR);
+        if opens {
+            self.run.numbers.clear();
+            self.evidence = 0;
+        }
+        let numbers = &mut self.run.numbers;
+        if numbers.len() >= KEPT {
+            numbers.remove(0);
+        }
+        numbers.push((number, false));
+        if self.evidence == 0 {
+            self.since = now;
+        }
+        if self.evidence == 0 || now != self.latest {
+            self.evidence += 1;
+            self.latest = now;
+        }
+        (opens, true)
+    }
+
+    /// Marks a sample as whole. Returns whether that is new.
+    pub(super) fn complete(&mut self, number: u64) -> bool {
+        let mut numbers = self.run.numbers.iter_mut();
+        let Some((_, is_whole)) = numbers.find(|(known, _)| *known == number) else {
+            return false;
+        };
+        !std::mem::replace(is_whole, true)
+    }
+
+    /// Whether this number continues a run below `live`.
+    pub(super) fn is_continued(&self, number: u64, live: u64) -> bool {
+        let last = self.run.numbers.last().filter(|_| self.evidence > 0);
+        last.is_some_and(|(last, _)| *last < live && last.abs_diff(number) <= FAR)
+    }
+
+    pub(super) fn is_whole(&self, number: u64) -> bool {
+        self.run.numbers.contains(&(number, true))
+    }
+
+    pub(super) const fn is_confirmed(&self) -> bool {
+        self.evidence >= CONFIRMATIONS
+    }
+
+    /// The live run went on: the evidence counts from zero again.
+    pub(super) const fn contradict(&mut self) {
+        self.evidence = 0;
+        self.claim = (0, Timestamp(0));
+    }
+
+    /// Whether a HEARTBEAT with lastSN `next - 1` confirms the run. The live run's next number
+    /// is `live`. A run below `live` is not confirmed by a HEARTBEAT that reaches it.
+    pub(super) fn agrees(&self, next: u64, live: u64, now: Timestamp) -> bool {
+        let end = self.end();
+        let is_ahead = end > live;
+        self.evidence > 0
+            && now > self.since
+            && (end..=end.saturating_add(FAR)).contains(&next)
+            && (is_ahead || next < live)
+    }
+
+    /// Whether an earlier HEARTBEAT had the same lastSN, or one at most `reach` lower.
+    pub(super) fn is_claimed(&mut self, next: u64, reach: u64, now: Timestamp) -> bool {
+        let (claimed, at) = self.claim;
+        let is_same = claimed > 0 && (claimed..=claimed.saturating_add(reach)).contains(&next);
+        if !is_same {
+            self.claim = (next, now);
+        }
+        is_same && now.nanoseconds_since(at) >= COPIES
+    }
+
+    /// Keeps what a GAP passes over.
+    pub(super) const fn pass_over(&mut self, start: u64, end: u64) {
+        self.run.gap = (start, end);
+    }
+
+    /// The samples that came, in ascending order.
+    pub(super) fn into_run(self) -> Run {
+        let mut run = self.run;
+        run.numbers.sort_unstable();
+        if run
+            .numbers
+            .first()
+            .is_none_or(|(first, _)| run.gap.1 > *first)
+        {
+            // It contradicts the samples that came.
+            run.gap = (0, 0);
+        }
+        run
+    }
+
+    /// One past its highest number.
+    fn end(&self) -> u64 {
+        let numbers = self.run.numbers.iter();
+        numbers.map(|(number, _)| number + 1).max().unwrap_or(0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_numbers_of_a_long_run_are_forgotten() {
+        let mut unconfirmed = UnconfirmedRun::default();
+        for number in 1..=100 {
+            assert_eq!(unconfirmed.note(number, Timestamp(1)), (number == 1, true));
+        }
+        assert_eq!(unconfirmed.len(), UnconfirmedRun::CAP);
+        // It counts again.
+        assert_eq!(unconfirmed.note(1, Timestamp(1)), (false, true));
+        assert_eq!(unconfirmed.note(100, Timestamp(1)), (false, false));
+        assert_eq!(unconfirmed.evidence, 1);
+    }
+}

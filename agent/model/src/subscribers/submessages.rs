@@ -1,0 +1,119 @@
+//! What is said of samples without bringing any: HEARTBEAT, GAP, ACKNACK, and what the kernel gave up.
+
+use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
+
+use super::{Subscribers, WriterContext, delivery_context, is_open};
+use crate::delivery::Receiver;
+use crate::receivers::Matched;
+use crate::route::Destination;
+use crate::routes::KnownRoute;
+
+impl Subscribers {
+    /// A HEARTBEAT came this way.
+    pub(super) fn heartbeat(
+        &mut self,
+        index: usize,
+        (receiver, matched): (Receiver, Matched),
+        heartbeat: Heartbeat<'_>,
+        context: &mut WriterContext<'_>,
+    ) {
+        let Some(known) = self.routes.get(index) else {
+            return;
+        };
+        // It goes where data goes, unless a reader is known to be there.
+        let holds = known.has_data || matched == Matched::Yes;
+        let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
+        let opens =
+            matched == Matched::Yes && (is_meant || !known.route.destination.is_multicast());
+        let place = match self.find(receiver) {
+            None if opens => self.delivery(index, receiver, context),
+            found => found,
+        };
+        let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) else {
+            return;
+        };
+        if is_meant || holds {
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+            delivery.heartbeat(heartbeat, &mut context);
+        }
+    }
+
+    /// A GAP came this way.
+    pub(super) fn gap(
+        &mut self,
+        index: usize,
+        receiver: Receiver,
+        gap: Gap<'_>,
+        context: &mut WriterContext<'_>,
+    ) {
+        let Some(known) = self.routes.get(index) else {
+            return;
+        };
+        if !known.route.destination.is_multicast() && self.open > 0 {
+            for delivery in self.deliveries.iter_mut().filter(|each| is_open(each)) {
+                let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+                delivery.gap(gap, &mut context);
+            }
+        }
+        let place = self.find(receiver);
+        if let Some(delivery) = place.and_then(|place| self.deliveries.get_mut(place)) {
+            let mut context = delivery_context(&mut self.totals, self.reassembled, context);
+            delivery.gap(gap, &mut context);
+        }
+    }
+
+    /// A reader asks for samples again: what fills its gaps from now on is a retransmission.
+    pub(super) fn requested(&mut self, acknack: AckNack<'_>) {
+        let reader = acknack.record().reader().prefix;
+        for delivery in &mut self.deliveries {
+            if is_open(delivery) || delivery.receiver() == Receiver::Participant(reader) {
+                delivery.requested(acknack);
+            }
+        }
+    }
+
+    /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all of
+    /// its readers have came there, whether it was seen or not.
+    pub(super) fn acknowledged(&mut self, acknack: AckNack<'_>) {
+        let prefix = acknack.record().reader().prefix;
+        let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);
+        for delivery in &mut self.deliveries {
+            let below = match delivery.receiver() {
+                Receiver::Participant(receiver) if receiver == prefix => below,
+                Receiver::Route(route) if route.is_open() => self.acknowledgements.floor(|_| true),
+                _ => None,
+            };
+            if let Some(below) = below {
+                delivery.acknowledged(below);
+            }
+        }
+    }
+
+    /// The kernel gave up on some IP fragments of a datagram with this.
+    pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) {
+        self.reassembled = true;
+        let record = sample.record();
+        let destination = Destination::of(record);
+        let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        for delivery in &mut self.deliveries {
+            let leads_there = |known: &KnownRoute| {
+                !known.route.is_sent()
+                    && known.route.destination == destination
+                    && match delivery.receiver() {
+                        Receiver::Route(route) => known.route == route,
+                        Receiver::Participant(prefix) => {
+                            known.owner == Some(prefix) && directed.is_none_or(|to| to == prefix)
+                        }
+                    }
+            };
+            if self.routes.iter().any(leads_there) {
+                let number = sample.sequence_number();
+                delivery.not_reassembled(
+                    number,
+                    &mut delivery_context(&mut self.totals, self.reassembled, context),
+                );
+            }
+        }
+    }
+}

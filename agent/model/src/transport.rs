@@ -1,0 +1,184 @@
+//! How messages pass between a writer and a reader, as far as both announce it: by the network, or
+//! by a way of their host that a network does not show.
+//!
+//! It says what they would use, not what they did: whether their QoS fits is theirs to find out.
+
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+
+use super::discovery::{Discovery, Endpoint};
+use super::snapshot::{EndpointFacts, Transport, TransportCount};
+
+/// Pairs of one topic that are looked at; the rest is taken to be as those are.
+const MAX_PAIRS: usize = 1024;
+/// After so long a participant that told no nodes is none of ROS, and an endpoint is nobody's.
+const NODES_WITHIN: u64 = 30 * SECOND;
+const NODE_WITHIN: u64 = 10 * SECOND;
+
+/// Pairs of these writers and readers by how messages pass between them; each endpoint gets the
+/// ways it has a part in.
+pub(super) fn transports(
+    discovery: &Discovery,
+    writers: &mut [EndpointFacts],
+    readers: &mut [EndpointFacts],
+) -> Vec<TransportCount> {
+    let mut counts = Transport::ALL.map(|transport| TransportCount {
+        transport,
+        pairs: 0,
+    });
+    let mut left = MAX_PAIRS;
+    for writer in writers.iter_mut() {
+        for reader in readers.iter_mut().take(left) {
+            left -= 1;
+            let Some(transport) = transport(discovery, writer.guid, reader.guid) else {
+                continue;
+            };
+            writer.transports |= transport.bit();
+            reader.transports |= transport.bit();
+            let count = counts.iter_mut().find(|count| count.transport == transport);
+            if let Some(count) = count {
+                count.pairs += 1;
+            }
+        }
+    }
+    if left == 0 {
+        let all = readers
+            .iter()
+            .fold(0, |all, reader| all | reader.transports);
+        let unseen = writers.iter_mut().chain(readers);
+        for endpoint in unseen.filter(|endpoint| endpoint.transports == 0) {
+            endpoint.transports = all;
+        }
+    }
+    counts.into_iter().filter(|count| count.pairs > 0).collect()
+}
+
+/// Whether somebody on this writer's host may get its samples through Fast DDS's shared memory, who
+/// need not be known to read it.
+pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
+    let participants = discovery.participants();
+    let own = participants.get(&writer.prefix);
+    if vendor(discovery, writer.prefix) != VendorId::EPROSIMA {
+        return false;
+    }
+    own.is_none_or(|own| own.proxy.shared_memory)
+        && participants.iter().any(|(prefix, other)| {
+            *prefix != writer.prefix
+                && other.proxy.shared_memory
+                && is_one_host(VendorId::EPROSIMA, *prefix, writer.prefix)
+        })
+}
+
+/// Whether names are lacking that may be said in shared memory just now: those of a participant's
+/// nodes, or those of the node that an endpoint belongs to.
+pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
+    let is_new =
+        |first_seen: Timestamp, patience: u64| first_seen.0.saturating_add(patience) > now.0;
+    let participants = discovery.participants();
+    participants.values().any(|participant| {
+        participant.proxy.shared_memory
+            && participant.nodes.is_empty()
+            && is_new(participant.first_seen, NODES_WITHIN)
+    }) || discovery.endpoints().iter().any(|(guid, endpoint)| {
+        is_new(endpoint.first_seen, NODE_WITHIN)
+            && participants
+                .get(&guid.prefix)
+                .is_some_and(|participant| participant.proxy.shared_memory)
+    })
+}
+
+fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transport> {
+    let endpoints = discovery.endpoints();
+    let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
+    if is_one_process(discovery, writer.prefix, reader.prefix) {
+        return Some(Transport::SameProcess);
+    }
+    let (vendor, other) = (
+        vendor(discovery, writer.prefix),
+        vendor(discovery, reader.prefix),
+    );
+    if vendor != other || !is_one_host(vendor, writer.prefix, reader.prefix) {
+        return Some(Transport::Network);
+    }
+    let shared_memory = |guid: Guid, endpoint: &Endpoint| {
+        let participant = discovery.participants().get(&guid.prefix);
+        let default = participant.is_some_and(|known| known.proxy.shared_memory);
+        endpoint.shared_memory.unwrap_or(default)
+    };
+    Some(if of_writer.data_sharing && of_reader.data_sharing {
+        Transport::DataSharing
+    } else if !(shared_memory(writer, of_writer) && shared_memory(reader, of_reader)) {
+        Transport::Network
+    } else if vendor == VendorId::EPROSIMA {
+        Transport::SharedMemory
+    } else {
+        Transport::Iceoryx
+    })
+}
+
+fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
+    let participant = discovery.participants().get(&prefix);
+    let [first, second, ..] = prefix.0;
+    participant.map_or(VendorId([first, second]), |known| known.proxy.vendor)
+}
+
+/// One participant, or two of one process: Fast DDS has vendor, host and process in the first eight
+/// bytes, the process's number in the fifth and sixth and something random in the next two.
+fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
+    one == other
+        || vendor(discovery, one) == VendorId::EPROSIMA
+            && vendor(discovery, other) == VendorId::EPROSIMA
+            && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
+}
+
+/// Fast DDS has vendor and host in the first four bytes. Others do not tell: only who announces
+/// shared memory is asked about.
+fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
+    vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::discovery::Caps;
+    use super::*;
+
+    fn prefix(bytes: [u8; 12]) -> GuidPrefix {
+        GuidPrefix(bytes)
+    }
+
+    #[test]
+    fn fast_dds_tells_host_and_process_by_its_prefix_and_others_do_not() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let one = prefix([1, 15, 13, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        let sibling = prefix([1, 15, 13, 4, 9, 9, 7, 7, 1, 0, 0, 0]);
+        let neighbour = prefix([1, 15, 13, 4, 8, 9, 7, 7, 0, 0, 0, 0]);
+        let unknown_writer = prefix([1, 15, 14, 4, 9, 9, 7, 7, 0, 0, 0, 0]);
+        assert!(is_one_process(&discovery, one, one));
+        assert!(is_one_process(&discovery, one, sibling));
+        assert!(!is_one_process(&discovery, one, neighbour));
+        assert!(is_one_host(VendorId::EPROSIMA, one, neighbour));
+        assert!(!is_one_host(VendorId::EPROSIMA, one, unknown_writer));
+        let (cyclone, other) = (
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1]),
+            prefix([1, 16, 0, 0, 1, 1, 1, 1, 2, 1, 1, 1]),
+        );
+        assert!(is_one_process(&discovery, cyclone, cyclone));
+        assert!(!is_one_process(&discovery, cyclone, other));
+    }
+
+    #[test]
+    fn endpoints_that_are_not_known_are_no_pair() {
+        let discovery = Discovery::new(Caps {
+            participants: 1,
+            endpoints: 1,
+            nodes: 1,
+        });
+        let guid = Guid::default();
+        assert_eq!(transport(&discovery, guid, guid), None);
+    }
+}

@@ -1,0 +1,239 @@
+//! The walk over a whole datagram in user space, where all of its bytes are at hand.
+
+use super::{
+    Bytes as _, EXTRA_LEN, MAGIC, MAX_MESSAGE, Order, Step, Walk, octets_to_inline_qos, step,
+};
+use crate::cursor::{Cursor, Reason, WireError};
+use crate::guid::GuidPrefix;
+use crate::parameters::ParameterList;
+use crate::record::{Handover, Record, flag};
+use crate::rtps::{InlineQos, Payload, SubmessageFlags, VendorId};
+use crate::time::Timestamp;
+
+/// What is known of a datagram besides its bytes.
+#[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
+pub struct Envelope {
+    /// Nanoseconds since the Unix epoch, of the frame that completed the datagram.
+    pub time: u64,
+    /// Destination address, IPv4-mapped for IPv4.
+    pub destination: [u8; 16],
+    /// Destination UDP port.
+    pub destination_port: u16,
+    /// Interface index, 0 = unknown.
+    pub interface: u32,
+    /// Sent by this host.
+    pub outgoing: bool,
+    /// Came in several IP fragments.
+    pub fragmented: bool,
+    /// Source UDP port, 0 = unknown.
+    pub source_port: u16,
+    /// Cookie of the socket that it was seen at; 0 = unknown.
+    pub socket: u64,
+    /// Seen at a socket, not on an interface.
+    pub host: bool,
+}
+
+impl Envelope {
+    /// Of a datagram that the kernel filter handed over with `record`, complete at `time`.
+    #[must_use]
+    pub fn of_handover(record: &Record, time: Timestamp) -> Self {
+        Self {
+            time: time.0,
+            destination: zerocopy::transmute!(record.destination),
+            destination_port: record.destination_port,
+            interface: record.interface,
+            outgoing: record.flags & flag::OUTGOING != 0,
+            fragmented: true,
+            source_port: record.source_port,
+            ..Self::default()
+        }
+    }
+
+    /// The record fields that concern the whole datagram.
+    fn record(&self) -> Record {
+        const IPV4_MAPPED: [u8; 12] = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff];
+        let mut flags = 0;
+        if self.fragmented {
+            flags |= flag::FRAGMENTED;
+        }
+        if self.outgoing {
+            flags |= flag::OUTGOING;
+        }
+        if !self.destination.starts_with(&IPV4_MAPPED) {
+            flags |= flag::IPV6;
+        }
+        if self.host {
+            flags |= flag::HOST;
+        }
+        Record {
+            time: self.time,
+            destination: zerocopy::transmute!(self.destination),
+            destination_port: self.destination_port,
+            interface: self.interface,
+            source_port: self.source_port,
+            socket: self.socket,
+            flags,
+            ..Record::default()
+        }
+    }
+}
+
+/// One endpoint submessage of a datagram in user space.
+#[derive(Clone, Copy, Debug)]
+pub struct Found<'a> {
+    /// As the kernel filter would report it.
+    pub record: Record,
+    /// The whole submessage behind its header: fixed fields, inline QoS and payload.
+    pub body: &'a [u8],
+    /// Serialized payload of DATA, the fragment bytes of DATA_FRAG; empty for the others.
+    pub payload: &'a [u8],
+}
+
+impl<'a> Found<'a> {
+    /// The flags octet of the submessage's header.
+    #[must_use]
+    pub const fn flags(&self) -> SubmessageFlags {
+        SubmessageFlags(self.record.submessage_flags)
+    }
+
+    /// Payload of a DATA, as its flags D and K say what it is (RTPS 2.5, 9.4.5.4).
+    #[must_use]
+    pub const fn payload(&self) -> Payload<'a> {
+        let flags = self.flags();
+        if flags.contains(SubmessageFlags::DATA) {
+            Payload::Data(self.payload)
+        } else if flags.contains(SubmessageFlags::KEY) {
+            Payload::Key(self.payload)
+        } else {
+            Payload::None
+        }
+    }
+
+    /// Inline QoS of a DATA or DATA_FRAG, none if flag Q is not set; `vendor` decides what the
+    /// vendor-specific parameters mean.
+    ///
+    /// # Errors
+    /// The parameter list is malformed, also behind those parameters that the walk followed.
+    pub fn inline_qos(&self, vendor: VendorId) -> Result<InlineQos, WireError> {
+        let flags = self.flags();
+        if !flags.contains(SubmessageFlags::INLINE_QOS) {
+            return Ok(InlineQos::default());
+        }
+        let mut cursor = Cursor::new(self.body, flags.endianness());
+        let error = cursor.error("octetsToInlineQos", Reason::Truncated);
+        let [extra] = self.body.words::<1>(0).ok_or(error)?;
+        let octets = octets_to_inline_qos(Order::of(flags.0.into()), extra);
+        let offset = usize::try_from(EXTRA_LEN + octets).map_err(|_| error)?;
+        cursor.take("octetsToInlineQos", offset)?;
+        InlineQos::parse(ParameterList::inline(cursor), vendor)
+    }
+}
+
+/// How a walk in user space ended.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum Outcome {
+    /// To the datagram's end.
+    Complete,
+    /// No RTPS magic.
+    NotRtps,
+    /// A submessage contradicts the datagram's length; everything before it was reported.
+    Malformed,
+}
+
+/// Walks a whole datagram, any number of submessages, and shows every endpoint submessage to
+/// `show`. With `handover` the walk goes on where the kernel filter left off; bytes before that
+/// offset are not read. A GAP too long for one record is shown as two.
+pub fn datagram<'a>(
+    payload: &'a [u8],
+    envelope: &Envelope,
+    handover: Option<&Handover>,
+    mut show: impl FnMut(Found<'a>),
+) -> Outcome {
+    let length = u32::try_from(payload.len()).ok();
+    let Some(datagram_len) = length.filter(|length| *length <= MAX_MESSAGE) else {
+        return Outcome::Malformed;
+    };
+    let mut walk = Walk {
+        record: envelope.record(),
+        ..Walk::default()
+    };
+    if let Some(handover) = handover {
+        walk.begin(prefix_words(handover.source), datagram_len);
+        walk.destination = prefix_words(handover.destination);
+        walk.offset = handover.offset;
+        walk.timestamp = handover.timestamp;
+    } else {
+        let Some([magic, _version, source @ ..]) = payload.words::<5>(0) else {
+            return Outcome::NotRtps;
+        };
+        if magic != MAGIC {
+            return Outcome::NotRtps;
+        }
+        walk.begin(source, datagram_len);
+    }
+    walk.record.datagram_len = u16::try_from(datagram_len).unwrap_or(u16::MAX);
+    loop {
+        let start = walk.offset;
+        let step = step(&mut walk, &payload, datagram_len);
+        match step {
+            Step::End | Step::Later => return Outcome::Complete,
+            Step::Split | Step::Malformed => return Outcome::Malformed,
+            Step::Passed => {}
+            Step::Endpoint | Step::LongGap => {
+                let body = slice(payload, start + 4, walk.offset);
+                let payload_len = if walk.record.is_sample() {
+                    walk.record.payload_len
+                } else {
+                    0
+                };
+                let data = slice(payload, walk.offset - payload_len, walk.offset);
+                show(Found {
+                    record: walk.record,
+                    body,
+                    payload: data,
+                });
+                if step == Step::LongGap {
+                    let record = long_gap_tail(&walk.record, body);
+                    show(Found {
+                        record,
+                        body,
+                        payload: &[],
+                    });
+                }
+            }
+        }
+    }
+}
+
+/// The second record of a GAP whose set has more than [`Record::BITMAP_BITS`] bits: the same set
+/// from there on, with an empty range before it.
+fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
+    let order = Order::of(record.submessage_flags.into());
+    let gap_list_base = u64::from(record.payload_len) << 32 | u64::from(record.encapsulation);
+    let base = gap_list_base.wrapping_add(Record::BITMAP_BITS.into());
+    // reader, writer, gapStart, base, numBits, then five words that the first record holds
+    let map = |index: u32| {
+        body.words::<1>(28 + 20 + 4 * index)
+            .map_or(0, |[word]| order.word(word))
+    };
+    Record {
+        sequence_number: base,
+        payload_len: (base >> 32) as u32,
+        encapsulation: base as u32,
+        stamp_seconds: record.stamp_seconds - Record::BITMAP_BITS,
+        stamp_nanoseconds: map(0),
+        fragment_start: map(1),
+        fragments: map(2),
+        sample_size: 0,
+        status_info: 0,
+        ..*record
+    }
+}
+
+fn slice(bytes: &[u8], start: u32, end: u32) -> &[u8] {
+    bytes.get(start as usize..end as usize).unwrap_or(&[])
+}
+
+fn prefix_words(prefix: GuidPrefix) -> [u32; 3] {
+    zerocopy::transmute!(prefix)
+}
