@@ -10,6 +10,7 @@
 )]
 
 use std::fs;
+use std::sync::LazyLock;
 
 use regex::Regex;
 use ros2probe_testing::repository;
@@ -100,10 +101,10 @@ fn sentences(text: &str) -> (Vec<(usize, String)>, Vec<(usize, String)>) {
 
 /// A text without its code, targets of links and emphasis.
 fn plain(text: &str) -> String {
-    let code = Regex::new("`[^`]*`").unwrap();
-    let link = Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap();
-    let text = code.replace_all(text, "code");
-    link.replace_all(&text, "$1").replace("**", "")
+    static CODE: LazyLock<Regex> = LazyLock::new(|| Regex::new("`[^`]*`").unwrap());
+    static LINK: LazyLock<Regex> = LazyLock::new(|| Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap());
+    let text = CODE.replace_all(text, "code");
+    LINK.replace_all(&text, "$1").replace("**", "")
 }
 
 #[test]
