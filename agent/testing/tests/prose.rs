@@ -46,8 +46,11 @@ const EXCEPTIONS: [(&str, &str); 0] = [];
 /// Documents of this project's own prose, as folders of Markdown files.
 const FOLDERS: [&str; 5] = [".", "docs", "deploy", "dashboards", "config"];
 
-/// Sentences of a document with the line on which their paragraph begins; those of tables apart.
-fn sentences(text: &str) -> (Vec<(usize, String)>, Vec<(usize, String)>) {
+/// Sentences, each with the line on which its paragraph begins.
+type Sentences = Vec<(usize, String)>;
+
+/// The sentences of a document: of its paragraphs, and of its tables.
+fn sentences(text: &str) -> (Sentences, Sentences) {
     let (mut paragraphs, mut cells) = (Vec::new(), Vec::new());
     let (mut is_code, mut is_generated, mut is_open) = (false, false, false);
     for (number, line) in text.lines().enumerate() {
