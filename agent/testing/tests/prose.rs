@@ -10,6 +10,7 @@
 )]
 
 use std::fs;
+use std::sync::LazyLock;
 
 use regex::Regex;
 use ros2probe_testing::repository;
@@ -45,8 +46,11 @@ const EXCEPTIONS: [(&str, &str); 0] = [];
 /// Documents of this project's own prose, as folders of Markdown files.
 const FOLDERS: [&str; 5] = [".", "docs", "deploy", "dashboards", "config"];
 
-/// Sentences of a document with the line on which their paragraph begins; those of tables apart.
-fn sentences(text: &str) -> (Vec<(usize, String)>, Vec<(usize, String)>) {
+/// Sentences, each with the line on which its paragraph begins.
+type Sentences = Vec<(usize, String)>;
+
+/// The sentences of a document: of its paragraphs, and of its tables.
+fn sentences(text: &str) -> (Sentences, Sentences) {
     let (mut paragraphs, mut cells) = (Vec::new(), Vec::new());
     let (mut is_code, mut is_generated, mut is_open) = (false, false, false);
     for (number, line) in text.lines().enumerate() {
@@ -100,10 +104,10 @@ fn sentences(text: &str) -> (Vec<(usize, String)>, Vec<(usize, String)>) {
 
 /// A text without its code, targets of links and emphasis.
 fn plain(text: &str) -> String {
-    let code = Regex::new("`[^`]*`").unwrap();
-    let link = Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap();
-    let text = code.replace_all(text, "code");
-    link.replace_all(&text, "$1").replace("**", "")
+    static CODE: LazyLock<Regex> = LazyLock::new(|| Regex::new("`[^`]*`").unwrap());
+    static LINK: LazyLock<Regex> = LazyLock::new(|| Regex::new(r"\[([^\]]*)\]\([^)]*\)").unwrap());
+    let text = CODE.replace_all(text, "code");
+    LINK.replace_all(&text, "$1").replace("**", "")
 }
 
 #[test]
