@@ -127,7 +127,9 @@ mod tests {
         // CPU time counts in ticks of 10 ms, and a busy machine gives them late.
         let later = (0_u64..)
             .map(|_| {
-                (0..10_000_000).for_each(|step| drop(std::hint::black_box(step)));
+                (0..10_000_000).for_each(|step| {
+                    std::hint::black_box(step);
+                });
                 read(local(&snapshot))
             })
             .find(|later| later.processes[0].cpu_seconds > process.cpu_seconds)
