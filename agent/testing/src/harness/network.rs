@@ -72,6 +72,12 @@ impl Namespace {
     pub fn alone() -> Result<Namespace> {
         sweep()?;
         let host = Namespace::create("robot", next_subnet(), 1, None)?;
+        // An IPv6 address that is confirmed seconds later is a change of the network, for which a
+        // browser ends its requests (ERR_NETWORK_CHANGED).
+        run(&format!(
+            "ip netns exec {} sysctl -qw net.ipv6.conf.default.accept_dad=0",
+            host.name
+        ))?;
         run(&format!(
             "ip -n {0} link add {INTERFACE} type veth peer name unplugged",
             host.name
