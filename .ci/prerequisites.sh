@@ -273,7 +273,7 @@ rust() {
     command -v cargo >/dev/null || die "Rust is missing: install it with rustup, then run this again"
     local version
     version=$(rustc --version | sed -E 's/rustc 1\.([0-9]+).*/\1/')
-    [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup toolchain install stable"
+    [ "$version" -ge 95 ] || die "rustc 1.95 or newer is needed, here is $(rustc --version): rustup update stable"
     cargo clippy --version >/dev/null 2>&1 || component clippy
     cargo fmt --version >/dev/null 2>&1 || component rustfmt
 }

@@ -43,8 +43,8 @@ pub enum Diagnosis<'a> {
     UnheardPublisher {
         /// Who.
         writer: String,
-        /// What is nearest to a match: somebody with other QoS (`qos`), of another `type`, in another
-        /// `partition`, or `nobody`.
+        /// The nearest candidate: an endpoint with other QoS (`qos`), of another `type`, in another
+        /// `partition`, or `nobody` where there is no endpoint.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.

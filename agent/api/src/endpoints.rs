@@ -17,7 +17,7 @@ pub struct Endpoint<'a> {
         schema(example = "010f2b7d6a474f3300000000.00001103")
     )]
     pub guid: String,
-    /// Its node, when `ros_discovery_info` told.
+    /// Its node, as `ros_discovery_info` announces it; null when unknown.
     pub node: Option<Cow<'a, str>>,
     /// ROS enclave of its participant; null means it is no ROS participant.
     pub enclave: Option<Cow<'a, str>>,

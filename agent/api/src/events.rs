@@ -31,7 +31,7 @@ pub struct Event<'a> {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Lagged {
-    /// How many; null when they were of another run of the agent, which nobody remembers.
+    /// Number of events; null when they belong to an earlier run of the agent.
     pub missed: Option<u64>,
     /// `overwritten` before they could be sent, or `restarted`: the id was of another run.
     pub reason: Cow<'static, str>,

@@ -25,7 +25,7 @@ pub struct Health {
     pub version: Cow<'static, str>,
     /// Where it looks: `host`, `wire` or `replay`.
     pub source: Cow<'static, str>,
-    /// The replay has come to the end of its capture: nothing changes any more.
+    /// The replay reached the end of its capture; no figure changes after that.
     pub finished: bool,
     /// Age of what is known; null while nothing is.
     pub age_seconds: Option<f64>,

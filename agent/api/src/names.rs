@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub struct Names<'a> {
     /// Unix time of the facts.
     pub timestamp_seconds: f64,
-    /// Every domain in which somebody is, also where only one was asked for.
+    /// Every domain with a participant, also when the request selects one.
     pub domains: BTreeSet<u32>,
     /// How many participants there are.
     pub participants: usize,

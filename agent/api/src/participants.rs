@@ -69,7 +69,7 @@ pub struct Participant<'a> {
 pub struct UnknownWriter<'a> {
     /// GUID.
     pub guid: String,
-    /// Implementation; empty where nothing tells.
+    /// DDS implementation; empty when unknown.
     pub vendor: Cow<'a, str>,
     /// Where it lives.
     #[serde(flatten)]

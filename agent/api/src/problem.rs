@@ -163,7 +163,7 @@ impl Code {
         }
     }
 
-    /// The end of its `type`, by which clients tell problems apart.
+    /// The last segment of its `type`, which identifies the kind of problem.
     #[must_use]
     pub const fn as_str(self) -> &'static str {
         self.parts().0

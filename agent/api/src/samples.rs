@@ -20,15 +20,15 @@ pub enum Line {
     Open(Open),
     /// A message.
     Sample(Sample),
-    /// Everything up to this time has been told.
+    /// The stream is complete up to this time.
     Clock(Clock),
-    /// Messages that are not told.
+    /// Messages that the stream lacks.
     Missed(Missed),
     /// The last line.
     End(End),
 }
 
-/// What is there when the stream begins; topics that appear later are told as well.
+/// Topics known at the start of the stream. Messages of later topics need no new line here.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Open {
@@ -49,7 +49,7 @@ pub struct OpenTopic {
     pub types: Vec<String>,
 }
 
-/// A message, told once.
+/// One message. Each message has one line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = SampleFacts))]
 pub struct Sample {
@@ -79,7 +79,7 @@ pub struct Sample {
     /// Bytes of the serialized message, encapsulation and padding included.
     pub size: u32,
     /// Present and true where it was seen in shared memory by looking now and then: the numbers
-    /// before it that were not told may have been sent all the same.
+    /// before it that the stream lacks may have been sent all the same.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sampled: bool,
     /// So many raw bytes follow this line; null where payloads were not asked for.
@@ -125,11 +125,11 @@ pub struct OfferedQos {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Clock {
-    /// Everything captured up to here has been told.
+    /// The stream is complete up to this time, in nanoseconds since the Unix epoch.
     pub time_ns: i64,
 }
 
-/// Messages of one writer that are not told.
+/// Messages of one writer that the stream lacks.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MissedFacts))]
 pub struct Missed {
@@ -151,7 +151,7 @@ pub struct Missed {
     pub reason: MissedReason,
 }
 
-/// Why messages are not told.
+/// Why the stream lacks messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]

@@ -86,7 +86,7 @@ pub struct Action<'a> {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Party<'a> {
-    /// The node, when `ros_discovery_info` told.
+    /// The node, as `ros_discovery_info` announces it; null when unknown.
     pub node: Option<Cow<'a, str>>,
     /// Its participant.
     pub participant: String,

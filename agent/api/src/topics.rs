@@ -139,7 +139,7 @@ pub struct Delivery<'a> {
     /// Address and port.
     #[cfg_attr(feature = "openapi", schema(example = "10.0.0.2:7411"))]
     pub destination: String,
-    /// The receiver: participant, process or socket; empty where nothing tells receivers apart.
+    /// The receiver: participant, process or socket; empty where receivers cannot be distinguished.
     pub subscriber: Cow<'a, str>,
     /// Readers of the topic in that participant.
     pub readers: Vec<String>,

@@ -6,12 +6,12 @@
 
 mod persistence;
 
-use ros2probe_wire::DomainId;
 use std::collections::HashSet;
 use std::io;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use arc_swap::{ArcSwap, ArcSwapOption};
+use ros2probe_wire::DomainId;
 
 use crate::config::{Limit, ManyGlobs, Watch, Watchlist, check_globs};
 use crate::events::{AgentEvent, EventLog};

@@ -1,9 +1,9 @@
 //! How often participants, endpoints and nodes came and went: the counters behind an alert on a
 //! flapping robot. Bounded: few kinds, and no more domains than ports allow.
 
-use ros2probe_wire::DomainId;
 use std::collections::BTreeMap;
 
+use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::Role;
 
 use super::size::Size;

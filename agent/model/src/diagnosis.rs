@@ -11,12 +11,11 @@ mod examiner;
 mod matching;
 mod nodes;
 
-use ros2probe_wire::DomainId;
 use std::cmp::Ordering;
 use std::sync::Arc;
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::{DomainId, Guid};
 
 use super::topic_kind::TopicKind;
 pub use examiner::Examiner;

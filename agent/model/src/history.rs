@@ -4,12 +4,11 @@
 //! A second is immutable once it is taken: readers share it with the ring and never hold the
 //! capture up. Rows are bounded in number; seconds of many topics reach back less far.
 
-use ros2probe_wire::DomainId;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Timestamp};
 
 use super::histogram::Histogram;
 use super::rate::SECONDS as WINDOW;

@@ -3,10 +3,10 @@
 //! A subscription's choice, matched against topics as they appear. It decides nothing about
 //! measuring beyond that: the watchlist has its own patterns.
 
-use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
 use regex::bytes::{Regex, RegexBuilder};
+use ros2probe_wire::DomainId;
 
 use super::glob;
 use super::topic::Naming;

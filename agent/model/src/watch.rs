@@ -1,10 +1,10 @@
 //! What to watch and what to expect of it: plain data, already checked, and the matcher that tells
 //! which entries cover a topic.
 
-use ros2probe_wire::DomainId;
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use ros2probe_wire::DomainId;
 use serde::{Deserialize, Serialize};
 
 use crate::glob;

@@ -1,12 +1,12 @@
 //! From shape to meaning: what the types and ranges of the shape cannot say.
 
-use ros2probe_wire::DomainId;
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use globset::Glob;
+use ros2probe_wire::DomainId;
 
 use super::check::check;
 use super::document::Node;

@@ -1,7 +1,6 @@
 //! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
 //! the configuration allows and nowhere else.
 
-use ros2probe_wire::DomainId;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
@@ -31,6 +30,7 @@ use crate::subscriptions::{
 use ros2probe_bag::{Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
+use ros2probe_wire::DomainId;
 
 /// Ended ones whose report is kept.
 const ENDED: usize = 16;

@@ -3,7 +3,6 @@
 //! Written by a thread of its own, the latest list only; who adds a watch does not wait for the
 //! disk. A file that cannot be used is kept aside and never ends the agent.
 
-use ros2probe_wire::DomainId;
 use std::io;
 use std::mem;
 use std::path::PathBuf;
@@ -11,6 +10,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use ros2probe_wire::DomainId;
 use serde::{Deserialize, Serialize};
 
 use crate::config::watch::{Expectations, Retain, Watch, check_pattern, check_trace};

@@ -1,13 +1,12 @@
 //! One topic: do its writers and readers understand each other, and has each one somebody?
 
-use ros2probe_wire::DomainId;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{DomainId, Guid};
 
 use super::examiner::{Findings, half_known};
 use super::matching::{self, Offer, Policies, Policy, Verdict};

@@ -1,10 +1,9 @@
 //! Whom an event of discovery is about, in the forms in which counters, journal and events keep it.
 
-use ros2probe_wire::DomainId;
 use std::sync::Arc;
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::discovery::Role;
+use ros2probe_wire::{DomainId, Guid};
 
 use super::facts::{Endpoint, ParticipantProxy};
 use crate::churn::{Entity, Event};

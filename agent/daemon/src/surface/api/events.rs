@@ -4,7 +4,6 @@
 //! holds nobody up. What is overwritten before a slow client came to it is told as `lagged`. Streams
 //! are limited in number and end when the agent ends.
 
-use ros2probe_wire::DomainId;
 use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -33,6 +32,7 @@ use crate::events::EventLog;
 use crate::events::{EVENTS, Position, Reader, Record, Value};
 use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
+use ros2probe_wire::DomainId;
 
 /// Streams at once, of all listeners: fewer than connections, so that requests find one.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);

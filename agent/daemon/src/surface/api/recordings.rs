@@ -3,7 +3,6 @@
 //! They lie below the directory that the configuration names; a name is a file name and nothing
 //! else. Whoever wants a bag elsewhere records with `rp bag record`.
 
-use ros2probe_wire::DomainId;
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
 
@@ -26,6 +25,7 @@ use crate::recording::{
     Command, FilterOptions, Recording, RecordingOptions, RecordingState, Refusal, Report,
 };
 use ros2probe_bag::{Form, Options, Storage};
+use ros2probe_wire::DomainId;
 
 /// How long an answer waits for a bag to be completed.
 const TIMEOUT: Duration = Duration::from_secs(10);

@@ -4,7 +4,6 @@
 //! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
 //! and is told, on a replay it is waited for. It holds nobody else up.
 
-use ros2probe_wire::DomainId;
 use std::collections::HashSet;
 use std::time::Duration;
 
@@ -13,7 +12,7 @@ use axum::extract::{Extension, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use ros2probe_wire::Guid;
+use ros2probe_wire::{DomainId, Guid};
 use serde::Deserialize;
 use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
