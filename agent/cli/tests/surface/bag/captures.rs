@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use ros2probe::bag::read;
-use ros2probe::recording::Report;
+use ros2probe_api::recording_report::Report;
 use serde_json::Value;
 
 use super::metadata;
