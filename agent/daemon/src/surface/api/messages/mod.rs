@@ -393,7 +393,7 @@ fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<J
 #[cfg(test)]
 mod tests {
     use ros2probe_wire::DomainId;
-    use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
+    use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
     use super::*;
