@@ -41,3 +41,6 @@ pub mod topics;
 pub mod watches;
 
 pub use open::Open;
+
+/// The highest domain id of DDS for which RTPS has ports (RTPS 2.5, 9.6.2.3).
+pub const MAX_DOMAIN_ID: u32 = 232;

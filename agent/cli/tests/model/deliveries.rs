@@ -1,15 +1,15 @@
 //! Deliveries under forged records and virtual time: what each receiver got, what it lost, and where
 //! that died. Every class by construction, and all of them adding up.
 
-use ros2probe::model::input::Input;
+use ros2probe_model::input::Input;
 use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, READER, Seen};
 use std::net::{Ipv4Addr, SocketAddrV4};
 
 use proptest::prelude::*;
-use ros2probe::model::cause::LossCause;
+use ros2probe_model::cause::LossCause;
 
-use ros2probe::model::observer::Settings;
-use ros2probe::model::snapshot::{Direction, SocketFacts};
+use ros2probe_model::observer::Settings;
+use ros2probe_model::snapshot::{Direction, SocketFacts};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 

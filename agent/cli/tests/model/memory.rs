@@ -5,12 +5,12 @@ use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use ros2probe::agent_facts::{AgentFacts, SourceKind};
-use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
-use ros2probe::config::{Limit, Limits, Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::surface::{Exposition, Format, MetricSources};
+use ros2probe_bag::{Options, Storage, TopicDescription, Writer};
+use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
+use ros2probe_daemon::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -140,7 +140,7 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
     let modelled = resident() - before;
     let sources = MetricSources::new(
         SourceKind::Host,
-        ros2probe::settings_cell::Settings {
+        ros2probe_daemon::settings_cell::Settings {
             histograms: true,
             ..Default::default()
         },

@@ -1,12 +1,12 @@
 //! The core under forged traffic and virtual time: what discovery, interest and measurement must
 //! do, each named after what went wrong in observers before.
 
-use ros2probe::config::{Expectations, Watch, Watchlist};
-use ros2probe::model::churn;
-use ros2probe::model::event::EventKind;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
+use ros2probe_daemon::config::{Expectations, Watch, Watchlist};
+use ros2probe_model::churn;
+use ros2probe_model::event::EventKind;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{Measurement, Snapshot, SocketFacts, TopicFacts, WatchState};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::MILLISECOND;
@@ -141,7 +141,7 @@ fn watchlist(patterns: &[&str]) -> Watchlist {
         expectations: Expectations::default(),
         per_subscriber: false,
         trace: 0.0,
-        retain: ros2probe::config::Retain::None,
+        retain: ros2probe_daemon::config::Retain::None,
     };
     Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
@@ -948,7 +948,7 @@ fn expectations_are_judged_in_the_sources_time() {
         expectations,
         per_subscriber: false,
         trace: 0.0,
-        retain: ros2probe::config::Retain::None,
+        retain: ros2probe_daemon::config::Retain::None,
     };
     world.observer.input(Input::Watchlist(Arc::new(
         Watchlist::new(vec![watch]).unwrap(),
