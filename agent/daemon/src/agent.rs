@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use ros2probe_capture::live::LiveSource;
-use ros2probe_capture::pcap::Speed;
+pub use ros2probe_capture::pcap::Speed;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::{Dialect, Library, Sources};

@@ -16,12 +16,13 @@ use ros2probe::client::{Agent, Outcome, Samples, Target};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::name::full_name;
 use ros2probe_api::participants::ParticipantList;
+use ros2probe_api::recordings::FilterOptions;
 use ros2probe_api::topics::TopicList;
 use ros2probe_bag::{self, Form, Options, Storage, Writer};
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::recording::{
-    Activity, Command, DiscoveredTopic, Filter, FilterOptions, Finished, GraphSnapshot, Recorder,
-    SampleRing, Sources, by_name, default_name, record, schema, unobserved_lines,
+    Activity, Command, DiscoveredTopic, Filter, Finished, GraphSnapshot, Recorder, SampleRing,
+    Sources, by_name, default_name, record, schema, shortfalls, unobserved_lines,
 };
 use ros2probe_message::{Library, Sources as Places};
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
@@ -525,7 +526,7 @@ impl<'a> RecordingOutput<'a> {
 /// What is in the bag and what is not. 1 where the storage refused something or nothing of a capture
 /// could be read, [`INCOMPLETE`] where something of a capture is not in the bag.
 fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> ExitCode {
-    for line in ended.report.shortfalls() {
+    for line in shortfalls(&ended.report) {
         log("WARN", &line);
     }
     if let Some(error) = &ended.error {

@@ -121,7 +121,7 @@ enum Nodes {
     /// Not asked for, since when.
     Open { since: Option<Timestamp> },
     /// Asked for.
-    FilterOptions(Timestamp),
+    Requested(Timestamp),
     /// This is the list.
     Told(Vec<NodeEntities>),
     /// It cannot be had.
@@ -444,7 +444,7 @@ impl Session {
             return;
         }
         let message = self.message().ask(NODES_READER, writer, last, [last], 1);
-        self.nodes = Nodes::FilterOptions(now);
+        self.nodes = Nodes::Requested(now);
         self.send(self.to_user("node request", message), outgoing);
     }
 
@@ -509,7 +509,7 @@ impl Session {
         }
         match &mut self.nodes {
             Nodes::Told(_) | Nodes::Missing => true,
-            Nodes::FilterOptions(asked) => since(*asked, now) >= NODES_TIMEOUT,
+            Nodes::Requested(asked) => since(*asked, now) >= NODES_TIMEOUT,
             Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_TIMEOUT,
         }
     }

@@ -12,12 +12,14 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::disk_quota::DiskQuota;
-use super::filter::{Candidate, Filter, FilterOptions};
+use super::filter::{Candidate, Filter};
 use super::graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic};
-use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
+use super::report::{add_missed, add_paused, add_written, custom_data, take_back};
 use super::sample_ring::SampleRing;
 use crate::subscriptions::line::qos;
 use crate::subscriptions::{Item, Topic};
+use ros2probe_api::recording_report::{NO_SUBSCRIBER, OtherDomain, Report};
+use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
@@ -312,7 +314,7 @@ impl<'a> Recorder<'a> {
                     return Ok(());
                 }
                 if self.place(&missed.topic)?.is_some() {
-                    self.report.missed(missed);
+                    add_missed(&mut self.report, missed);
                 }
                 Ok(())
             }
@@ -342,9 +344,9 @@ impl<'a> Recorder<'a> {
         // Before the report goes into the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
-            self.report.unwritten(topic, messages, bytes);
+            take_back(&mut self.report, topic, messages, bytes);
         }
-        let custom_data = self.report.custom_data();
+        let custom_data = custom_data(&self.report);
         let closed = self.writer.close_with(custom_data, compress);
         let (summary, close_error) = match closed {
             Ok(summary) => (Some(summary), None),
@@ -364,7 +366,7 @@ impl<'a> Recorder<'a> {
         let topic = &*sample.topic;
         if self.paused {
             if self.accepts(&topic.name) {
-                self.report.paused(&topic.name);
+                add_paused(&mut self.report, &topic.name);
             }
             return Ok(());
         }
@@ -384,7 +386,7 @@ impl<'a> Recorder<'a> {
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
             .write(id, sample.time, sent, sample.sequence_number, payload)?;
-        self.report.written(&topic.name, payload.len());
+        add_written(&mut self.report, &topic.name, payload.len());
         if sample.sampled && !self.sampled.contains(&*topic.name) {
             self.sampled.insert(topic.name.to_string());
         }

@@ -13,10 +13,9 @@ use jiff::Zoned;
 use tokio::sync::Notify;
 
 use super::disk_quota::DiskQuota;
-use super::filter::{Filter, FilterError, FilterOptions};
+use super::filter::{Filter, FilterError};
 use super::graph::{DiscoveredTopic, GraphSnapshot};
 use super::recorder::{Finished, Recorder, Sources};
-use super::report::Report;
 use super::session::{self, Activity, Command};
 use crate::config::{Limit, RecordingLimits};
 use crate::events::{AgentEvent, EventLog};
@@ -27,6 +26,8 @@ use crate::subscriptions::{
     ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
     Subscriptions,
 };
+use ros2probe_api::recording_report::Report;
+use ros2probe_api::recordings::{FilterOptions, RecordingState};
 use ros2probe_bag::{Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
@@ -127,18 +128,6 @@ pub struct Status {
     pub files: usize,
     /// Why it ended, if that was not asked for.
     pub error: Option<String>,
-}
-
-/// What a recording is doing.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum RecordingState {
-    /// Taking what comes.
-    #[default]
-    Recording,
-    /// Letting it go by.
-    Paused,
-    /// The bag is complete.
-    Ended,
 }
 
 /// Why nothing is recorded.

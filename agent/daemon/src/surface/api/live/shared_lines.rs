@@ -7,15 +7,16 @@ use std::time::Instant;
 
 use bytes::Bytes;
 
+use super::super::body_stream::write_line;
 use super::super::index::Index;
 use super::findings::{Circumstances, dropped, findings};
-use super::line::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
 use crate::agent_facts::Ability as Able;
 use crate::agent_facts::SourceKind;
 use crate::snapshot_cell::State;
 use crate::watches::InForce;
+use ros2probe_api::live::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use ros2probe_model::history::Past;
 
 /// One moment, and what it took to come there.
@@ -46,7 +47,7 @@ struct Part {
 impl Part {
     fn set(&mut self, line: &Line<'_>, round: u64) {
         let mut text = Vec::with_capacity(self.text.len());
-        line.write(&mut text);
+        write_line(&mut text, line);
         if self.text != text {
             (self.changed, self.text) = (round, text.into());
         }
@@ -101,9 +102,9 @@ impl SharedLines {
                     .map(|ability| {
                         let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
                         Ability(
-                            ability.label(),
+                            ability.label().into(),
                             agent.abilities.contains(ability).into(),
-                            reason.map(|(_, reason)| reason.as_str()),
+                            reason.map(|(_, reason)| reason.into()),
                         )
                     })
                     .collect(),
