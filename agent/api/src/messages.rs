@@ -1,7 +1,8 @@
 //! `/topics/{topic}/messages`: the lines of the stream of decoded messages, and
 //! `/topics/{topic}/definition`.
 //!
-//! `V` is a decoded message: the agent writes JSON text, and a client reads what it needs.
+//! The fields of a message are of any type `V`: the agent writes JSON text, and a client reads what
+//! it needs. The line of a message is a [`Message`] of them.
 
 use std::borrow::Cow;
 
@@ -11,11 +12,11 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesLine))]
 #[serde(rename_all = "snake_case")]
-pub enum Line<V> {
+pub enum Line<M> {
     /// The type of the messages that follow.
     Type(Definition),
     /// A message.
-    Message(Message<V>),
+    Message(M),
     /// Messages that will not be shown because their bytes are not known.
     Missed(Missed),
     /// The stream lives.

@@ -6,6 +6,7 @@
 //! else hears of it, it has no user endpoint, and nothing of it stays.
 
 pub mod announcements;
+mod announcer;
 pub mod message;
 pub mod participants;
 pub mod session;

@@ -9,7 +9,7 @@ use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
 use ros2probe_api::live::{Finding, Severity};
-use ros2probe_model::diagnosis::{Diagnosis, Policy};
+use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
 
@@ -168,27 +168,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             writer,
             reader,
             policies,
-        } => {
-            let differ: Vec<_> = policies
-                .iter()
-                .map(|policy| ends.difference(policy, *writer, *reader))
-                .collect();
-            let text = format!(
-                "{} sends nothing to {} on {}: {}",
-                ends.who(*writer),
-                ends.who(*reader),
-                topic.name,
-                differ.join("; ")
-            );
-            let about = format!("{}|{}|{writer}|{reader}", topic.domain_id, topic.dds_name);
-            Finding {
-                writer: Some(writer.to_string()),
-                reader: Some(reader.to_string()),
-                policies: policies.iter().map(|each| each.label().into()).collect(),
-                ..finding(kind, Severity::Error, &about, text)
-            }
-            .with_remedy("let the publisher offer what the subscription requests, or request less")
-        }
+        } => incompatible(kind, topic, (*writer, *reader), policies, ends),
         Diagnosis::TypeConflict { topic, types } => {
             let types: Vec<&str> = types.iter().map(AsRef::as_ref).collect();
             let text = format!(
@@ -234,12 +214,8 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             writer,
             reason,
         } => {
-            let who = ends.who(*writer);
-            let text = format!(
-                "{who} publishes {}, and {}",
-                topic.name,
-                lacks(reason.label(), "subscription")
-            );
+            let why = lacks(reason.label(), "subscription");
+            let text = format!("{} publishes {}, and {why}", ends.who(*writer), topic.name);
             let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
             Finding {
                 writer: Some(writer.to_string()),
@@ -251,12 +227,9 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reader,
             reason,
         } => {
+            let why = lacks(reason.label(), "publisher");
             let who = ends.who(*reader);
-            let text = format!(
-                "{who} subscribes to {}, and {}",
-                topic.name,
-                lacks(reason.label(), "publisher")
-            );
+            let text = format!("{who} subscribes to {}, and {why}", topic.name);
             let about = format!("{}|{}|{reader}", topic.domain_id, topic.dds_name);
             Finding {
                 reader: Some(reader.to_string()),
@@ -275,6 +248,35 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             .with_remedy("start all of its processes with the same ROS_DOMAIN_ID")
         }
     }
+}
+
+/// A writer and a reader whose QoS differs.
+fn incompatible(
+    kind: &'static str,
+    topic: &TopicKey,
+    (writer, reader): (Guid, Guid),
+    policies: &Policies,
+    ends: &Ends<'_>,
+) -> Finding {
+    let differ: Vec<_> = policies
+        .iter()
+        .map(|policy| ends.difference(policy, writer, reader))
+        .collect();
+    let text = format!(
+        "{} sends nothing to {} on {}: {}",
+        ends.who(writer),
+        ends.who(reader),
+        topic.name,
+        differ.join("; ")
+    );
+    let about = format!("{}|{}|{writer}|{reader}", topic.domain_id, topic.dds_name);
+    Finding {
+        writer: Some(writer.to_string()),
+        reader: Some(reader.to_string()),
+        policies: policies.iter().map(|each| each.label().into()).collect(),
+        ..finding(kind, Severity::Error, &about, text)
+    }
+    .with_remedy("let the publisher offer what the subscription requests, or request less")
 }
 
 /// Why an endpoint has no counterpart.

@@ -65,7 +65,7 @@ pub(super) struct Wanted {
 #[schema(value_type = Object)]
 pub(super) struct JsonText(Box<RawValue>);
 
-pub(super) type Line = messages::Line<JsonText>;
+pub(super) type Line = messages::Line<Message<JsonText>>;
 
 /// One client's stream.
 struct Stream {
