@@ -12,9 +12,9 @@ use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
 use ros2probe_daemon::discover::{converse, local_participant};
 use ros2probe_daemon::privilege;
 use ros2probe_model::input::Input;
+use ros2probe_model::naming::Naming;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::ParticipantFacts;
-use ros2probe_model::topic::Naming;
 use ros2probe_wire::discovery::Role;
 
 use crate::cli::Discover;

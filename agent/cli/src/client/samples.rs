@@ -13,7 +13,7 @@ use ros2probe_api::samples::{self, Line, Open};
 use ros2probe_daemon::subscriptions::line::announced;
 use ros2probe_daemon::subscriptions::{Item, Missed, MissedReason, NextItem, Topic};
 use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::payloads::Sample;
+use ros2probe_model::dispatch::Sample;
 
 /// Writers that are remembered; of further ones each message makes its own description.
 const WRITERS: usize = 65_536;

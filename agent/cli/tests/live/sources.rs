@@ -19,7 +19,7 @@ use ros2probe::capture::pcap::PcapReader;
 use ros2probe::capture::reassembly::Limits;
 use ros2probe::config::{Config, Watchlist};
 use ros2probe::model::input::Input;
-use ros2probe::model::journal::Loss;
+use ros2probe::model::loss::Loss;
 use ros2probe::model::observer::{Observer, Settings};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe_testing::harness::PREFIX;

@@ -15,9 +15,9 @@ use std::time::Instant;
 use crate::rp;
 use ros2probe::agent_facts::{AgentFacts, SourceKind};
 use ros2probe::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe::model::dispatch::{Dispatch, Sample, SampleOutcome};
 use ros2probe::model::input::Input;
 use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::payloads::{Dispatch, Sample, SampleOutcome};
 use ros2probe::model::snapshot::Snapshot;
 use ros2probe::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
