@@ -412,7 +412,7 @@ mod tests {
         );
         assert!(message("x/action/Y_SendGoal_Request").contains("x/action/Y.action"));
         assert!(message("x/srv/Y_Event").contains("x/srv/Y.srv"));
-        assert!(message("../etc/passwd").contains("no type's name"));
+        assert!(message("../etc/passwd").contains("not a type name"));
     }
 
     #[test]
