@@ -185,7 +185,7 @@ impl LiveSource {
             && let Err(error) = host.start(spawn)
         {
             let reason = in_words(&error);
-            tracing::warn!(reason, "a cgroup that is made anew is not seen");
+            tracing::warn!(reason, "a recreated cgroup is not observed");
         }
         self.start_shared_memory(spawn);
     }

@@ -144,7 +144,7 @@ impl Follow {
         if self.attached.take().is_some() {
             self.held.clear();
             let reason = format!("the cgroup {} was removed", self.path.display());
-            tracing::warn!("{reason}: its sockets are not seen until it is there again");
+            tracing::warn!("{reason}: its sockets are not observed until it is recreated");
             self.detach(reason);
         }
         if there.is_none() {
@@ -156,7 +156,7 @@ impl Follow {
                 *self.detached() = None;
                 tracing::info!(
                     cgroup = %self.path.display(),
-                    "the cgroup is there again: its sockets are seen"
+                    "the cgroup was recreated: its sockets are observed"
                 );
             }
             Err(error) => {

@@ -150,7 +150,7 @@ impl WireTap {
                 "the network namespace was removed or replaced: restart to observe the current one"
             );
         } else {
-            tracing::info!(%namespace, "the network namespace is there again");
+            tracing::info!(%namespace, "the network namespace is back");
         }
     }
 
@@ -346,7 +346,7 @@ impl IncludedInterfaces {
             if *was_there && !is_there {
                 tracing::warn!(interface = name, "the interface is gone");
             } else if is_there && !*was_there {
-                tracing::info!(interface = name, "the interface is there again");
+                tracing::info!(interface = name, "the interface is back");
             }
             *was_there = is_there;
         }
