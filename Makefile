@@ -56,7 +56,7 @@ test-fast: ## unit tests, model and surface, without root and namespaces: under 
 	@env -u CARGO_TARGET_$(HOST)_RUNNER cargo nextest run --workspace --profile fast
 
 test-corpus: ## tests against the whole corpus of captures in ROS2PROBE_FIXTURES (../shared/fixtures)
-	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --package ros2probe --run-ignored only --filterset 'test(corpus)'
+	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --package ros2probe --package ros2probe-model --run-ignored only --filterset 'test(corpus)'
 
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2

@@ -58,6 +58,7 @@ fn each_claim_of_the_threat_model_names_tests_that_exist() {
         "agent/cli/tests",
         "agent/cli/src",
         "agent/daemon/src",
+        "agent/model/tests",
         "wire/src",
         "wire/tests",
     ];

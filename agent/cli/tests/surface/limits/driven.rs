@@ -89,25 +89,25 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "PER_PARTICIPANT",
         "agent/model/src/discovery.rs",
-        "agent/cli/tests/model/observer.rs",
+        "agent/model/tests/model/observer/storms.rs",
         "a_storm_of_endpoints_of_one_participant_leaves_room_for_others",
     ],
     [
         "APPLICANTS",
         "agent/model/src/discovery.rs",
-        "agent/cli/tests/model/bounds.rs",
+        "agent/model/tests/model/bounds.rs",
         "no_table_grows_beyond_its_cap_whatever_is_forged",
     ],
     [
         "MATCHES_AT_ONCE",
         "agent/model/src/observer.rs",
-        "agent/cli/tests/model/observer.rs",
+        "agent/model/tests/model/observer/interest.rs",
         "lists_of_costly_globs_are_asked_a_part_at_a_time",
     ],
     [
         "PENDING",
         "agent/model/src/discovery.rs",
-        "agent/cli/tests/model/bounds.rs",
+        "agent/model/tests/model/bounds.rs",
         "no_table_grows_beyond_its_cap_whatever_is_forged",
     ],
     [
@@ -119,13 +119,13 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "MAX_ADDRESSES",
         "agent/model/src/receivers.rs",
-        "agent/cli/tests/model/bounds.rs",
+        "agent/model/tests/model/bounds.rs",
         "one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone",
     ],
     [
         "MAX_NAME_LEN",
         "agent/model/src/discovery.rs",
-        "agent/cli/tests/model/observer.rs",
+        "agent/model/tests/model/observer/storms.rs",
         "a_storm_of_forgeries_leaves_memory_bounded_and_real_topics_counted",
     ],
     [
@@ -149,13 +149,13 @@ pub const FIXED: &[[&str; 4]] = &[
     [
         "LIMIT",
         "agent/model/src/routes.rs",
-        "agent/cli/tests/model/deliveries.rs",
+        "agent/model/tests/model/deliveries/routes.rs",
         "a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted",
     ],
     [
         "READERS",
         "agent/model/src/acknowledgement.rs",
-        "agent/cli/tests/model/bounds.rs",
+        "agent/model/tests/model/bounds.rs",
         "no_table_grows_beyond_its_cap_whatever_is_forged",
     ],
     [

@@ -1,7 +1,7 @@
 //! The model's list of types that begin with a header, compared with their definitions.
 
-use ros2probe::message::{Dialect, Element, Library, Sources};
-use ros2probe::model::header::begins_with_header;
+use ros2probe_message::{Dialect, Element, Library, Sources};
+use ros2probe_model::header::begins_with_header;
 
 /// The types that come with the program; a unit test there finds every one of them in this list.
 #[test]

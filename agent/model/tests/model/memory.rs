@@ -1,16 +1,18 @@
-//! What deliveries take: resident memory of a process in which nothing else happens, as nextest runs
-//! each test. `cargo test` needs the filter `memory::`.
+//! What deliveries, all entries and recordings take, against the table of limits: resident memory of a
+//! process in which nothing else happens, as nextest runs each test. `cargo test` needs the filter
+//! `memory::`.
 
 use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-use ros2probe::agent_facts::{AgentFacts, SourceKind};
-use ros2probe::bag::{Options, Storage, TopicDescription, Writer};
-use ros2probe::config::{Limit, Limits, Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::surface::{Exposition, Format, MetricSources};
+use ros2probe_bag::{Options, Storage, TopicDescription, Writer};
+use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::input::Input;
+use ros2probe_model::limits::{Limit, Limits};
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -56,40 +58,26 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     println!("{each} bytes a delivery");
 }
 
-/// What the table of limits takes for granted, on a robot on which participants, endpoints, topics,
-/// unknown writers and flows are all at their caps, each with names of usual length: with what is
-/// shown of it and the one before, while a page is written.
-#[test]
-fn entries_take_no_more_than_the_table_of_limits_says() {
-    let _alone = ALONE.lock().unwrap();
-    let limits = Limits::default();
-    let before = resident();
-    let mut observer = Observer::new(Settings::default().with_limits(&limits));
-    observer.input(Input::Watchlist(Arc::new(
-        Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
-    )));
-    let mut now = host::START;
-    observer.input(Input::Time(Timestamp(now)));
-    let put = |observer: &mut Observer, now: u64, message: Message| {
+/// GUID prefix of a participant by its number.
+fn prefix(number: usize) -> GuidPrefix {
+    let [a, b, c, d] = u32::try_from(number).unwrap().to_be_bytes();
+    GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
+}
+
+/// Participants and endpoints at their caps, with names of usual length. Returns the writers.
+fn announce_all(observer: &mut Observer, limits: &Limits, now: u64) -> Vec<Guid> {
+    let mut put = |message: Message| {
         observer.input(Input::Datagram {
             envelope: &forge::multicast(now, 0),
             payload: &message.bytes(),
             handover: None,
         });
     };
-    let prefix = |number: usize| {
-        let [a, b, c, d] = u32::try_from(number).unwrap().to_be_bytes();
-        GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
-    };
     let each = limits.endpoints / limits.participants;
     let mut writers = Vec::new();
     for participant in 0..limits.participants {
         let payload = forge::participant(prefix(participant), 10_000, None);
-        put(
-            &mut observer,
-            now,
-            Message::from(prefix(participant)).data(SPDP, 1, &payload),
-        );
+        put(Message::from(prefix(participant)).data(SPDP, 1, &payload));
         for number in 0..each {
             let index = participant * each + number;
             let [_, _, high, low] = u32::try_from(number + 1).unwrap().to_be_bytes();
@@ -104,20 +92,17 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
                 SEDP_READERS
             };
             let number = number as u64 + 1;
-            put(
-                &mut observer,
-                now,
-                Message::from(prefix(participant)).data(by, number, &payload),
-            );
+            put(Message::from(prefix(participant)).data(by, number, &payload));
             writers.extend(is_writer.then_some(guid));
         }
     }
-    let mut strangers: Vec<_> = (0..limits.unknown_writers)
-        .map(|number| Guid::new(prefix(1 << 20 | number), EntityId([0, 0, 1, 3])))
-        .collect();
-    strangers.extend(&writers);
+    writers
+}
+
+/// Each writer sends 100 samples, ten a second, to a socket of its own. Returns the time after them.
+fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64 {
     for number in 1..=100 {
-        for (place, writer) in strangers.iter().enumerate() {
+        for (place, writer) in writers.iter().enumerate() {
             observer.input(Input::Record(&Record {
                 kind: kind::DATA,
                 submessage_flags: 5,
@@ -137,10 +122,32 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
         now += 100 * host::MILLISECOND;
         observer.input(Input::Time(Timestamp(now)));
     }
+    now
+}
+
+/// What the table of limits takes for granted, on a robot on which participants, endpoints, topics,
+/// unknown writers and flows are all at their caps, each with names of usual length: with what is
+/// shown of it and the one before, while a page is written.
+#[test]
+fn entries_take_no_more_than_the_table_of_limits_says() {
+    let _alone = ALONE.lock().unwrap();
+    let limits = Limits::default();
+    let before = resident();
+    let mut observer = Observer::new(Settings::default().with_limits(&limits));
+    observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
+    )));
+    observer.input(Input::Time(Timestamp(host::START)));
+    let announced = announce_all(&mut observer, &limits, host::START);
+    let mut writers: Vec<_> = (0..limits.unknown_writers)
+        .map(|number| Guid::new(prefix(1 << 20 | number), EntityId([0, 0, 1, 3])))
+        .collect();
+    writers.extend(announced);
+    let now = send_from_all(&mut observer, &writers, host::START);
     let modelled = resident() - before;
     let sources = MetricSources::new(
         SourceKind::Host,
-        ros2probe::settings_cell::Settings {
+        ros2probe_daemon::settings_cell::Settings {
             histograms: true,
             ..Default::default()
         },

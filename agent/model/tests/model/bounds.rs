@@ -7,13 +7,14 @@ use std::path::Path;
 use std::sync::Arc;
 
 use crate::allocator;
-use ros2probe::config::{Limits, Watch, Watchlist};
-use ros2probe::model::history::History;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::selection::{Depth, SampleRequest, Selection};
-use ros2probe::model::size::Size;
-use ros2probe::model::snapshot::SocketFacts;
+use ros2probe_model::history::History;
+use ros2probe_model::input::Input;
+use ros2probe_model::limits::Limits;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::size::Size;
+use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::walk::Envelope;
@@ -480,7 +481,7 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     }
     let mut listed = BTreeSet::new();
     tables(
-        &Path::new(env!("CARGO_MANIFEST_DIR")).join("../model/src"),
+        &Path::new(env!("CARGO_MANIFEST_DIR")).join("src"),
         &mut listed,
     );
     // Those two are in front of the model.

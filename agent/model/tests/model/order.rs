@@ -4,10 +4,10 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::Settings;
-use ros2probe::model::payloads::{MissedReason, SampleOutcome};
-use ros2probe::model::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::Settings;
+use ros2probe_model::payloads::{MissedReason, SampleOutcome};
+use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::model::host::{ALICE, BOB, Host, MILLISECOND, READER, START, Seen, WRITER};

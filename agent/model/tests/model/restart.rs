@@ -5,11 +5,11 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use ros2probe::config::{Watch, Watchlist};
-use ros2probe::model::discovery::Memory;
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::Snapshot;
+use ros2probe_model::discovery::Memory;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::Snapshot;
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;

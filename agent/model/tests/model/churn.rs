@@ -2,9 +2,10 @@
 //! up. Counted to the byte by an allocator that counts.
 
 use crate::allocator;
-use ros2probe::config::{Limits, Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_model::input::Input;
+use ros2probe_model::limits::Limits;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};

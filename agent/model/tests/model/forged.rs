@@ -5,10 +5,10 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
-use ros2probe::model::input::Input;
-use ros2probe::model::payloads::{Dispatch, SampleOutcome};
-use ros2probe::model::selection::{Depth, SampleRequest, Selection};
-use ros2probe::model::snapshot::Measurement;
+use ros2probe_model::input::Input;
+use ros2probe_model::payloads::{Dispatch, SampleOutcome};
+use ros2probe_model::selection::{Depth, SampleRequest, Selection};
+use ros2probe_model::snapshot::Measurement;
 use ros2probe_testing::model::host::{BOB, Host, Seen};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;

@@ -4,9 +4,9 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 use std::time::Instant;
 
-use ros2probe::model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
+use ros2probe_model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;

@@ -4,10 +4,11 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use ros2probe::config::{Limits, Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::{Snapshot, SocketFacts, TopicFacts};
+use ros2probe_model::input::Input;
+use ros2probe_model::limits::Limits;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{Snapshot, SocketFacts, TopicFacts};
+use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::time::MILLISECOND;

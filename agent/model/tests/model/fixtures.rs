@@ -13,7 +13,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use replayed::Replayed;
-use ros2probe::model::snapshot::Measurement;
+use ros2probe_model::snapshot::Measurement;
 use ros2probe_testing::truth::{self, Facts, GraphLine, Scenario};
 use ros2probe_wire::names::DdsType;
 

@@ -1,0 +1,226 @@
+//! Where a sample was lost: before the host, in a socket buffer, in reassembly.
+
+use ros2probe_model::cause::LossCause;
+use ros2probe_model::input::Input;
+use ros2probe_testing::model::host::{BOB, Host};
+use ros2probe_wire::Record;
+use ros2probe_wire::record::{flag, kind};
+
+#[test]
+fn every_cause_is_counted_for_itself_and_all_add_up() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=100 {
+        match number {
+            // Never left the network.
+            10 | 20 | 30 => {}
+            40 | 41 => host.no_room(bob, number),
+            50 => host.gap(bob, 50),
+            60 => {}
+            61 => {
+                host.data(bob, 61);
+                host.wait(20);
+                host.data(bob, 60);
+            }
+            _ => host.data(bob, number),
+        }
+        host.wait(1);
+    }
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver")
+    };
+    let facts = delivery.delivered;
+    assert_eq!(facts.lost_before_host, 3);
+    assert_eq!(facts.lost_in_socket_buffer, 2);
+    assert_eq!(
+        (facts.irrelevant, facts.recovered, facts.pending),
+        (1, 1, 0)
+    );
+    assert_eq!(facts.messages + facts.lost() + facts.irrelevant, 100);
+    assert_eq!(host.losses(LossCause::BeforeHost), [10, 20, 30]);
+    assert_eq!(host.losses(LossCause::SocketBuffer), [40, 41]);
+    let breakdown = host.topic().breakdown.unwrap();
+    assert_eq!(breakdown.retransmission.count(), 1);
+    assert_eq!(host.topic().received.unwrap().lost(), 5);
+}
+
+#[test]
+fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_brings_it_back() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let run = |host: &mut Host, number| {
+        host.wait(10);
+        for fragment in [4, 5, 6] {
+            let late = Record {
+                flags: bob.flags | flag::NO_ROOM,
+                ..host.fragments(bob, number, fragment, 1)
+            };
+            host.put(late);
+            host.wait(1);
+        }
+        host.wait(3);
+        let arrival = Record {
+            elapsed: 9_000_000,
+            ..host.fragments(bob, number, 1, 10)
+        };
+        host.put(arrival);
+    };
+    let whole = Record {
+        elapsed: 2_000_000,
+        ..host.fragments(bob, 1, 1, 10)
+    };
+    host.put(whole);
+    run(&mut host, 2);
+    assert_eq!(host.deliveries()[0].delivered.messages, 1);
+    host.wait(100);
+    // A retransmission is another arrival; part of it has no room either.
+    let again = host.fragments(bob, 2, 4, 3);
+    host.put(Record {
+        flags: bob.flags | flag::NO_ROOM,
+        ..host.fragments(bob, 2, 5, 1)
+    });
+    host.put(again);
+    assert_eq!(host.deliveries()[0].delivered.messages, 1);
+    host.wait(100);
+    host.put(host.fragments(bob, 2, 5, 1));
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.messages, facts.recovered, facts.duplicates),
+        (2, 1, 0)
+    );
+    run(&mut host, 3);
+    host.wait(15_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.lost(), facts.lost_in_socket_buffer), (1, 1));
+    assert_eq!(host.losses(LossCause::SocketBuffer), [3]);
+    // The union counts what reached the host, and knows nothing of room.
+    let union = host.measurement();
+    assert_eq!((union.messages, union.lost, union.recovered), (3, 0, 0));
+}
+
+#[test]
+fn a_retransmission_without_room_is_lost_like_the_original() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    host.data(bob, 1);
+    host.data(bob, 3);
+    host.wait(100);
+    host.no_room(bob, 2);
+    host.wait(12_000);
+    assert_eq!(host.losses(LossCause::SocketBuffer), [2]);
+    assert_eq!(host.deliveries()[0].delivered.lost(), 1);
+}
+
+#[test]
+fn a_loss_whose_fragments_the_kernel_gives_up_later_is_told_with_its_final_cause() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=20 {
+        if ![7, 8, 14].contains(&number) {
+            host.put(Record {
+                datagram_len: 60_000,
+                ..host.record(bob, kind::DATA, number)
+            });
+        }
+        host.wait(100);
+    }
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.lost(), facts.pending), (3, 3));
+    assert!(host.observer.journal().delivery_losses().next().is_none());
+    host.wait(16_000);
+    host.put(Record {
+        flags: flag::NOT_REASSEMBLED,
+        socket: 0,
+        ..host.record(bob, kind::DATA, 8)
+    });
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.lost(), facts.pending, facts.lost_in_reassembly),
+        (3, 2, 1)
+    );
+    host.wait(30_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.pending, facts.lost_before_host), (0, 2));
+    assert_eq!(host.losses(LossCause::Reassembly), [8]);
+    assert_eq!(host.losses(LossCause::BeforeHost), [7, 14]);
+    let topic = host.topic().received.unwrap();
+    assert_eq!(
+        (topic.lost(), topic.pending, topic.lost_in_reassembly),
+        (3, 0, 1)
+    );
+}
+
+#[test]
+fn a_reassembly_that_is_given_up_after_the_repair_came_is_no_loss() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    host.data(bob, 1);
+    host.data(bob, 3);
+    host.wait(200);
+    host.data(bob, 2);
+    host.wait(30_000);
+    host.put(Record {
+        flags: flag::NOT_REASSEMBLED,
+        socket: 0,
+        ..host.record(bob, kind::DATA, 2)
+    });
+    host.wait(40_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.lost(), facts.recovered, facts.messages), (0, 1, 3));
+}
+
+#[test]
+fn what_left_this_host_and_never_arrived_is_lost_unless_its_socket_is_closed() {
+    for is_closed in [false, true] {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        for number in 1..=20 {
+            host.data(bob.leaving(), number);
+            host.wait(1);
+            if number < 18 {
+                host.data(bob, number);
+            }
+            host.wait(100);
+        }
+        if is_closed {
+            host.observer.input(Input::SocketClosed(bob.socket));
+        }
+        for _ in 0..40 {
+            host.wait(1000);
+        }
+        let lost = host.losses(LossCause::BeforeHost);
+        let expected: &[u64] = if is_closed { &[] } else { &[18, 19, 20] };
+        assert_eq!(lost, expected, "closed: {is_closed}");
+        let topic = host.topic();
+        assert_eq!(topic.sent.unwrap().messages, 20);
+        let breakdown = topic.breakdown.unwrap();
+        assert_eq!(
+            (breakdown.send_delay.count(), breakdown.transit.count()),
+            (20, 17)
+        );
+        assert_eq!(breakdown.transit.range(), Some((0.001, 0.001)));
+    }
+}
+
+#[test]
+fn what_left_for_a_receiver_that_still_talks_is_lost_soon() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=20 {
+        host.data(bob.leaving(), number);
+        host.wait(1);
+        if number < 18 {
+            host.data(bob, number);
+        }
+        host.wait(100);
+    }
+    host.wait(3000);
+    // Bob announces himself again.
+    host.participant(BOB, bob.address);
+    for _ in 0..12 {
+        host.wait(1000);
+    }
+    assert_eq!(host.losses(LossCause::BeforeHost), [18, 19, 20]);
+}

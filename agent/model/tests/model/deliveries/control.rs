@@ -1,0 +1,163 @@
+//! HEARTBEAT and ACKNACK: what a writer still has, and what a reader waits for.
+
+use ros2probe_model::cause::LossCause;
+use ros2probe_testing::model::host::{BOB, CAROL, Host};
+
+#[test]
+fn a_heartbeat_tells_the_tail_to_the_reader_it_is_for_and_to_no_other() {
+    let mut host = Host::new();
+    let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
+    for number in 1..=10 {
+        host.data(bob, number);
+        host.data(carol, number);
+    }
+    host.heartbeat(bob.directed(BOB), 1, 13);
+    // The same socket, but for somebody else.
+    host.heartbeat(carol.multicast(7413).directed(BOB), 1, 13);
+    host.wait(12_000);
+    let lost: Vec<_> = host
+        .deliveries()
+        .iter()
+        .map(|each| each.delivered.lost())
+        .collect();
+    assert_eq!(lost, [3, 0]);
+    assert_eq!(host.losses(LossCause::BeforeHost), [11, 12, 13]);
+}
+
+#[test]
+fn an_acknowledgement_tells_what_a_reader_waits_for() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    host.acknack(bob, 1);
+    for number in 1..=20 {
+        host.data(bob, number);
+        host.wait(100);
+    }
+    host.request(bob, 11, 2, 0b11 << 30);
+    let topic = host.topic();
+    let [facts] = &topic.acknowledgements[..] else {
+        panic!("one reader")
+    };
+    assert_eq!(
+        (facts.acknowledged, facts.missing, facts.lag_samples),
+        (10, 2, 10)
+    );
+    assert!(
+        facts
+            .lag_seconds
+            .is_some_and(|lag| (lag - 1.0).abs() < 0.001)
+    );
+    host.unsubscribe(BOB, 2);
+    host.wait(100);
+    assert!(host.topic().acknowledgements.is_empty());
+}
+
+#[test]
+fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    host.subscribe_with(BOB, 2, false);
+    host.wait(10);
+    for number in 1..=100 {
+        if number % 10 != 0 {
+            host.data(bob, number);
+        }
+        // All others have acknowledged all: the writer has nothing before this any more.
+        host.heartbeat(bob, number, number);
+        host.wait(10);
+    }
+    host.wait(2000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.lost(), facts.irrelevant, facts.recovered),
+        (10, 0, 0)
+    );
+}
+
+#[test]
+fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    // All samples go by shared memory.
+    for number in 1..=100 {
+        host.heartbeat(bob.directed(BOB), 1, number);
+        host.wait(100);
+    }
+    host.wait(12_000);
+    assert_eq!(host.deliveries()[0].delivered.lost(), 0);
+    // All samples are larger than what gets through, and the reader asks for them.
+    for number in 101..=120 {
+        host.heartbeat(bob.directed(BOB), 1, number);
+        host.request(bob, 101, 1, 1 << 31);
+        host.wait(100);
+    }
+    host.wait(12_000);
+    // What it acknowledged before came by shared memory.
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.lost(), facts.irrelevant), (20, 99));
+}
+
+#[test]
+fn what_a_writer_of_few_samples_overwrote_before_it_came_is_lost() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=100 {
+        // KEEP_LAST (1): of 50 and 51 only the HEARTBEAT with 51 came.
+        match number {
+            10 | 20 | 21 | 50 => {}
+            51 => host.heartbeat(bob.directed(BOB), 51, 51),
+            _ => {
+                host.data(bob, number);
+                host.heartbeat(bob.directed(BOB), number, number);
+            }
+        }
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.lost(), facts.irrelevant), (95, 5, 0));
+    assert_eq!(host.losses(LossCause::BeforeHost), [10, 20, 21, 50, 51]);
+    assert_eq!(host.measurement().lost, 5);
+}
+
+#[test]
+fn what_its_reader_acknowledged_is_not_lost_although_it_was_not_seen() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in 1..=101 {
+        if number % 10 != 0 {
+            host.data(bob, number);
+        }
+        host.acknack(bob, number + 1);
+        host.heartbeat(bob.directed(BOB), number, number);
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!(
+        (facts.messages, facts.lost(), facts.irrelevant),
+        (91, 0, 10)
+    );
+    assert_eq!(
+        (host.measurement().lost, host.measurement().irrelevant),
+        (0, 10)
+    );
+}
+
+#[test]
+fn what_was_written_while_a_reader_was_away_is_not_lost_when_a_heartbeat_begins_later() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    (1..=100).for_each(|number| host.data(bob, number));
+    host.wait(50);
+    host.unsubscribe(BOB, 2);
+    host.wait(1000);
+    host.subscribe(BOB, 3);
+    host.wait(10);
+    host.heartbeat(bob.directed(BOB), 391, 400);
+    (401..=410).for_each(|number| host.data(bob, number));
+    host.wait(12_000);
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.lost()), (110, 0));
+    assert_eq!(host.measurement().lost, 0);
+}

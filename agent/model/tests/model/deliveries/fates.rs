@@ -1,0 +1,151 @@
+//! Every sample that was sent is delivered, lost for one cause or irrelevant, whatever happens.
+
+use proptest::prelude::*;
+use ros2probe_model::cause::LossCause;
+use ros2probe_testing::model::host::{BOB, Host, Seen};
+use ros2probe_wire::Record;
+use ros2probe_wire::record::{flag, kind};
+
+/// What becomes of one sample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Fate {
+    Arrives,
+    ArrivesTwice,
+    BeforeHost,
+    NoRoom,
+    Reassembly,
+    /// Retransmitted after it was lost, or had no room.
+    Repaired,
+    RepairedAfterNoRoom,
+    /// Retransmitted into a full buffer.
+    RepairHadNoRoom,
+    Excused,
+}
+
+fn fate() -> impl Strategy<Value = Fate> {
+    prop_oneof![
+        12 => Just(Fate::Arrives),
+        1 => Just(Fate::ArrivesTwice),
+        2 => Just(Fate::BeforeHost),
+        2 => Just(Fate::NoRoom),
+        1 => Just(Fate::Reassembly),
+        2 => Just(Fate::Repaired),
+        1 => Just(Fate::RepairedAfterNoRoom),
+        1 => Just(Fate::RepairHadNoRoom),
+        1 => Just(Fate::Excused),
+    ]
+}
+
+/// One sample as a whole, or in fragments of which the middle ones meet that fate.
+fn arrival(host: &Host, bob: Seen, number: u64, fragmented: bool, part: bool) -> Record {
+    let record = match (fragmented, part) {
+        (false, _) => host.record(bob, kind::DATA, number),
+        (true, false) => Record {
+            elapsed: 100_000,
+            ..host.fragments(bob, number, 1, 10)
+        },
+        (true, true) => host.fragments(bob, number, 4, 3),
+    };
+    Record {
+        datagram_len: 9000,
+        ..record
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 64, failure_persistence: None, ..ProptestConfig::default() })]
+    #[test]
+    fn what_was_sent_is_delivered_lost_for_one_cause_or_irrelevant(
+        fates in prop::collection::vec((fate(), any::<bool>(), 1u64..30), 1..300),
+    ) {
+        let mut host = Host::new();
+        let bob = host.reader(BOB, 7411);
+        let no_room = |record: Record| Record { flags: record.flags | flag::NO_ROOM, ..record };
+        host.put(arrival(&host, bob, 1, false, false));
+        // The kernel has been told of the writer by then: from here on no fragment is left out.
+        host.wait(300);
+        let mut given_up = Vec::new();
+        let mut repairs = Vec::new();
+        for (number, (fate, fragmented, pause)) in (2..).zip(&fates) {
+            host.wait(*pause);
+            let whole = arrival(&host, bob, number, *fragmented, false);
+            let part = arrival(&host, bob, number, *fragmented, true);
+            match fate {
+                Fate::Arrives => host.put(whole),
+                Fate::ArrivesTwice => {
+                    host.put(whole);
+                    host.put(whole);
+                }
+                Fate::BeforeHost => {}
+                Fate::NoRoom | Fate::RepairedAfterNoRoom => {
+                    host.put(no_room(part));
+                    host.put(whole);
+                }
+                Fate::Reassembly => given_up.push(number),
+                Fate::Repaired | Fate::RepairHadNoRoom => {}
+                Fate::Excused => host.gap(bob, number),
+            }
+            if matches!(fate, Fate::Repaired | Fate::RepairedAfterNoRoom | Fate::RepairHadNoRoom) {
+                repairs.push((number, *fate, *fragmented));
+            }
+            // Repairs come some samples later.
+            if repairs.len() > 4 {
+                host.heartbeat(bob, 1, number);
+                let (number, fate, fragmented) = repairs.remove(0);
+                repair(&mut host, bob, number, fate, fragmented);
+            }
+        }
+        let sent = 2 + fates.len() as u64;
+        host.heartbeat(bob, 1, sent - 1);
+        for (number, fate, fragmented) in repairs {
+            repair(&mut host, bob, number, fate, fragmented);
+        }
+        host.data(bob, sent);
+        for _ in 0..15 {
+            host.wait(1000);
+        }
+        // What is not known yet is pending, and nothing is open any more.
+        let facts = host.deliveries()[0].delivered;
+        prop_assert_eq!(facts.messages - facts.history + facts.lost() + facts.irrelevant, sent);
+        let unknown = fates.iter().filter(|(fate, ..)| matches!(fate, Fate::BeforeHost | Fate::Reassembly));
+        prop_assert_eq!(facts.pending, unknown.count() as u64);
+        for number in given_up {
+            host.put(Record {
+                flags: flag::NOT_REASSEMBLED,
+                socket: 0,
+                ..host.record(bob, kind::DATA, number)
+            });
+        }
+        for _ in 0..40 {
+            host.wait(1000);
+        }
+        let with = |wanted: &[Fate]| -> Vec<u64> {
+            let fates = (2..).zip(&fates);
+            fates.filter(|(_, (fate, ..))| wanted.contains(fate)).map(|(number, _)| number).collect()
+        };
+        prop_assert_eq!(host.losses(LossCause::BeforeHost), with(&[Fate::BeforeHost]));
+        prop_assert_eq!(host.losses(LossCause::Reassembly), with(&[Fate::Reassembly]));
+        let full = with(&[Fate::NoRoom, Fate::RepairHadNoRoom]);
+        prop_assert_eq!(host.losses(LossCause::SocketBuffer), full);
+        let facts = host.deliveries()[0].delivered;
+        let repaired = with(&[Fate::Repaired, Fate::RepairedAfterNoRoom]).len();
+        prop_assert_eq!(facts.recovered, repaired as u64);
+        prop_assert_eq!(facts.irrelevant, with(&[Fate::Excused]).len() as u64);
+        prop_assert_eq!(facts.duplicates, with(&[Fate::ArrivesTwice]).len() as u64);
+        prop_assert_eq!(facts.messages + facts.lost() + facts.irrelevant, sent);
+        prop_assert_eq!(host.topic().received.map(|sum| *sum), Some(facts));
+    }
+}
+
+fn repair(host: &mut Host, bob: Seen, number: u64, fate: Fate, fragmented: bool) {
+    host.wait(10);
+    let only_part = fate == Fate::RepairedAfterNoRoom;
+    let again = arrival(host, bob, number, fragmented, only_part);
+    if fate == Fate::RepairHadNoRoom {
+        host.put(Record {
+            flags: again.flags | flag::NO_ROOM,
+            ..arrival(host, bob, number, fragmented, true)
+        });
+    }
+    host.put(again);
+}

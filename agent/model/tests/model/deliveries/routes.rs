@@ -1,0 +1,298 @@
+//! One delivery by several routes: multicast and unicast, mirrored, and the caps of routes.
+
+use std::net::SocketAddrV4;
+
+use ros2probe_model::cause::LossCause;
+use ros2probe_model::observer::Settings;
+use ros2probe_model::snapshot::Direction;
+use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, Seen};
+use ros2probe_wire::Record;
+use ros2probe_wire::record::kind;
+
+#[test]
+fn a_multicast_original_and_its_unicast_repair_are_one_delivery() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    host.owner(group, BOB);
+    for number in 1..=100 {
+        if number % 10 != 0 {
+            host.data(group, number);
+        }
+        host.wait(1);
+    }
+    for number in (10..100).step_by(10).filter(|number| *number != 50) {
+        host.data(bob.directed(BOB), number);
+    }
+    host.data(group, 101);
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver: {:#?}", host.deliveries())
+    };
+    let facts = delivery.delivered;
+    assert_eq!((facts.recovered, facts.lost(), facts.messages), (8, 2, 99));
+    assert_eq!(host.losses(LossCause::BeforeHost), [50, 100]);
+    assert_eq!(delivery.sockets, [101, 7411]);
+    assert_eq!(delivery.destination.to_string(), GROUP);
+    assert_eq!(delivery.process.as_deref(), Some("listener"));
+}
+
+#[test]
+fn ways_are_put_together_when_their_socket_is_known_late() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    for number in 1..=100 {
+        if number % 10 != 0 {
+            host.data(group, number);
+        }
+        host.wait(1);
+        if number % 20 == 5 && number > 20 {
+            host.data(bob.directed(BOB), number - 5);
+        }
+        if number == 50 {
+            host.owner(group, BOB);
+        }
+    }
+    host.data(group, 101);
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver: {:#?}", host.deliveries())
+    };
+    assert_eq!(
+        (delivery.delivered.recovered, delivery.delivered.lost()),
+        (4, 6)
+    );
+    assert_eq!(
+        host.losses(LossCause::BeforeHost),
+        [10, 30, 50, 70, 90, 100]
+    );
+}
+
+#[test]
+fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    let large = |host: &mut Host, seen: Seen, number| {
+        let record = host.record(seen, kind::DATA, number);
+        host.put(Record {
+            datagram_len: 60_000,
+            ..record
+        });
+    };
+    // By unicast what the multicast brings after all, and the other way round.
+    (1..=5).for_each(|number| large(&mut host, bob, number));
+    (9..=20).for_each(|number| large(&mut host, bob, number));
+    host.wait(11_000);
+    assert_eq!(host.topic().received.unwrap().pending, 3);
+    for number in [6, 8, 20, 22] {
+        large(&mut host, group, number);
+    }
+    assert_eq!(host.topic().received.unwrap().pending, 1);
+    host.wait(11_000);
+    host.owner(group, BOB);
+    host.wait(100);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one receiver: {:#?}", host.deliveries())
+    };
+    assert_eq!(
+        delivery.delivered.pending,
+        host.topic().received.unwrap().pending
+    );
+    for _ in 0..50 {
+        host.wait(1000);
+    }
+    assert_eq!(host.topic().received.unwrap().pending, 0);
+    assert_eq!(host.losses(LossCause::BeforeHost), [7, 21]);
+}
+
+#[test]
+fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs() {
+    let mut host = Host::new();
+    let (bob, carol) = (
+        host.reader(BOB, 7411).wire(),
+        host.reader(CAROL, 7413).wire(),
+    );
+    let group = bob.multicast(0);
+    for number in 1..=100 {
+        if number % 10 != 0 {
+            host.data(group, number);
+        }
+        host.wait(1);
+    }
+    for number in (10..100).step_by(20) {
+        host.data(bob.directed(BOB), number);
+    }
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("one group: {:#?}", host.deliveries())
+    };
+    assert_eq!(delivery.subscriber, "");
+    assert_eq!(
+        (delivery.delivered.recovered, delivery.delivered.lost()),
+        (5, 4)
+    );
+    // Unicast only: two addresses are two receivers.
+    let mut host = Host::new();
+    host.reader(BOB, 7411);
+    host.reader(CAROL, 7413);
+    for number in 1..=10 {
+        host.data(bob, number);
+        if number != 5 {
+            host.data(carol, number);
+        }
+    }
+    host.wait(12_000);
+    let lost: Vec<_> = host
+        .deliveries()
+        .iter()
+        .map(|each| {
+            (
+                each.participant.map(|guid| guid.prefix),
+                each.delivered.lost(),
+            )
+        })
+        .collect();
+    assert_eq!(lost, [(Some(BOB), 0), (Some(CAROL), 1)]);
+}
+
+#[test]
+fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    let elsewhere = host.reader(CAROL, 7413).wire();
+    host.owner(group, BOB);
+    for number in 1..=100 {
+        // The mirror is first, and shows what Bob and Carol get.
+        host.data(group.wire(), number);
+        host.data(group, number);
+        if number % 10 == 0 {
+            host.data(elsewhere.directed(CAROL), number - 5);
+        }
+        host.wait(10);
+    }
+    host.wait(12_000);
+    let [delivery] = &host.deliveries()[..] else {
+        panic!("Bob alone: {:#?}", host.deliveries())
+    };
+    assert_eq!(delivery.participant.unwrap().prefix, BOB);
+    let facts = delivery.delivered;
+    assert_eq!(
+        (facts.messages, facts.lost(), facts.duplicates),
+        (100, 0, 0)
+    );
+    let union = host.measurement();
+    // The very first came before it was known that a socket receives it.
+    assert_eq!((union.messages, union.lost, union.duplicates), (100, 0, 10));
+}
+
+#[test]
+fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    let group = bob.multicast(101);
+    for number in 1..=10 {
+        host.data(group.leaving(), number);
+        host.data(group.leaving(), number);
+        host.data(group, number);
+    }
+    let topic = host.topic();
+    let sent: Vec<_> = topic
+        .deliveries
+        .iter()
+        .map(|each| (each.direction, each.delivered))
+        .collect();
+    assert_eq!(sent[0].0, Direction::Sent);
+    assert_eq!((sent[0].1.messages, sent[0].1.duplicates), (10, 0));
+    assert_eq!((sent[1].1.messages, sent[1].1.duplicates), (10, 0));
+    assert_eq!(
+        (host.measurement().messages, host.measurement().duplicates),
+        (10, 0)
+    );
+    host.data(group, 10);
+    assert_eq!(host.measurement().duplicates, 1);
+}
+
+#[test]
+fn a_full_table_refuses_counts_and_makes_room_when_somebody_is_silent() {
+    let mut host = Host::with(Settings {
+        deliveries: 3,
+        ..Settings::default()
+    });
+    let bob = host.reader(BOB, 7411);
+    let at = |socket: u64| Seen {
+        socket,
+        ..bob.multicast(socket)
+    };
+    for number in 1..=10 {
+        (1..=5).for_each(|socket| host.data(at(socket), number));
+    }
+    assert_eq!(host.deliveries().len(), 3);
+    let row = |host: &Host| {
+        let tables = host.snapshot().tables;
+        let row = tables
+            .into_iter()
+            .find(|row| row.table == "deliveries")
+            .unwrap();
+        (row.size, row.limit, row.evictions)
+    };
+    assert_eq!(row(&host), (3, 3, 20));
+    for number in 11..=60 {
+        (3..=5).for_each(|socket| host.data(at(socket), number));
+        host.wait(400);
+    }
+    let sockets: Vec<_> = host
+        .deliveries()
+        .iter()
+        .map(|each| each.sockets.clone())
+        .collect();
+    assert_eq!(sockets, [[3], [4], [5]]);
+    assert!(
+        host.deliveries()
+            .iter()
+            .all(|each| each.delivered.lost() == 0)
+    );
+    // The sums keep what was counted of those that went.
+    let sum: u64 = host
+        .deliveries()
+        .iter()
+        .map(|each| each.delivered.messages)
+        .sum();
+    assert!(host.topic().received.unwrap().messages > sum);
+}
+
+#[test]
+fn a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411).wire();
+    for number in 1..=200 {
+        host.data(bob, number);
+        for forged in 0..100 {
+            let address = u32::from_be_bytes([10, 1, 0, 0]) + (number as u32) * 100 + forged;
+            let nowhere = Seen {
+                address: SocketAddrV4::new(address.into(), 7411),
+                ..bob
+            };
+            host.data(nowhere, number);
+        }
+        host.wait(50);
+    }
+    let tables = host.snapshot().tables;
+    let row = tables.iter().find(|row| row.table == "deliveries").unwrap();
+    assert!(row.size <= 2000 && row.evictions > 10_000, "{row:?}");
+    let deliveries = host.deliveries();
+    let of_bob = deliveries
+        .iter()
+        .find(|each| each.participant.is_some())
+        .unwrap();
+    assert_eq!(
+        (of_bob.delivered.messages, of_bob.delivered.lost()),
+        (200, 0)
+    );
+    for _ in 0..70 {
+        host.wait(1000);
+    }
+    assert_eq!(host.deliveries().len(), 1);
+}

@@ -1,0 +1,99 @@
+//! Time that comes with the data: steps of the wall clock, jumps, and the same result twice.
+
+use ros2probe_model::churn;
+use ros2probe_model::event::EventKind;
+use ros2probe_model::input::Input;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
+use ros2probe_wire::{Guid, Timestamp};
+
+use super::{ALICE, Dice, START, WRITER, World, alice};
+
+#[test]
+fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
+    const HOUR: u64 = 3600 * SECOND;
+    for (forward, step) in [(true, HOUR.cast_signed()), (false, -HOUR.cast_signed())] {
+        let mut world = World::new(&["/chatter"]);
+        world.spdp(ALICE, 10);
+        world.sedp(alice(WRITER), "rt/chatter");
+        world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
+        world.stream(alice(WRITER), 1..=500);
+        world.observer.drain();
+        let before = world.now;
+
+        // The writer's clock is the same one.
+        world.now = world.now.saturating_add_signed(step);
+        world.observer.input(Input::ClockSet(step));
+        world.stream(alice(WRITER), 501..=700);
+        // A gap that is settled ten seconds later, as without the step.
+        world.stream(alice(WRITER), 702..=1000);
+        let snapshot = world.snapshot();
+        assert_eq!(snapshot.at.0, world.now);
+        let seen = &snapshot.participants[0];
+        let age = |time: Timestamp| Timestamp(world.now).nanoseconds_since(time);
+        assert_eq!(age(seen.first_seen), 9_990 * MILLISECOND.cast_signed());
+        assert_eq!(age(seen.last_seen), 10 * MILLISECOND.cast_signed());
+        let chatter = world.measurement("/chatter");
+        assert_eq!(age(chatter.last_message.unwrap()), age(seen.last_seen));
+        assert_eq!(chatter.messages, 999, "{forward}");
+        assert!((chatter.rate_hz - 100.0).abs() < 2.0, "{}", chatter.rate_hz);
+        assert_eq!(chatter.negative_latency, 0);
+        assert!(chatter.source_latency.sum() < 1e-6, "{forward}");
+        assert!(chatter.interarrival.sum() < 10.0, "{forward}");
+        assert_eq!(world.churn("participant", "expired"), 0);
+        assert_eq!(world.node_names(), ["/talker"]);
+        for event in world.observer.drain().events.events {
+            assert!(world.now.abs_diff(event.at.0) < 10 * SECOND, "{event:?}");
+        }
+
+        // And a lease that runs out does so after as long as ever.
+        assert_eq!(world.measurement("/chatter").lost, 0);
+        world.wait(9_900);
+        assert_eq!(world.snapshot().participants.len(), 1, "{forward}");
+        assert_eq!(world.measurement("/chatter").lost, 1, "{forward}");
+        world.wait(200);
+        assert_eq!(world.snapshot().participants.len(), 0, "{forward}");
+        let events = world.observer.drain().events.events;
+        let expired = events.iter().find(|event| {
+            let EventKind::Participant { change, .. } = &event.kind else {
+                return false;
+            };
+            *change == churn::Event::Expired
+        });
+        assert_eq!(expired.unwrap().at.0 + 110 * MILLISECOND, world.now);
+        assert!(world.now.abs_diff(before) > HOUR / 2);
+    }
+}
+
+#[test]
+fn a_clock_that_jumps_is_followed() {
+    let mut world = World::new(&["/**"]);
+    world.spdp(ALICE, 10);
+    world.wait(1000 * 3600 * 24 * 365);
+    assert!(world.snapshot().participants.is_empty());
+    world.observer.input(Input::Time(Timestamp(START)));
+    world.observer.input(Input::Time(Timestamp(u64::MAX)));
+}
+
+#[test]
+fn the_same_input_gives_the_same_facts() {
+    let replay = || {
+        let mut world = World::new(&["/**"]);
+        let mut dice = Dice(3);
+        for _ in 0..50 {
+            let prefix = dice.prefix();
+            world.spdp(prefix, 10);
+            world.sedp(
+                Guid::new(prefix, WRITER),
+                &format!("rt/t{}", dice.roll() % 20),
+            );
+            (1..50).for_each(|number| world.sample(Guid::new(prefix, WRITER), number));
+            world.wait(dice.roll() % 2000);
+        }
+        format!(
+            "{:?} {:?}",
+            world.snapshot(),
+            world.observer.drain().interest
+        )
+    };
+    assert_eq!(replay(), replay());
+}

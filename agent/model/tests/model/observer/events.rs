@@ -1,0 +1,208 @@
+//! Events of the graph, of losses and of expectations.
+
+use std::sync::Arc;
+
+use ros2probe_model::churn;
+use ros2probe_model::event::EventKind;
+use ros2probe_model::input::Input;
+use ros2probe_model::snapshot::WatchState;
+use ros2probe_model::watch::{Expectations, Watch, Watchlist};
+use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
+use ros2probe_wire::DomainId;
+
+use super::{ALICE, BOB, READER, WRITER, World, alice, bob};
+
+#[test]
+fn who_comes_and_goes_is_told_with_what_was_known_of_it() {
+    let mut world = World::new(&[]);
+    world.spdp(ALICE, 10);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
+    let told = world.events();
+    let changes = |told: &[(u64, EventKind)], wanted: churn::Event| {
+        let kinds = told.iter().map(|(_, kind)| match kind {
+            EventKind::Participant { change, guid, .. } => {
+                assert_eq!(guid.prefix, ALICE);
+                ("participant", *change)
+            }
+            EventKind::Endpoint {
+                change,
+                guid,
+                topic,
+                message_type,
+                ..
+            } => {
+                assert_eq!((*guid, &**topic), (alice(WRITER), "rt/chatter"));
+                assert_eq!(&**message_type, "std_msgs/msg/String");
+                ("endpoint", *change)
+            }
+            EventKind::Node { change, name, .. } => {
+                assert_eq!(&**name, "/talker");
+                ("node", *change)
+            }
+            other => panic!("{other:?}"),
+        });
+        let kinds: Vec<_> = kinds.collect();
+        kinds.iter().filter(|(_, change)| *change == wanted).count()
+    };
+    assert_eq!((told.len(), changes(&told, churn::Event::Appeared)), (3, 3));
+    assert!(world.events().is_empty());
+    world.wait(11_000);
+    let mut told = world.events();
+    // And that nobody heard it, for as long as it was there.
+    told.retain(|(_, kind)| !matches!(kind, EventKind::Diagnosis { .. }));
+    assert_eq!(told.len(), 3);
+    assert_eq!(changes(&told, churn::Event::Expired), 1);
+    assert_eq!(changes(&told, churn::Event::Cascaded), 2);
+    assert!(told.iter().all(|(at, _)| *at == 10_000));
+}
+
+#[test]
+fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_gone() {
+    let mut world = World::new(&["/**"]);
+    world.spdp(ALICE, 100);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
+    world.sample(alice(WRITER), 1);
+    world.events();
+    // Three gaps within a second: 2, 4 to 5, 7.
+    for number in [3, 6, 8] {
+        world.wait(100);
+        world.sample(alice(WRITER), number);
+    }
+    let losses = |world: &mut World| -> Vec<_> {
+        let told = world.events().into_iter();
+        let losses = told.filter_map(|(_, kind)| match kind {
+            EventKind::Loss(burst) => Some(burst),
+            _ => None,
+        });
+        losses.collect()
+    };
+    // The writer is reliable: it may retransmit for ten seconds.
+    world.wait(9_000);
+    assert_eq!(losses(&mut world), []);
+    world.wait(4_000);
+    let told = losses(&mut world);
+    assert!((1..=2).contains(&told.len()), "{told:?}");
+    assert_eq!(told.iter().map(|burst| burst.count).sum::<u64>(), 4);
+    assert_eq!((told[0].first, told.last().unwrap().last), (2, 7));
+    for burst in &told {
+        assert_eq!(burst.writer, alice(WRITER));
+        assert_eq!(burst.topic, Some((DomainId(0), "rt/chatter".into())));
+        assert_eq!(burst.node.as_deref(), Some("/talker"));
+    }
+
+    world.sample(alice(WRITER), 10);
+    let dispose = Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 200, alice(WRITER));
+    world.put(dispose);
+    world.wait(1_000);
+    let told = losses(&mut world);
+    assert_eq!(told.len(), 1);
+    assert_eq!((told[0].first, told[0].last, told[0].count), (9, 9, 1));
+    assert_eq!(told[0].topic, Some((DomainId(0), "rt/chatter".into())));
+}
+
+#[test]
+fn a_changed_expectation_is_told_once_and_another_watch_changes_nothing() {
+    let expects = |pattern: &str, max_silence_s| Watch {
+        expectations: Expectations {
+            max_silence_s,
+            ..Expectations::default()
+        },
+        ..Watch::named(pattern).unwrap()
+    };
+    let chatter = expects("/chatter", Some(2.0));
+    let mut world = World::new(&[]);
+    let watch = |world: &mut World, watches: Vec<Watch>| {
+        let watchlist = Watchlist::new(watches).unwrap();
+        world.observer.input(Input::Watchlist(Arc::new(watchlist)));
+    };
+    watch(&mut world, vec![chatter.clone()]);
+    world.spdp(ALICE, 100);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.spdp(BOB, 100);
+    world.sedp(bob(READER), "rt/chatter");
+    world.stream(alice(WRITER), 1..=150);
+    let states = |world: &mut World| -> Vec<_> {
+        let told = world.events().into_iter();
+        let states = told.filter_map(|(_, kind)| match kind {
+            EventKind::Expectation {
+                from,
+                to,
+                violations,
+                ..
+            } => Some((from, to, violations)),
+            EventKind::Silence { last_message, .. } => {
+                assert!(last_message.is_some());
+                Some((None, WatchState::Silent, vec!["silence"]))
+            }
+            _ => None,
+        });
+        states.collect()
+    };
+    assert_eq!(states(&mut world), []);
+    world.wait(5_000);
+    let silent = (
+        Some(WatchState::Ok),
+        WatchState::Silent,
+        vec!["max_silence_s"],
+    );
+    let silence = (None, WatchState::Silent, vec!["silence"]);
+    assert_eq!(states(&mut world), [silent, silence]);
+
+    // In front of it, so that its place in the list is another.
+    watch(&mut world, vec![expects("/other", None), chatter.clone()]);
+    world.wait(2_000);
+    assert_eq!(states(&mut world), []);
+    world.stream(alice(WRITER), 151..=300);
+    let good = (Some(WatchState::Silent), WatchState::Ok, Vec::new());
+    assert_eq!(states(&mut world), [good]);
+    let dispose = Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 200, alice(WRITER));
+    world.put(dispose);
+    world.wait(2_000);
+    let gone = (Some(WatchState::Ok), WatchState::NotPublished, Vec::new());
+    assert_eq!(states(&mut world), [gone]);
+}
+
+#[test]
+fn expectations_are_judged_in_the_sources_time() {
+    let mut world = World::new(&[]);
+    let expectations = Expectations {
+        min_rate_hz: Some(50.0),
+        max_silence_s: Some(3.0),
+        ..Expectations::default()
+    };
+    let watch = Watch {
+        pattern: "/chatter".to_owned(),
+        domain_id: None,
+        expectations,
+        per_subscriber: false,
+        trace: 0.0,
+        retain: ros2probe_model::watch::Retain::None,
+    };
+    world.observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
+    let state = |world: &World| {
+        let facts = world.snapshot().watches.remove(0);
+        (facts.topics[0].topic.clone(), facts.topics[0].state)
+    };
+    let at = |state| ("/chatter".to_owned(), state);
+    assert_eq!(state(&world), at(WatchState::NotPublished));
+    world.spdp(ALICE, 100);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.wait(1000);
+    assert_eq!(state(&world), at(WatchState::NoSubscriber));
+    world.sedp(alice(READER), "rt/chatter");
+    world.stream(alice(WRITER), 1..=500);
+    assert_eq!(state(&world), at(WatchState::Ok));
+    for number in 501..=540 {
+        world.sample(alice(WRITER), number);
+        world.wait(100);
+    }
+    assert_eq!(state(&world), at(WatchState::Violated));
+    world.wait(5000);
+    assert_eq!(state(&world), at(WatchState::Silent));
+    world.stream(alice(WRITER), 541..=1040);
+    assert_eq!(state(&world), at(WatchState::Ok));
+}

@@ -1,0 +1,112 @@
+//! Writers that send and were never announced.
+
+use ros2probe_model::input::Input;
+use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
+use ros2probe_wire::record::Verdict;
+use ros2probe_wire::walk::Envelope;
+use ros2probe_wire::{Guid, GuidPrefix};
+
+use super::{ALICE, BOB, WRITER, World, alice};
+
+#[test]
+fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
+    let mut world = World::new(&["/chatter"]);
+    world.stream(alice(WRITER), 1..=250);
+    assert!(world.snapshot().unknown_writers.is_empty());
+    world.stream(alice(WRITER), 251..=400);
+    let snapshot = world.snapshot();
+    let unknown = &snapshot.unknown_writers[0];
+    assert_eq!(
+        (unknown.guid, unknown.measurement.messages),
+        (alice(WRITER), 400)
+    );
+    assert!((unknown.measurement.rate_hz - 100.0).abs() < 1.0);
+    let changes = world.observer.drain().interest;
+    assert_eq!(changes, [(alice(WRITER), Some(Verdict::Meter))]);
+    world.spdp(ALICE, 10);
+    world.sedp(alice(WRITER), "rt/chatter");
+    assert!(world.snapshot().unknown_writers.is_empty());
+    world.stream(alice(WRITER), 401..=500);
+    assert_eq!(world.measurement("/chatter").messages, 500);
+    assert!(world.observer.drain().interest.is_empty());
+}
+
+#[test]
+fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_participant() {
+    const FAST: GuidPrefix = GuidPrefix(*b"\x01\x0fsome-robot");
+    let mut world = World::new(&[]);
+    let holder = SocketFacts {
+        cookie: 77,
+        process_id: Some(4242),
+        process: Some("lidar_driver".to_owned()),
+        cgroup: Some("/robot.slice".to_owned()),
+        ..SocketFacts::default()
+    };
+    world.observer.input(Input::Socket(holder));
+    let send = |world: &mut World, number| {
+        for (prefix, socket) in [(FAST, 77), (ALICE, 78), (BOB, 77)] {
+            let envelope = Envelope {
+                host: true,
+                outgoing: true,
+                socket,
+                ..forge::multicast(world.now, 0)
+            };
+            let sample = Message::from(prefix).data(WRITER, number, &[0, 1, 0, 0]);
+            world.observer.input(Input::Datagram {
+                envelope: &envelope,
+                payload: &sample.bytes(),
+                handover: None,
+            });
+        }
+        world.wait(10);
+    };
+    (1..=400).for_each(|number| send(&mut world, number));
+    world.spdp(BOB, 10);
+    send(&mut world, 401);
+    let told = |prefix: GuidPrefix| {
+        let snapshot = world.snapshot();
+        let writers = snapshot.unknown_writers.into_iter();
+        let mut writers = writers.filter(|writer| writer.guid == Guid::new(prefix, WRITER));
+        let writer = writers.next().unwrap();
+        (writer.vendor, writer.process.id, writer.process.name)
+    };
+    let lidar = Some("lidar_driver".to_owned());
+    assert_eq!(
+        told(FAST),
+        ("eProsima Fast DDS".to_owned(), Some(4242), lidar.clone())
+    );
+    assert_eq!(told(BOB).0, "Eclipse Cyclone DDS");
+    assert_eq!((told(BOB).1, told(BOB).2), (Some(4242), lidar));
+    assert_eq!((told(ALICE).1, told(ALICE).2), (None, None));
+    let participant = world.snapshot().participants.remove(0);
+    assert_eq!(participant.guid.prefix, BOB);
+    assert_eq!(participant.process.id, Some(4242));
+    assert_eq!(participant.process.cgroup.as_deref(), Some("/robot.slice"));
+}
+
+#[test]
+fn what_the_kernels_budget_for_strangers_leaves_out_is_not_lost() {
+    let mut world = World::new(&["/chatter"]);
+    for number in [1, 2, 3, 40, 90, 91, 200] {
+        world.sample(alice(WRITER), number);
+        world.wait(400);
+    }
+    world.wait(1000);
+    world.stream(alice(WRITER), 500..=700);
+    world.stream(alice(WRITER), 711..=900);
+    let unknown = world.snapshot().unknown_writers.remove(0).measurement;
+    assert_eq!((unknown.messages, unknown.lost), (7 + 201 + 190, 10));
+}
+
+#[test]
+fn a_sample_on_its_way_while_its_writer_says_goodbye_makes_no_stranger() {
+    let mut world = World::new(&["/**"]);
+    world.spdp(ALICE, 10);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.stream(alice(WRITER), 1..=10);
+    world.put(Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 99, alice(WRITER)));
+    world.sample(alice(WRITER), 11);
+    world.wait(10_000);
+    assert!(world.snapshot().unknown_writers.is_empty());
+}
