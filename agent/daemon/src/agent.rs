@@ -202,15 +202,7 @@ pub fn run(options: Options) -> Result<()> {
         lost_lines: log.lost_lines(),
         ..MetricSources::new(source.kind(), Settings::new(&config))
     };
-    let watches = Watches::new(
-        Arc::clone(&sources.limits),
-        Arc::clone(&sources.events),
-        Arc::clone(&sources.settings),
-        Arc::clone(sources.latest.bell()),
-        config.watches.clone(),
-        options.watch,
-    );
-    let watches = Arc::new(watches.context("the watchlist is unusable")?);
+    let watches = watches(&config, options.watch, &sources)?;
     let (server, mut control) = listeners(&config, &sources)?;
     // A replay is a person's own command, which reads and writes that person's files.
     if matches!(source, Source::Live(_)) {
@@ -242,15 +234,8 @@ pub fn run(options: Options) -> Result<()> {
             .context("cannot start the threads that keep state")?,
         recordings,
         library: library(),
-        // Only clients of the API read the history.
-        history: match control.is_empty() {
-            true => Duration::ZERO,
-            false => config.history,
-        },
-        addresses: match config.api.page {
-            PageChoice::On => control.addresses().collect(),
-            PageChoice::Off => Vec::new(),
-        },
+        history: history(&config, &control),
+        addresses: page_addresses(&config, &control),
         stop: stop.clone(),
     };
     let agent = components.assemble().context("recordings.snapshots")?;
@@ -303,6 +288,35 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         options.report,
     );
     config
+}
+
+/// The watches of the configuration and of the command line.
+fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Result<Arc<Watches>> {
+    let watches = Watches::new(
+        Arc::clone(&sources.limits),
+        Arc::clone(&sources.events),
+        Arc::clone(&sources.settings),
+        Arc::clone(sources.latest.bell()),
+        config.watches.clone(),
+        given,
+    );
+    Ok(Arc::new(watches.context("the watchlist is unusable")?))
+}
+
+/// How long figures are kept: only clients of the API read them.
+fn history(config: &Config, control: &api::Server) -> Duration {
+    match control.is_empty() {
+        true => Duration::ZERO,
+        false => config.history,
+    }
+}
+
+/// Where the page is served.
+fn page_addresses(config: &Config, control: &api::Server) -> Vec<SocketAddr> {
+    match config.api.page {
+        PageChoice::On => control.addresses().collect(),
+        PageChoice::Off => Vec::new(),
+    }
 }
 
 /// Starts the threads of the source and the working thread, which keep their privileges.

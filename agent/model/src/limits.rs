@@ -49,7 +49,7 @@ pub struct Row {
     /// What becomes of the next one.
     pub reached: &'static str,
     /// Which metrics tell more than `ros2probe_limit_reached_total` does.
-    pub told_by: &'static str,
+    pub counted_by: &'static str,
     /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and
     /// two pages of metrics that tell of it; 1 where bytes are counted.
     pub bytes: usize,
@@ -92,7 +92,7 @@ const PARTICIPANTS: Row = Row {
     reached: "one that is no longer heard makes room (for 5 s, if it was there for \
         less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
         worth more; otherwise the newcomer is left out",
-    told_by: "ros2probe_table_evictions_total",
+    counted_by: "ros2probe_table_evictions_total",
     bytes: 2 << 10,
 };
 const ENDPOINTS: Row = Row {
@@ -103,7 +103,7 @@ const ENDPOINTS: Row = Row {
     reached: "a participant that is no longer heard makes room with all its entries, \
         or the least worthy entry for a newcomer that is worth more; otherwise the \
         newcomer waits until there is room",
-    told_by: "ros2probe_table_evictions_total",
+    counted_by: "ros2probe_table_evictions_total",
     bytes: 5_632,
 };
 const TOPICS: Row = Row {
@@ -114,7 +114,7 @@ const TOPICS: Row = Row {
     reached: "one that has vanished makes room, or the latest one that is not watched \
         by its exact name for one that is; otherwise the newcomer is listed but not \
         measured until an entry is free",
-    told_by: "ros2probe_topics_rejected_total",
+    counted_by: "ros2probe_topics_rejected_total",
     bytes: 15 << 10,
 };
 const WATCHES: Row = Row {
@@ -123,7 +123,7 @@ const WATCHES: Row = Row {
     range: (1, 10_000),
     what: "Watches of the configuration, the command line and clients together",
     reached: "a client's is refused (409), and so is a configuration that lists more",
-    told_by: "",
+    counted_by: "",
     bytes: 1 << 10,
 };
 const UNKNOWN_WRITERS: Row = Row {
@@ -133,7 +133,7 @@ const UNKNOWN_WRITERS: Row = Row {
     what: "Writers whose announcement was missed",
     reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
               otherwise the newcomer is not followed",
-    told_by: "ros2probe_table_evictions_total",
+    counted_by: "ros2probe_table_evictions_total",
     bytes: 4 << 10,
 };
 const FLOWS: Row = Row {
@@ -144,7 +144,7 @@ const FLOWS: Row = Row {
            messages",
     reached: "those that were silent for 10 s make room; until then the newcomer is not \
               followed, and its topic's own counts stay right",
-    told_by: "ros2probe_table_evictions_total",
+    counted_by: "ros2probe_table_evictions_total",
     bytes: 2 << 10,
 };
 const REASSEMBLY_BYTES: Row = Row {
@@ -153,7 +153,7 @@ const REASSEMBLY_BYTES: Row = Row {
     range: (65_536, 1 << 30),
     what: "Bytes of captured datagrams of which fragments are missing",
     reached: "the oldest datagram is dropped",
-    told_by: "ros2probe_incomplete_datagrams_total",
+    counted_by: "ros2probe_incomplete_datagrams_total",
     bytes: 1,
 };
 const SUBSCRIPTIONS: Row = Row {
@@ -162,7 +162,7 @@ const SUBSCRIPTIONS: Row = Row {
     range: (1, 1_000),
     what: "Clients that get messages one by one, recordings and snapshots",
     reached: "the next one is refused (503)",
-    told_by: "ros2probe_subscriptions_refused_total",
+    counted_by: "ros2probe_subscriptions_refused_total",
     bytes: 8 << 10,
 };
 const PAYLOAD_BYTES: Row = Row {
@@ -173,7 +173,7 @@ const PAYLOAD_BYTES: Row = Row {
            read (the other)",
     reached: "the oldest message of the longest queue is dropped, or the least \
         complete one, and reported to its readers",
-    told_by: "ros2probe_missed_messages_total",
+    counted_by: "ros2probe_missed_messages_total",
     bytes: 1,
 };
 const RECORDINGS: Row = Row {
@@ -182,7 +182,7 @@ const RECORDINGS: Row = Row {
     range: (1, 100),
     what: "Bags that the agent writes at once on request",
     reached: "the next one is refused (409)",
-    told_by: "",
+    counted_by: "",
     bytes: 6 << 20,
 };
 const API_CLIENTS: Row = Row {
@@ -191,7 +191,7 @@ const API_CLIENTS: Row = Row {
     range: (1, 10_000),
     what: "Connections to each listener of the control API",
     reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed",
-    told_by: "",
+    counted_by: "",
     bytes: 32 << 10,
 };
 const METRICS_CLIENTS: Row = Row {
@@ -200,7 +200,7 @@ const METRICS_CLIENTS: Row = Row {
     range: (1, 10_000),
     what: "Connections to the metrics listener",
     reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed; with TLS it is closed",
-    told_by: "",
+    counted_by: "",
     bytes: 32 << 10,
 };
 

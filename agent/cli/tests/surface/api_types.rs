@@ -104,12 +104,12 @@ fn recordings(agent: &LocalAgent) {
     );
 }
 
-/// A topic of which messages come.
+/// The topic of which most messages come.
 fn published(agent: &LocalAgent) -> String {
     let list: RecordingList = get(agent, "/recordings");
     let topics = &list.recordings[0].report.topics;
-    let mut topics = topics.iter().filter(|(_, topic)| topic.messages > 1);
-    topics.next().unwrap().0.clone()
+    let most = topics.iter().max_by_key(|(_, topic)| topic.messages);
+    most.unwrap().0.clone()
 }
 
 fn streams(agent: &LocalAgent, topic: &str) {

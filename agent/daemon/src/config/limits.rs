@@ -67,7 +67,7 @@ impl JsonSchema for LimitsShape {
 /// The caps of the configuration as a Markdown table, for `docs/limits.md`.
 #[must_use]
 pub fn markdown() -> String {
-    let mut table = "| `limits.` | default | what | at the cap | told in detail by |\n\
+    let mut table = "| `limits.` | default | what | at the cap | counted in detail by |\n\
                      | --- | --- | --- | --- | --- |\n"
         .to_owned();
     for limit in Limit::ALL {
@@ -76,17 +76,17 @@ pub fn markdown() -> String {
             default,
             what,
             reached,
-            told_by,
+            counted_by,
             ..
         } = limit.row();
-        let told_by = match told_by {
+        let counted_by = match counted_by {
             "" => String::new(),
-            told_by => format!("`{told_by}`"),
+            counted_by => format!("`{counted_by}`"),
         };
         // Writing to a string cannot fail.
         let _ = writeln!(
             table,
-            "| `{key}` | {default} | {what} | {reached} | {told_by} |"
+            "| `{key}` | {default} | {what} | {reached} | {counted_by} |"
         );
     }
     table

@@ -34,7 +34,7 @@ pub use ros2probe_model::watch::{
 /// A larger file is no configuration.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Everything the agent is told, checked.
+/// The checked configuration of the agent.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// What to measure, in file order.
@@ -294,7 +294,7 @@ pub enum ConfigError {
         /// Why not.
         source: io::Error,
     },
-    /// Nobody writes that much by hand.
+    /// Larger than any file written by hand.
     #[error("the configuration {} is larger than 1 MiB", path.display())]
     TooLarge {
         /// Which file.
