@@ -191,17 +191,11 @@ pub fn run(options: Options) -> Result<()> {
     let (configured, file) = configuration(options.config.as_deref())?;
     let config = overridden(&configured, &options);
     let log = Log::start(config.log);
-    let export = otlp::Settings::resolve(
-        &config.otlp,
-        &|name| std::env::var(name).ok(),
-        &Host::read(),
-    )?;
+    let export = export(&config)?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
-    let sources = MetricSources {
-        lost_lines: log.lost_lines(),
-        ..MetricSources::new(source.kind(), Settings::new(&config))
-    };
+    let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
+    sources.lost_lines = log.lost_lines();
     let watches = watches(&config, options.watch, &sources)?;
     let (server, mut control) = listeners(&config, &sources)?;
     // A replay is a person's own command, which reads and writes that person's files.
@@ -214,7 +208,7 @@ pub fn run(options: Options) -> Result<()> {
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
-    let exporter = export.map(|settings| Exporter::start(settings, &sources, Arc::clone(&spans)));
+    let exporter = export.map(|export| Exporter::start(export, &sources, Arc::clone(&spans)));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, &watches);
@@ -288,6 +282,12 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         options.report,
     );
     config
+}
+
+/// What is exported, by the configuration and the environment.
+fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
+    let variable = |name: &str| std::env::var(name).ok();
+    otlp::Settings::resolve(&config.otlp, &variable, &Host::read())
 }
 
 /// The watches of the configuration and of the command line.

@@ -253,6 +253,7 @@ impl Occurrence {
 type Values = Vec<(&'static str, Option<Value>)>;
 
 fn robot(kind: &EventKind, at: Timestamp) -> Values {
+    let ago = |last| Value::Real(seconds(at, last));
     match kind {
         EventKind::Participant {
             change,
@@ -325,10 +326,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             domain(*domain_id),
             ("topic", Some(text(topic))),
             ("watch", Some(text(watch))),
-            (
-                "last_message_seconds_ago",
-                last_message.map(|last| Value::Real(seconds(at, last))),
-            ),
+            ("last_message_seconds_ago", last_message.map(ago)),
         ],
         EventKind::Diagnosis { finding, .. } => self::finding(finding),
     }
