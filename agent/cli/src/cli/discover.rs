@@ -26,7 +26,7 @@ pub(crate) struct Discover {
     /// Ask this participant, by its GUID prefix: 24 hexadecimal digits
     #[arg(long, value_name = "PREFIX", value_parser = prefix, conflicts_with = "all")]
     pub(crate) participant: Option<GuidPrefix>,
-    /// Ask every participant that is heard
+    /// Ask every participant found
     #[arg(long)]
     pub(crate) all: bool,
     /// Print what would be sent, but send nothing
@@ -42,7 +42,8 @@ pub(crate) struct Discover {
     #[arg(long, value_name = "SECONDS", default_value_t = 10,
         value_parser = clap::value_parser!(u64).range(1..=120))]
     pub(crate) listen: u64,
-    /// Configuration file, for its `capture`; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    /// Configuration file, for its `capture` section [default: /etc/ros2probe/ros2probe.yaml, if it
+    /// exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
 }

@@ -29,7 +29,7 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 --filter takes an expression over `m`, the message (or the field that --field selects): m.pose.x > 1.5,
 'error' in m.msg, len(m.ranges) == 0, 0 <= m.level < 3 and not m.done. It knows fields, [index],
 numbers, strings, comparisons, in, and, or, not, + - * / // % **, lists, abs, all, any, bool, float,
-int, len, max, min, str, sum, and of strings startswith, endswith, lower, upper.
+int, len, max, min, str, sum, and for strings startswith, endswith, lower, upper.
 
 rp does not subscribe, so it cannot request messages that were sent before.
 
@@ -38,9 +38,9 @@ Examples:
   rp topic echo /odom --field pose.pose.position --filter 'm.x > 10'
   rp topic echo /points --replay robot.pcap --no-arr")]
 pub(crate) struct Echo {
-    /// Name of the topic, as /chatter
+    /// Name of the topic, e.g. /chatter
     topic_name: String,
-    /// Type of its messages, as std_msgs/msg/String [default: the announced one]
+    /// Type of its messages, e.g. std_msgs/msg/String [default: the announced one]
     message_type: Option<String>,
     #[command(flatten)]
     printing: Printing,
@@ -59,7 +59,7 @@ pub(crate) struct Echo {
     /// Print one message, then end
     #[arg(long)]
     once: bool,
-    /// End after so many seconds
+    /// End after this many seconds
     #[arg(long, value_name = "SECONDS", value_parser = positive)]
     timeout: Option<f64>,
     /// Print times and sequence number before each message

@@ -38,16 +38,16 @@ const CACHE: u64 = 100 << 20;
 /// `rp bag record`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Nothing on the network tells that there is a recording: messages are copied, not subscribed to. What
-was never whole on the wire is not in the bag and is named at the end, and in the bag's metadata.
-Space pauses and resumes. SIGUSR1 writes what waits in --snapshot-mode. Ctrl-C ends the recording;
-a second one skips what takes long (messages on their way, compression of files), a third one all.
-Exit code: 0; 1 when the storage takes no more; of a capture, 3 when something is not in the bag.
+A recording is invisible on the network: messages are copied, not subscribed to. Messages that were
+incomplete on the wire are missing in the bag; they are reported at the end and in its metadata.
+Space pauses and resumes. With --snapshot-mode, SIGUSR1 writes the messages in memory. Ctrl-C ends the
+recording; a second one skips slow steps (messages in transit, compression), a third one ends at once.
+Exit code: 0; 1 if the storage fails or is full; with --replay, 3 if something is missing in the bag.
 
 Examples:
   rp bag record -a                                      every topic
-  rp bag record /tf /tf_static -e '^/camera/' -o drive  some
-  rp bag record -a --replay robot.pcap -o drive         out of a capture")]
+  rp bag record /tf /tf_static -e '^/camera/' -o drive  some topics
+  rp bag record -a --replay robot.pcap -o drive         from a capture")]
 pub(crate) struct Record {
     /// Topics to record
     #[arg(value_name = "TOPIC")]
@@ -58,7 +58,7 @@ pub(crate) struct Record {
     /// Services whose events to record
     #[arg(long, value_name = "SERVICE", num_args = 1..)]
     services: Vec<String>,
-    /// Types of which to record all topics
+    /// Record all topics of these types
     #[arg(long, value_name = "TYPE", num_args = 1..)]
     topic_types: Vec<String>,
     /// Record all topics; from Jazzy on all services, too
@@ -70,68 +70,68 @@ pub(crate) struct Record {
     /// Record the events of all services
     #[arg(long)]
     all_services: bool,
-    /// Record topics and services in whose name this regular expression is found
+    /// Record topics and services whose name matches this regular expression
     #[arg(long, short = 'e')]
     regex: Option<String>,
-    /// Not those in whose name this regular expression is found
+    /// Exclude topics and services whose name matches this regular expression
     #[arg(long, short = 'x', visible_alias = "exclude", value_name = "REGEX")]
     exclude_regex: Option<String>,
-    /// Not these topics
+    /// Exclude these topics
     #[arg(long, value_name = "TOPIC", num_args = 1..)]
     exclude_topics: Vec<String>,
-    /// No topics of these types
+    /// Exclude topics of these types
     #[arg(long, value_name = "TYPE", num_args = 1..)]
     exclude_topic_types: Vec<String>,
-    /// Not the events of these services
+    /// Exclude the events of these services
     #[arg(long, value_name = "SERVICE", num_args = 1..)]
     exclude_services: Vec<String>,
-    /// Declare topics in the bag that nobody publishes
+    /// Declare topics without publishers in the bag
     #[arg(long)]
     include_unpublished_topics: bool,
     /// Record hidden topics as well
     #[arg(long)]
     include_hidden_topics: bool,
-    /// Leave out topics that nobody subscribes to
+    /// Exclude topics without subscriptions
     #[arg(long)]
     ignore_leaf_topics: bool,
-    /// Record only topics that are there at the start
+    /// Record only topics that exist at the start
     #[arg(long)]
     no_discovery: bool,
-    /// Directory to make [default: rosbag2_ and the time, here]
+    /// Directory to create [default: ./rosbag2_TIME]
     #[arg(long, short = 'o', value_name = "DIR")]
     output: Option<PathBuf>,
     /// Storage of the bag: mcap
     #[arg(long, short = 's', default_value = "mcap")]
     storage: String,
-    /// Split when a file reaches so many bytes; 0 = never
+    /// Split when a file reaches this many bytes; 0 = never
     #[arg(long, short = 'b', value_name = "BYTES", default_value_t = 0)]
     max_bag_size: u64,
-    /// Split when a file reaches so many seconds; 0 = never
+    /// Split when a file reaches this many seconds; 0 = never
     #[arg(long, short = 'd', value_name = "SECONDS", default_value_t = 0)]
     max_bag_duration: u64,
-    /// Bytes of messages that may wait for the storage, as far as the agent allows; what finds no
-    /// room is dropped, counted and named
+    /// Bytes of messages that may wait for the storage, limited by the agent; messages that do not
+    /// fit are dropped, counted and reported
     #[arg(long, value_name = "BYTES", default_value_t = CACHE)]
     max_cache_size: u64,
-    /// Compress whole files once they are complete: file
+    /// Compress files after they are complete: file
     #[arg(long, value_name = "none|file", default_value = "none")]
     compression_mode: String,
-    /// How: zstd or lz4
+    /// Format of the compression: zstd or lz4
     #[arg(long, value_name = "FORMAT", default_value = "")]
     compression_format: String,
-    /// How MCAP files are written: none, fastwrite, zstd_fast or zstd_small
+    /// Preset for MCAP files: none, fastwrite, zstd_fast or zstd_small
     #[arg(long, value_name = "PRESET", default_value = "")]
     storage_preset_profile: String,
-    /// YAML file with settings of the storage; goes before the preset
+    /// YAML file with storage settings, which override the preset
     #[arg(long, value_name = "FILE")]
     storage_config_file: Option<PathBuf>,
-    /// Also written into metadata.yaml
+    /// Entry to add to metadata.yaml
     #[arg(long, value_name = "KEY=VALUE", num_args = 1.., value_parser = pair)]
     custom_data: Vec<(String, String)>,
     /// Keep the last messages in memory, up to --max-cache-size, and write them on SIGUSR1
     #[arg(long)]
     snapshot_mode: bool,
-    /// Begin paused
+    /// Start paused
     #[arg(long)]
     start_paused: bool,
     /// Directory with message definitions; may be repeated

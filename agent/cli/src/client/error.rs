@@ -16,8 +16,8 @@ pub enum ClientError {
     NoAgent,
     /// An agent listens, but not for this user.
     #[error(
-        "the agent's socket {} may be used by root and the group ros2probe: \
-         `sudo usermod -aG ros2probe $USER`, then log in again", path.display()
+        "the agent's socket {} is accessible only to root and the group ros2probe: `sudo usermod \
+         -aG ros2probe $USER`, then log in again", path.display()
     )]
     Denied {
         /// The socket.
@@ -38,7 +38,7 @@ pub enum ClientError {
         place: String,
     },
     /// The connection ended within an answer.
-    #[error("the connection to the agent at {place} broke")]
+    #[error("the connection to the agent at {place} was lost")]
     Broke {
         /// Where.
         place: String,

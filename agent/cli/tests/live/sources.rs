@@ -19,7 +19,7 @@ use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::config::{Config, Watchlist};
 use ros2probe_model::input::Input;
-use ros2probe_model::journal::Loss;
+use ros2probe_model::loss::Loss;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::harness::PREFIX;

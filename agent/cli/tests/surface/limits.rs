@@ -19,9 +19,9 @@ use ros2probe_daemon::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
 use ros2probe_daemon::surface::MetricSources;
+use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::payloads::{Dispatch, Sample, SampleOutcome};
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};

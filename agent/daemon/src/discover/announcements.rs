@@ -1,6 +1,6 @@
 //! What a participant announced when it was asked.
 
-use ros2probe_model::topic::Naming;
+use ros2probe_model::naming::Naming;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::entities::NodeEntities;
 

@@ -15,8 +15,8 @@ use crate::series_name::series_name;
 use ros2probe_model::churn;
 use ros2probe_model::diagnosis::{Diagnosis, Policy};
 use ros2probe_model::event::{EventKind, LossBurst, bounded};
+use ros2probe_model::naming::Naming;
 use ros2probe_model::snapshot::WatchState;
-use ros2probe_model::topic::Naming;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
 

@@ -45,13 +45,13 @@ pub struct Filter {
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// No topic can ever match.
-    #[error("name topics, or ask for all of them or those that match a regular expression")]
+    #[error("name topics, or request all of them or those that match a regular expression")]
     Nothing,
     /// Too long a list.
     #[error("more than {MAX_NAMES} names")]
     TooMany,
     /// A name without its leading slash, or a wrong one.
-    #[error("`{0}` is no topic or service name: it must begin with `/`")]
+    #[error("`{0}` is not a topic or service name: it must begin with `/`")]
     Name(String),
     /// A regular expression that cannot be used.
     #[error("the regular expression `{expression}` cannot be used: {reason}")]

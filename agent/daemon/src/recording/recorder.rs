@@ -25,7 +25,7 @@ use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
-use ros2probe_model::payloads::{Offered, Sample};
+use ros2probe_model::dispatch::{Offered, Sample};
 
 /// How often what was taken is handed to the system, by the time of the samples: so much is lost
 /// when the process is killed.

@@ -140,13 +140,16 @@ pub enum Refusal {
     )]
     NoDirectory,
     /// No name of a directory.
-    #[error("`{0}` is no name: letters, digits, `_`, `-` and `.`, not first a `.`")]
+    #[error(
+        "`{0}` is not a valid name: use letters, digits, `_`, `-` and `.`, not starting with \
+             `.`"
+    )]
     Name(String),
     /// There is one of that name.
-    #[error("there is a recording `{0}` already")]
+    #[error("a recording named `{0}` already exists")]
     Exists(String),
     /// As many as may are under way.
-    #[error("{0} recordings are under way, which is the limit (limits.recordings)")]
+    #[error("{0} recordings are running, which is the limit (limits.recordings)")]
     TooMany(usize),
     /// The topics.
     #[error(transparent)]

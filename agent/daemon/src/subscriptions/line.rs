@@ -7,7 +7,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, Timestamp};
 
 use super::Item;
-use ros2probe_model::payloads::{Missed, MissedReason, Offered, Sample, Topic};
+use ros2probe_model::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 
 /// The line for an item of a subscription.
 #[must_use]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_api::samples::{self, Line, Open};
 use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::payloads::{Missed, MissedReason, Sample, Topic};
+use ros2probe_model::dispatch::{Missed, MissedReason, Sample, Topic};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe_model::cause::LossCause;
-use ros2probe_model::journal::DeliveryLoss;
+use ros2probe_model::loss::DeliveryLoss;
+use ros2probe_model::loss::LossCause;
 use ros2probe_model::snapshot::{Delivered, Direction, Snapshot};
 use ros2probe_wire::{EntityId, Guid};
 

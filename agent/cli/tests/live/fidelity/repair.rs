@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_model::cause::LossCause;
+use ros2probe_model::loss::LossCause;
 use ros2probe_model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
 
 use super::experiment::{DISCOVERY, Truth, is, reported, sums};

@@ -33,7 +33,7 @@ use crate::subscriptions::{
 };
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{Library, Limits, MessageType, decode};
-use ros2probe_model::payloads::Sample;
+use ros2probe_model::dispatch::Sample;
 use tree::{ELEMENTS, Tree};
 
 /// Streams at once, of all listeners: each has the bytes of all messages of its topic captured.
@@ -401,7 +401,7 @@ mod tests {
     use crate::agent_facts::SourceKind;
     use crate::snapshot_cell::SnapshotCell;
     use crate::subscriptions::{Caps, Subscriptions};
-    use ros2probe_model::payloads::{Dispatch, SampleOutcome, Topic};
+    use ros2probe_model::dispatch::{Dispatch, SampleOutcome, Topic};
 
     #[test]
     fn messages_that_wait_beyond_the_bytes_go_and_are_counted() {
