@@ -7,7 +7,7 @@ use ros2probe_wire::Timestamp;
 
 use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
-use ros2probe_model::payloads::MissedReason;
+use ros2probe_model::dispatch::MissedReason;
 
 /// One moment of the agent.
 #[derive(Clone, Debug)]

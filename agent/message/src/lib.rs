@@ -27,31 +27,24 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
-mod definition_source;
 mod dialect;
 mod digits;
 mod embedded;
 pub mod filter;
 mod hash;
-mod idl;
-mod implicit_types;
 pub mod library;
 mod name;
-mod numpy;
-mod parse;
 pub mod python;
-mod schema;
-mod search;
 pub mod truncation;
 pub mod value;
 pub mod yaml;
 
 pub use decode::{DecodeError, Decoded, Limits, decode};
+pub use definition::parse::{ParseError, Problem};
 pub use definition::{
     Definition, Element, Field, Kind, MessageType, NotClosed, Shape, Structure, TypeName,
 };
 pub use dialect::Dialect;
 pub use library::{Library, NotFound, Sources};
-pub use parse::{ParseError, Problem};
 pub use truncation::Truncation;
 pub use value::{Array, Items, Message, Scalar, Value};

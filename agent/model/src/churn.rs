@@ -7,7 +7,6 @@ use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::Role;
 
 use super::size::Size;
-use super::snapshot::ChurnCount;
 
 /// Who.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -71,6 +70,19 @@ impl Event {
             Self::Cascaded => "cascaded",
         }
     }
+}
+
+/// One kind of discovery event.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ChurnCount {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// `participant`, `writer`, `reader`, `node`.
+    pub entity: &'static str,
+    /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.
+    pub event: &'static str,
+    /// How often.
+    pub count: u64,
 }
 
 /// The counters.

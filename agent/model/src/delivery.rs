@@ -14,15 +14,16 @@ use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
-use super::cause::LossCause;
 use super::journal::Journal;
+use super::loss::LossCause;
 use super::loss_causes::{LossCauses, REASSEMBLY};
+use super::measurement::Delivered;
 use super::reception::{Outcome, Reception, Whole};
+use super::route::Direction;
 use super::route::Route;
 use super::samples::Budget;
 use super::sequence::REACH;
 use super::size::Size;
-use super::snapshot::{Delivered, Direction};
 use super::undelivered::Undelivered;
 use super::writer::settle_window;
 use accounting::Accounting;

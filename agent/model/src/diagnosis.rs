@@ -6,10 +6,7 @@
 //! value: two lists tell by comparison what came and what went ([`changes`]). Whether a finding is
 //! worth waking somebody for is not decided here.
 
-mod endpoints;
-mod examiner;
 mod matching;
-mod nodes;
 
 use std::cmp::Ordering;
 use std::sync::Arc;
@@ -18,7 +15,7 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
 use super::topic_kind::TopicKind;
-pub use examiner::Examiner;
+pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
 
 /// Which topic a finding is about.

@@ -26,8 +26,8 @@ use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
+use super::naming::Naming;
 use super::size::Size;
-use super::topic::Naming;
 use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;

@@ -16,9 +16,9 @@ use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::churn;
 use super::diagnosis::Diagnosis;
-use super::journal::Loss;
+use super::expectation::WatchState;
+use super::loss::Loss;
 use super::size::Size;
-use super::snapshot::WatchState;
 
 /// Events of one class in a second of the source's clock.
 const MOST: u16 = 512;

@@ -8,7 +8,6 @@
 use ros2probe_wire::Timestamp;
 
 use super::rate::{SECONDS, Slot};
-use super::snapshot::WatchState;
 use crate::watch::Expectations;
 
 /// Consecutive bad judgements until a topic is violated.
@@ -27,6 +26,21 @@ const MAX_RATE: u8 = 1 << 1;
 const MAX_LOSS: u8 = 1 << 2;
 const MAX_LATENCY: u8 = 1 << 3;
 const MAX_SILENCE: u8 = 1 << 4;
+
+/// State of one watchlist entry's expectations on one topic.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub enum WatchState {
+    /// All expectations hold (or there are none) and messages flow.
+    Ok,
+    /// At least one expectation is broken, after hysteresis.
+    Violated,
+    /// Publishers exist but nothing came for longer than `max_silence_s`.
+    Silent,
+    /// No publisher is known.
+    NotPublished,
+    /// Published, but nobody subscribes: writers may send nothing at all.
+    NoSubscriber,
+}
 
 /// What a topic is judged by.
 pub struct Evidence<'a> {
@@ -54,6 +68,29 @@ pub struct Judgement {
     broken: u8,
     bad: u8,
     good: u8,
+}
+
+impl WatchState {
+    /// All states, for exporting one series each.
+    pub const ALL: [Self; 5] = [
+        Self::Ok,
+        Self::Violated,
+        Self::Silent,
+        Self::NotPublished,
+        Self::NoSubscriber,
+    ];
+
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Ok => "ok",
+            Self::Violated => "violated",
+            Self::Silent => "silent",
+            Self::NotPublished => "not_published",
+            Self::NoSubscriber => "no_subscriber",
+        }
+    }
 }
 
 impl Default for Judgement {

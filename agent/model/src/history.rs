@@ -11,9 +11,10 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::histogram::Histogram;
+use super::measurement::Measurement;
 use super::rate::SECONDS as WINDOW;
 use super::size::Size;
-use super::snapshot::{Measurement, TableFacts};
+use super::snapshot::TableFacts;
 
 /// Rows of all seconds together, 24 bytes each: 10 minutes of 436 topics.
 const ROWS: usize = 262_144;

@@ -13,7 +13,7 @@ use std::sync::Arc;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
-use super::payloads::{Dispatch, MAX_UNANNOUNCED, Sample};
+use super::dispatch::{Dispatch, Sample};
 use super::size::Size;
 
 /// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three
@@ -21,6 +21,8 @@ use super::size::Size;
 const PATIENCE: u64 = 4 * SECOND;
 /// Samples that wait at once.
 const WAITING: usize = 4096;
+/// Numbers of one unannounced writer that are remembered.
+pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// Samples from before the announcement come again within this time, or not at all.
 const AGAIN: u64 = 10 * SECOND;
 /// What keeping a sample costs besides its payload.

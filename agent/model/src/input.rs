@@ -7,10 +7,10 @@ use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp};
 
 use crate::discovery::Memory;
+use crate::dispatch::Dispatch;
 use crate::event::Taken;
-use crate::payloads::Dispatch;
 use crate::selection::SampleRequest;
-use crate::snapshot::SocketFacts;
+use crate::sockets::SocketFacts;
 use crate::trace::Spans;
 use crate::watch::Watchlist;
 

@@ -1,14 +1,13 @@
 //! The latest events, oldest first: bounded lists for whoever asks what happened, not how often.
 
 use std::collections::VecDeque;
-use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
-use super::cause::LossCause;
+use super::dispatch::MissedReason;
 use super::event::Events;
-use super::payloads::MissedReason;
+use super::loss::{DeliveryLoss, Loss};
 use super::size::Size;
 
 /// Entries kept of discovery events and of writers' losses each.
@@ -35,19 +34,6 @@ pub struct DiscoveryEvent {
     pub name: Arc<str>,
 }
 
-/// Consecutive samples that were settled as lost.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Loss {
-    /// When it was settled.
-    pub at: Timestamp,
-    /// Whose.
-    pub writer: Guid,
-    /// First lost sequence number.
-    pub first: u64,
-    /// Last lost sequence number.
-    pub last: u64,
-}
-
 /// Consecutive samples that subscriptions will not get, until they are taken.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Missing {
@@ -59,27 +45,6 @@ pub struct Missing {
     pub last: u64,
     /// Why; an incomplete one stands alone.
     pub reason: MissedReason,
-}
-
-/// Consecutive samples that one receiver lost, told once the cause is known.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct DeliveryLoss {
-    /// When the cause was settled.
-    pub at: Timestamp,
-    /// Whose samples.
-    pub writer: Guid,
-    /// The participant that missed them, where it was known.
-    pub participant: Option<GuidPrefix>,
-    /// Cookie of the socket by which the writer's new samples come; 0 on a wire source.
-    pub socket: u64,
-    /// Where they come to.
-    pub destination: SocketAddr,
-    /// Where they died.
-    pub cause: LossCause,
-    /// First lost sequence number.
-    pub first: u64,
-    /// Last lost sequence number.
-    pub last: u64,
 }
 
 /// All lists.

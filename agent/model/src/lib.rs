@@ -1,7 +1,9 @@
 //! The core: a state machine without clock, thread or I/O. Time and bytes come in, facts go out.
 //!
 //! - [`observer::Observer`] takes one [`input::Input`] after the other, each with its time, and is
+//!   drained of its [`input::Output`].
 //! - [`snapshot::Snapshot`] is all that it knows at a moment: participants, endpoints, topics and
+//!   what was counted of them.
 //! - [`interest`] is the verdict for each writer that the kernel programs need.
 //! - [`watch`] and [`limits`] are what an operator wants measured, and how much it may take.
 //!
@@ -22,14 +24,15 @@
 
 pub mod acknowledgement;
 pub mod assembly;
-pub mod cause;
 pub mod churn;
 pub mod delivery;
 pub mod departures;
 pub mod diagnosis;
 pub mod discovery;
 pub mod discovery_fragments;
+pub mod dispatch;
 pub mod event;
+pub mod examiner;
 pub mod expectation;
 pub mod glob;
 pub mod header;
@@ -41,14 +44,16 @@ pub mod input;
 pub mod interest;
 pub mod journal;
 pub mod limits;
+pub mod loss;
 pub mod loss_causes;
+pub mod measurement;
+pub mod naming;
 pub mod observer;
 pub mod payloads;
 pub mod profiler;
 pub mod rate;
 pub mod receivers;
 pub mod reception;
-mod report;
 pub mod route;
 pub mod routes;
 pub mod sampled;

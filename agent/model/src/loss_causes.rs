@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
-use super::cause::LossCause;
+use super::loss::LossCause;
 use super::size::Size;
 
 /// Samples remembered of one receiver: a few seconds of a busy topic's losses.

@@ -4,8 +4,10 @@
 //! same facts, live or replayed at any speed. It reads no clock, sends nothing and keeps no packet.
 
 mod announcements;
+mod calendar;
 mod clock;
 mod lists;
+mod report;
 mod samples;
 mod settings;
 
@@ -20,20 +22,22 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Outcome};
 use ros2probe_wire::{DomainId, Guid, Reason, Record, Timestamp};
 
-use super::diagnosis::Examiner;
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use super::discovery_fragments::DiscoveryFragments;
 use super::event::bounded_shared;
+use super::examiner::Examiner;
 use super::input::{Input, Output};
 use super::interest::Interest;
 use super::journal::Journal;
+use super::measurement::Measurement;
+use super::naming::Naming;
 use super::payloads::Payloads;
 use super::profiler::{Profiler, RecordOutcome, UNDELIVERED};
 use super::receivers::Receivers;
 use super::selection::SampleRequest;
 use super::size::Size;
-use super::snapshot::{Measurement, Snapshot};
-use super::topic::{Naming, TopicId, Topics, Watched};
+use super::snapshot::Snapshot;
+use super::topic::{TopicId, Topics, Watched};
 use super::trace::{Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
@@ -322,7 +326,7 @@ impl Observer {
     /// All facts at this moment.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
-        let mut snapshot = super::report::snapshot(self, self.wall_clock.model_time(now));
+        let mut snapshot = report::snapshot(self, self.wall_clock.model_time(now));
         self.wall_clock.convert_snapshot(&mut snapshot);
         snapshot
     }
@@ -332,7 +336,7 @@ impl Observer {
         &self,
         now: Timestamp,
     ) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
-        super::report::measured(self, self.wall_clock.model_time(now))
+        report::measured(self, self.wall_clock.model_time(now))
     }
 
     /// Counts a parse failure, also of those outside who parse for the core.

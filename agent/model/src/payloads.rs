@@ -5,8 +5,6 @@
 //! What waits to be taken is bounded; what finds no room is counted and told. It measures nothing:
 //! whether somebody wants samples changes no number.
 
-mod sample;
-
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
@@ -14,23 +12,15 @@ use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, Timestamp, record};
 
 use super::assembly::Assembly;
-use super::in_order::{Due, InOrder, Progress};
+use super::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
+use super::in_order::{Due, InOrder, MAX_UNANNOUNCED, Progress};
 use super::journal::Missing;
+use super::selection::RequestIds;
 use super::size::{Size, largest};
-use super::topic::RequestIds;
 use super::writer::Counted;
-pub use sample::Dispatch;
-pub use sample::Missed;
-pub use sample::MissedReason;
-pub use sample::Offered;
-pub use sample::Sample;
-pub use sample::SampleOutcome;
-pub use sample::Topic;
 
 /// Entries that wait to be taken: a round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
-/// Numbers of one unannounced writer that are remembered.
-pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
 /// not told of.
 pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;

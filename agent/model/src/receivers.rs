@@ -21,7 +21,7 @@ use addresses::AnnouncedAddresses;
 use super::discovery::Discovery;
 use super::route::{Destination, Route};
 use super::size::Size;
-use super::snapshot::SocketFacts;
+use super::sockets::SocketFacts;
 use super::sockets::Sockets;
 use super::topic::{Topic, Topics};
 use super::wall_clock::WallClock;

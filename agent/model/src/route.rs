@@ -5,7 +5,25 @@ use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::flag;
 
-use super::snapshot::Direction;
+/// Which side of the network a delivery was seen at.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
+pub enum Direction {
+    /// On its way out of this host. Losses are not counted here: what did not leave is nobody's.
+    Sent,
+    /// At a receiver.
+    Received,
+}
+
+impl Direction {
+    /// Label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Sent => "sent",
+            Self::Received => "received",
+        }
+    }
+}
 
 /// A UDP destination.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]

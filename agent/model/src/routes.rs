@@ -9,9 +9,9 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::receivers::{GraphView, Matched};
+use super::route::Direction;
 use super::route::{Destination, Route};
 use super::size::Size;
-use super::snapshot::Direction;
 use super::topic::Topic;
 
 /// Routes of one writer.

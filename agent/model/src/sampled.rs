@@ -9,9 +9,9 @@
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
 
+use super::measurement::SampledFacts;
 use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
-use super::snapshot::SampledFacts;
 
 /// A writer that was not seen in shared memory for so long is not sampled any more.
 const HOLD: u64 = 10 * SECOND;

@@ -9,7 +9,7 @@ use regex::bytes::{Regex, RegexBuilder};
 use ros2probe_wire::DomainId;
 
 use super::glob;
-use super::topic::Naming;
+use super::naming::Naming;
 use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
@@ -82,6 +82,15 @@ pub struct SampleRequest {
     pub domain_id: Option<DomainId>,
     /// How much of them.
     pub depth: Depth,
+}
+
+/// Requests for the samples of one topic.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RequestIds {
+    /// Whose.
+    pub ids: Arc<[u64]>,
+    /// Those of them that want the bytes.
+    pub payloads: Arc<[u64]>,
 }
 
 impl Choice {
@@ -202,6 +211,30 @@ impl SampleRequest {
             && self
                 .selection
                 .covers(naming.kind, &naming.name, &naming.dds_name, naming.hidden)
+    }
+}
+
+impl RequestIds {
+    /// Which requests cover this topic; `None` = no request does.
+    pub(super) fn of(
+        domain_id: DomainId,
+        naming: &Naming,
+        sample_requests: &[SampleRequest],
+    ) -> Option<Self> {
+        let covering = sample_requests
+            .iter()
+            .filter(|request| request.covers(domain_id, naming));
+        let covering: Vec<_> = covering.collect();
+        let of_depth = |depth| {
+            let deep = covering
+                .iter()
+                .filter(move |request| request.depth >= depth);
+            deep.map(|request| request.id).collect()
+        };
+        (!covering.is_empty()).then(|| Self {
+            ids: of_depth(Depth::Arrivals),
+            payloads: of_depth(Depth::Payloads),
+        })
     }
 }
 

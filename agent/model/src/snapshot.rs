@@ -9,14 +9,15 @@ use std::sync::Arc;
 
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
-pub use delivery::{
-    AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts,
-};
-
+pub use super::churn::ChurnCount;
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
-use super::histogram::Histogram;
+pub use super::expectation::WatchState;
+pub use super::measurement::{Breakdown, Delivered, Measurement, SampledFacts};
+pub use super::route::Direction;
+pub use super::sockets::SocketFacts;
 use super::topic_kind::TopicKind;
+pub use delivery::{AcknowledgementFacts, DeliveryFacts};
 
 /// All facts at `at`. Lists are sorted by their identity.
 #[derive(Clone, Debug, Default)]
@@ -246,100 +247,6 @@ pub struct EndpointFacts {
     pub transports: u8,
 }
 
-/// What was counted while the topic was watched. Counters never go down while the topic lives.
-#[derive(Clone, Debug, Default)]
-pub struct Measurement {
-    /// Samples received whole, each once.
-    pub messages: u64,
-    /// Their payload bytes, encapsulation included (as `ros2 topic bw` counts).
-    pub bytes: u64,
-    /// Samples settled as lost: a sequence gap that nothing excused or filled in time.
-    pub lost: u64,
-    /// Samples that filled a gap later, by retransmission or reordering.
-    pub recovered: u64,
-    /// Samples and fragments seen again.
-    pub duplicates: u64,
-    /// Samples whose fragments never became complete (also counted in `lost` once settled).
-    pub incomplete: u64,
-    /// Samples excused by GAP, by the ACKNACKs of readers that have them, or because the kernel did
-    /// not know their writer yet.
-    pub irrelevant: u64,
-    /// Time of the last new sample.
-    pub last_message: Option<Timestamp>,
-    /// Messages a second over the last window; for people, never for rules.
-    pub rate_hz: f64,
-    /// Payload bytes a second over the same window.
-    pub bandwidth: f64,
-    /// Seconds between consecutive samples of one writer.
-    pub interarrival: Histogram,
-    /// Capture time minus INFO_TS, seconds. Needs synchronised clocks across hosts.
-    pub source_latency: Histogram,
-    /// Capture time minus `std_msgs/Header.stamp`, seconds, where the type begins with a header.
-    pub header_latency: Histogram,
-    /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
-    pub negative_latency: u64,
-    /// Samples whose INFO_TS lies more than an hour before or after their capture time (a clock
-    /// that was never set, or a forgery); not in the histograms.
-    pub implausible_latency: u64,
-    /// How often the writer's numbers left their run, and one record did not suffice to believe it.
-    pub sequence_jumps: u64,
-    /// Present when some of this was read from shared memory, which is a sampled view: messages are
-    /// then counted by the span of their numbers, and times are those of the samples that were
-    /// seen.
-    pub sampled: Option<SampledFacts>,
-}
-
-/// How much a sampled view saw.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct SampledFacts {
-    /// Samples of which at least a part was seen.
-    pub seen: u64,
-    /// Samples that there were, by their sequence numbers.
-    pub span: u64,
-    /// How often so much time passed between two looks that something may have gone unnoticed.
-    pub uncertain: u64,
-}
-
-impl Measurement {
-    /// Adds all of `other`, as a topic adds up its writers.
-    pub fn add(&mut self, other: &Self) {
-        self.messages += other.messages;
-        self.bytes += other.bytes;
-        self.lost += other.lost;
-        self.recovered += other.recovered;
-        self.duplicates += other.duplicates;
-        self.incomplete += other.incomplete;
-        self.irrelevant += other.irrelevant;
-        self.last_message = self.last_message.max(other.last_message);
-        self.rate_hz += other.rate_hz;
-        self.bandwidth += other.bandwidth;
-        self.interarrival.merge(&other.interarrival);
-        self.source_latency.merge(&other.source_latency);
-        self.header_latency.merge(&other.header_latency);
-        self.negative_latency += other.negative_latency;
-        self.implausible_latency += other.implausible_latency;
-        self.sequence_jumps += other.sequence_jumps;
-        if let Some(other) = &other.sampled {
-            let sampled = self.sampled.get_or_insert_default();
-            sampled.seen += other.seen;
-            sampled.span += other.span;
-            sampled.uncertain += other.uncertain;
-        }
-    }
-}
-
-impl SampledFacts {
-    /// Seen of those that there were; `None` while there were none.
-    #[must_use]
-    #[expect(
-        clippy::cast_precision_loss,
-        reason = "a ratio of counts far below 2^52"
-    )]
-    pub fn coverage(&self) -> Option<f64> {
-        (self.span > 0).then(|| self.seen as f64 / self.span as f64)
-    }
-}
-
 /// A writer that sends without a known announcement.
 #[derive(Clone, Debug)]
 pub struct UnknownWriterFacts {
@@ -353,44 +260,6 @@ pub struct UnknownWriterFacts {
     pub first_seen: Timestamp,
     /// Measured like any writer.
     pub measurement: Measurement,
-}
-
-/// State of one watchlist entry's expectations on one topic.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum WatchState {
-    /// All expectations hold (or there are none) and messages flow.
-    Ok,
-    /// At least one expectation is broken, after hysteresis.
-    Violated,
-    /// Publishers exist but nothing came for longer than `max_silence_s`.
-    Silent,
-    /// No publisher is known.
-    NotPublished,
-    /// Published, but nobody subscribes: writers may send nothing at all.
-    NoSubscriber,
-}
-
-impl WatchState {
-    /// All states, for exporting one series each.
-    pub const ALL: [Self; 5] = [
-        Self::Ok,
-        Self::Violated,
-        Self::Silent,
-        Self::NotPublished,
-        Self::NoSubscriber,
-    ];
-
-    /// Label value.
-    #[must_use]
-    pub const fn label(self) -> &'static str {
-        match self {
-            Self::Ok => "ok",
-            Self::Violated => "violated",
-            Self::Silent => "silent",
-            Self::NotPublished => "not_published",
-            Self::NoSubscriber => "no_subscriber",
-        }
-    }
 }
 
 /// One watchlist entry and the topics it covers now.
@@ -416,19 +285,6 @@ pub struct WatchedTopicFacts {
     pub state: WatchState,
     /// Which expectations are broken: `min_rate_hz`, `max_loss_ratio`, ...
     pub violations: Vec<&'static str>,
-}
-
-/// One kind of discovery event.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ChurnCount {
-    /// Domain.
-    pub domain_id: DomainId,
-    /// `participant`, `writer`, `reader`, `node`.
-    pub entity: &'static str,
-    /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.
-    pub event: &'static str,
-    /// How often.
-    pub count: u64,
 }
 
 /// Parse failures of one kind.

@@ -7,7 +7,24 @@
 use std::collections::BTreeMap;
 
 use super::size::Size;
-use super::snapshot::SocketFacts;
+
+/// What is known of one socket from outside the packets.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SocketFacts {
+    /// `SO_COOKIE`.
+    pub cookie: u64,
+    /// Process that holds it.
+    pub process_id: Option<u32>,
+    /// The same process as it knows itself: in a container another number, which is the one that
+    /// participants announce.
+    pub own_process_id: Option<u32>,
+    /// Its name.
+    pub process: Option<String>,
+    /// Control group, as a path below the root.
+    pub cgroup: Option<String>,
+    /// Datagrams that the socket had no room for and of which it is not known what they held.
+    pub unidentified_drops: u64,
+}
 
 /// All known sockets.
 #[derive(Debug)]

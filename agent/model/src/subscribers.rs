@@ -24,13 +24,15 @@ use super::delivery::{Delivery, DeliveryContext, Receiver, Totals, seconds};
 use super::departures::Departures;
 use super::header::PLAUSIBLE;
 use super::journal::Journal;
+use super::measurement::Breakdown;
 use super::receivers::{GraphView, Matched};
 use super::reception::Whole;
+use super::route::Direction;
 use super::route::Route;
 use super::routes::{KnownRoute, Routes};
 use super::samples::Budget;
 use super::size::Size;
-use super::snapshot::{AcknowledgementFacts, Breakdown, Direction};
+use super::snapshot::AcknowledgementFacts;
 use super::topic::{Topic, TopicId};
 use lifecycle::is_best_effort;
 

@@ -8,37 +8,19 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
-use super::selection::{Depth, SampleRequest};
+use super::measurement::Measurement;
+use super::naming::Naming;
+use super::selection::{RequestIds, SampleRequest};
 use super::size::Size;
-use super::snapshot::Measurement;
-use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
 /// Handle of a topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TopicId(u64);
-
-/// What a topic is called and what it is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Naming {
-    /// DDS name; of a CPU buffer topic that of the topic beside it.
-    pub dds_name: Arc<str>,
-    /// ROS name, or the DDS name.
-    pub name: Arc<str>,
-    /// What it is.
-    pub kind: TopicKind,
-    /// Hidden by ROS convention.
-    pub hidden: bool,
-    /// The endpoint serves the topic from beside it, and is not one of its publishers.
-    pub is_buffer: bool,
-    /// Its samples are messages.
-    pub counts: bool,
-}
 
 /// Whether a topic is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,15 +31,6 @@ pub enum Watched {
     Yes,
     /// Asked for, but the cap is reached.
     Rejected,
-}
-
-/// Requests for the samples of one topic.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RequestIds {
-    /// Whose.
-    pub ids: Arc<[u64]>,
-    /// Those of them that want the bytes.
-    pub payloads: Arc<[u64]>,
 }
 
 /// One topic.
@@ -112,102 +85,6 @@ pub struct Topics {
     pub rejected: u64,
     /// Vanished topics given up before their grace period ended.
     pub evictions: u64,
-}
-
-impl Naming {
-    /// Of a DDS topic.
-    #[must_use]
-    pub fn of(topic: &DdsTopic) -> Self {
-        let demangled = topic.demangle();
-        let kind = TopicKind::of_demangled(&demangled);
-        let (is_buffer, counts) = match demangled {
-            Demangled::CpuBuffer(_) => (true, true),
-            Demangled::Buffer(_) => (true, false),
-            _ => (false, true),
-        };
-        let named = |name: &RosName, dds_name: &DdsTopic| Self {
-            dds_name: dds_name.as_str().into(),
-            name: name.as_str().into(),
-            kind,
-            hidden: name.is_hidden(),
-            is_buffer,
-            counts,
-        };
-        match &demangled {
-            Demangled::CpuBuffer(name) | Demangled::Buffer(name) => {
-                named(name, &DdsTopic::of_topic(name))
-            }
-            Demangled::Topic(name)
-            | Demangled::ServiceRequest(name)
-            | Demangled::ServiceReply(name) => named(name, topic),
-            Demangled::RosDiscovery | Demangled::NotRos => Self::verbatim(topic, kind),
-        }
-    }
-
-    fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
-        let name: Arc<str> = topic.as_str().into();
-        Self {
-            dds_name: Arc::clone(&name),
-            name,
-            kind,
-            hidden: false,
-            is_buffer: false,
-            counts: true,
-        }
-    }
-
-    /// Watchlist entries that cover it. Entries are about topics: services are covered only by
-    /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
-    /// `/**` is every topic that `ros2 topic list` shows.
-    fn covered_by(&self, domain_id: DomainId, watchlist: &Watchlist) -> Vec<usize> {
-        let mut covering = watchlist.matching(domain_id, self.watched_as());
-        if self.hidden && !self.kind.is_service() {
-            let names_hidden = |index: &usize| {
-                watchlist
-                    .watches()
-                    .get(*index)
-                    .is_some_and(|watch| watch.pattern.contains("/_"))
-            };
-            covering.retain(names_hidden);
-        }
-        covering
-    }
-
-    /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
-    pub(super) fn is_named_by(&self, domain_id: Option<DomainId>, watchlist: &Watchlist) -> bool {
-        watchlist.names(domain_id, self.watched_as())
-    }
-
-    /// The name that watches are about.
-    fn watched_as(&self) -> &str {
-        if self.kind.is_service() {
-            &self.dds_name
-        } else {
-            &self.name
-        }
-    }
-
-    /// Who wants its samples.
-    fn requested_by(
-        &self,
-        domain_id: DomainId,
-        sample_requests: &[SampleRequest],
-    ) -> Option<RequestIds> {
-        let covering = sample_requests
-            .iter()
-            .filter(|request| request.covers(domain_id, self));
-        let covering: Vec<_> = covering.collect();
-        let of_depth = |depth| {
-            let deep = covering
-                .iter()
-                .filter(move |request| request.depth >= depth);
-            deep.map(|request| request.id).collect()
-        };
-        (!covering.is_empty()).then(|| RequestIds {
-            ids: of_depth(Depth::Arrivals),
-            payloads: of_depth(Depth::Payloads),
-        })
-    }
 }
 
 impl Topic {
@@ -413,7 +290,7 @@ impl Topics {
         let topic = self.topics.get(&id)?;
         let is_named = topic.naming.is_named_by(Some(topic.domain_id), watchlist);
         let covering = topic.naming.covered_by(topic.domain_id, watchlist);
-        let requested = topic.naming.requested_by(topic.domain_id, sample_requests);
+        let requested = RequestIds::of(topic.domain_id, &topic.naming, sample_requests);
         let before = topic.watched;
         let mut displaced = None;
         let after = if covering.is_empty() && requested.is_none() {

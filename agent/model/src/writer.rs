@@ -11,17 +11,18 @@ use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
 
+use super::dispatch::MissedReason;
 use super::histogram::Histogram;
 use super::in_order::Progress;
-use super::journal::{Journal, Loss, Missing};
-use super::payloads::MissedReason;
+use super::journal::{Journal, Missing};
+use super::loss::Loss;
+use super::measurement::Measurement;
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception};
 use super::sampled::Sampled;
 use super::samples::Budget;
 use super::sequence::{FAR, REACH};
 use super::size::Size;
-use super::snapshot::Measurement;
 use super::wall_clock::WallClock;
 
 /// How long a gap of a best-effort writer may fill by reordering.

@@ -28,16 +28,9 @@ const ALLOWED: &[(&str, &[&str])] = &[
         "daemon",
         &["wire", "model", "capture", "message", "bag", "api", "page"],
     ),
-    // The package is called ros2probe. A running agent is asked through the API alone. What needs
-    // more: a replay within the process (`client/replay_agent.rs`) and `rp discover` (`ask.rs`)
-    // compose a capture and a model; `rp doctor` examines this host as the capture does; `rp bag
-    // record` (`client/samples.rs`) gives the daemon's recorder samples of the model.
-    (
-        "cli",
-        &[
-            "wire", "model", "capture", "message", "bag", "api", "daemon",
-        ],
-    ),
+    // The package is called ros2probe. It asks a running agent through the API alone; the daemon
+    // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.
+    ("cli", &["message", "bag", "api", "daemon"]),
 ];
 
 /// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.

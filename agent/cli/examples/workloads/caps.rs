@@ -98,6 +98,12 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         unreclaimable: settled()?,
     });
     let page = scraped(&agent)?;
+    print(steps, page);
+    Ok(())
+}
+
+/// Prints the table of what each kind of entry costs, and the cost of a scrape.
+fn print(steps: Vec<Step>, page: Scraped) {
     println!(
         "| entries | how many | MB unreclaimable | bytes each |\n| --- | ---: | ---: | ---: |"
     );
@@ -128,7 +134,6 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         bytes as f64 / 1e6,
         unreclaimable as f64 / 1e6,
     );
-    Ok(())
 }
 
 /// The maximum memory during a scrape, and the scraped figures.

@@ -13,7 +13,7 @@ use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use crate::report::Miss;
 use ros2probe_testing::harness::agent::{Agent, METRICS, get};

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use crate::footprint::{TOPICS, configured, crowd, wait_for_topics};
 use crate::report::Miss;

@@ -4,8 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use ros2probe_capture::pcap::Speed;
-use ros2probe_daemon::agent::{Listen, Options};
+use ros2probe_daemon::agent::{Listen, Options, Speed};
 use ros2probe_daemon::config::{Access, Watch};
 
 #[derive(Debug, Args)]

@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::top::{self, Column, Options};
-use ros2probe_capture::pcap::Speed;
+use ros2probe_daemon::agent::Speed;
 
 use super::{Output, UserError};
 

@@ -5,8 +5,6 @@ use std::path::PathBuf;
 
 use ros2probe_api::problem::{Code, Problem, URN};
 
-use ros2probe_capture::pcap::PcapError;
-
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
@@ -106,7 +104,7 @@ pub enum ClientError {
         /// The file.
         path: PathBuf,
         /// Why not.
-        source: PcapError,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// Not even a connection could be begun.
     #[error("cannot start the runtime of the connection")]

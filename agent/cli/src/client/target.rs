@@ -7,10 +7,9 @@ use clap::Args;
 
 use super::ClientError;
 use crate::ros2::{Dialect, dialect};
+use ros2probe_api::MAX_DOMAIN_ID;
 use ros2probe_daemon::run::CaptureTime;
 
-/// Highest domain there is.
-const MAX_DOMAIN: u32 = 232;
 /// A longer file is no token.
 const MAX_TOKEN: u64 = 4096;
 
@@ -38,7 +37,7 @@ pub struct Target {
     pub until: Option<CaptureTime>,
     /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
     #[arg(long = "domain", value_name = "N",
-        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
+        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN_ID)))]
     pub domain_id: Option<u32>,
     /// Distribution whose output to print [default: $ROS_DISTRO, else jazzy]
     #[arg(long, value_name = "DISTRO", value_parser = dialect::parser(), hide_possible_values = true)]
@@ -47,7 +46,7 @@ pub struct Target {
 
 /// The environment says what cannot be.
 #[derive(Debug, thiserror::Error)]
-#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN}")]
+#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN_ID}")]
 pub struct InvalidEnvironment(String);
 
 impl Target {
@@ -63,7 +62,7 @@ impl Target {
             Ok(text) if !text.trim().is_empty() => {
                 let domain_id = text.trim().parse().ok();
                 domain_id
-                    .filter(|domain_id| *domain_id <= MAX_DOMAIN)
+                    .filter(|domain_id| *domain_id <= MAX_DOMAIN_ID)
                     .ok_or(InvalidEnvironment(text))
             }
             _ => Ok(0),

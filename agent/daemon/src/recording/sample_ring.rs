@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 
-use ros2probe_model::payloads::Sample;
+use ros2probe_model::dispatch::Sample;
 
 /// What keeping a sample costs besides its payload.
 const OVERHEAD: usize = 256;

@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
 use super::{Depth, Item, Overflow, Request, Selection};
-use ros2probe_model::payloads::{Missed, MissedReason, Sample};
+use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::selection::SampleRequest;
 
 /// What a queued entry costs besides a payload.

@@ -7,7 +7,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{Duration, Timestamp};
 
 use super::Item;
-use ros2probe_model::payloads::{Missed, MissedReason, Offered, Sample, Topic};
+use ros2probe_model::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 
 /// The line for an item of a subscription.
 #[must_use]
@@ -78,8 +78,7 @@ pub fn offered(offered: &Offered) -> samples::Offered {
 }
 
 /// What a writer announced, as discovery has it.
-#[must_use]
-pub fn announced(offered: &samples::Offered) -> Offered {
+pub(super) fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
         qos: qos(&offered.qos),

@@ -11,9 +11,9 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::Durability;
 
 use crate::config::{Retain, Watch};
-use ros2probe_model::payloads::{Sample, Topic};
+use ros2probe_model::dispatch::{Sample, Topic};
+use ros2probe_model::naming::Naming;
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
-use ros2probe_model::topic::Naming;
 
 /// From here on ids are those of wishes for what is retained, not of readers.
 const FIRST: u64 = 1 << 63;
@@ -125,7 +125,7 @@ mod tests {
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
 
     use super::*;
-    use ros2probe_model::payloads::Offered;
+    use ros2probe_model::dispatch::Offered;
 
     fn writer(number: u8) -> Guid {
         Guid {

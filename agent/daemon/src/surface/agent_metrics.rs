@@ -16,7 +16,7 @@ use crate::limit_facts::{LimitFacts, LimitFigures};
 use crate::recording::{RecordingFigures, SnapshotFigures};
 use crate::settings_cell::Reload;
 use crate::snapshot_cell::State;
-use ros2probe_model::payloads::MissedReason;
+use ros2probe_model::dispatch::MissedReason;
 
 /// What runs, where its packets come from, and whether it sees.
 pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -> fmt::Result {

@@ -9,8 +9,8 @@ use super::catalogue::{self as metric, Metric};
 use super::metric_sink::{Family, Label, MetricSink, Number};
 use super::ros2_metrics::TopicRow;
 use crate::settings_cell::Settings;
-use ros2probe_model::cause::LossCause;
 use ros2probe_model::histogram::Histogram;
+use ros2probe_model::loss::LossCause;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts, TopicFacts,
 };

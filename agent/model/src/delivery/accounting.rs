@@ -3,12 +3,14 @@
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::Receiver;
-use crate::cause::LossCause;
-use crate::journal::{DeliveryLoss, Journal};
+use crate::journal::Journal;
+use crate::loss::DeliveryLoss;
+use crate::loss::LossCause;
 use crate::loss_causes::LossCauses;
+use crate::measurement::{Breakdown, Delivered};
 use crate::reception::Decision;
+use crate::route::Direction;
 use crate::route::Route;
-use crate::snapshot::{Breakdown, Delivered, Direction};
 
 /// What is counted of all deliveries of a writer.
 #[derive(Clone, Debug, Default)]

@@ -10,8 +10,8 @@ use super::{JUMP, Observer, TICK, graph};
 use crate::diagnosis;
 use crate::event::{EventKind, bounded, bounded_finding, bounded_shared};
 use crate::expectation::Evidence;
+use crate::expectation::WatchState;
 use crate::rate::Slot;
-use crate::snapshot::WatchState;
 
 impl Observer {
     /// Says what time it is: ends leases, settles gaps, judges expectations.

@@ -9,8 +9,8 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use super::{MATCHES_AT_ONCE, Observer, graph, naming};
 use crate::discovery::Endpoint;
+use crate::dispatch::{self, Offered};
 use crate::header::begins_with_header;
-use crate::payloads::{self, Offered};
 use crate::selection::SampleRequest;
 use crate::topic::{Topic, TopicId, Watched};
 use crate::topic_kind::TopicKind;
@@ -130,7 +130,7 @@ impl Observer {
                 self.interest.set(guid, verdict);
                 match &topic.requested {
                     Some(requested) if measured => {
-                        let topic = payloads::Topic {
+                        let topic = dispatch::Topic {
                             domain_id: topic.domain_id,
                             name: Arc::clone(&topic.naming.name),
                             dds_name: Arc::clone(&topic.naming.dds_name),

@@ -1,3 +1,4 @@
+use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{EntityId, GuidPrefix};
 
 use super::*;

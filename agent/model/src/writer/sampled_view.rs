@@ -4,8 +4,8 @@ use ros2probe_wire::record::{Body, Sample, flag};
 use ros2probe_wire::{Record, Timestamp};
 
 use super::{Counted, MeasurementContext, Writer, reach, record_time, seconds};
+use crate::dispatch::MissedReason;
 use crate::journal::{Journal, Missing};
-use crate::payloads::MissedReason;
 use crate::sampled::{Sampled, SampledUpdate, Seen};
 use crate::samples::Budget;
 

@@ -5,8 +5,8 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
+use ros2probe_model::dispatch::{Dispatch, SampleOutcome};
 use ros2probe_model::input::Input;
-use ros2probe_model::payloads::{Dispatch, SampleOutcome};
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_model::snapshot::Measurement;
 use ros2probe_testing::model::host::{BOB, Host, Seen};

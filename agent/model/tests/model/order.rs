@@ -4,9 +4,9 @@
 use std::sync::Arc;
 
 use proptest::prelude::*;
+use ros2probe_model::dispatch::{MissedReason, SampleOutcome};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Settings;
-use ros2probe_model::payloads::{MissedReason, SampleOutcome};
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;

@@ -25,13 +25,20 @@ const ANSWERS: [&str; 9] = [
     "snapshot/delivery.rs",
     "discovery/memory.rs",
     "diagnosis.rs",
-    "diagnosis/endpoints.rs",
-    "report/deliveries.rs",
+    "examiner/endpoints.rs",
+    "observer/report/deliveries.rs",
     "selection.rs",
     "watch.rs",
 ];
 /// Likewise single structs: what is handed out, what lasts for one look, lengths.
-const ANSWER: [&str; 5] = ["Taken", "Findings", "UnknownWriters", "SpanStage", "Past"];
+const ANSWER: [&str; 6] = [
+    "Taken",
+    "Findings",
+    "UnknownWriters",
+    "SpanStage",
+    "Past",
+    "SocketFacts",
+];
 /// What others hold and the model only shares.
 const SHARED: [&str; 2] = ["Arc<", "&'"];
 

@@ -3,8 +3,8 @@
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
 
-use ros2probe_model::cause::LossCause;
 use ros2probe_model::input::Input;
+use ros2probe_model::loss::LossCause;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Measurement, Snapshot, SocketFacts, TopicFacts,

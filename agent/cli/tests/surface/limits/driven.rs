@@ -172,7 +172,7 @@ pub const FIXED: &[[&str; 4]] = &[
     ],
     [
         "PER_KIND",
-        "agent/model/src/diagnosis/examiner.rs",
+        "agent/model/src/examiner.rs",
         "agent/cli/tests/surface/caps.rs",
         "findings_of_one_kind_beyond_the_cap_are_left_out",
     ],

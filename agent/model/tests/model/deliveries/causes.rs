@@ -1,7 +1,7 @@
 //! Where a sample was lost: before the host, in a socket buffer, in reassembly.
 
-use ros2probe_model::cause::LossCause;
 use ros2probe_model::input::Input;
+use ros2probe_model::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};

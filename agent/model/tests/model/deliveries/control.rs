@@ -1,6 +1,6 @@
 //! HEARTBEAT and ACKNACK: what a writer still has, and what a reader waits for.
 
-use ros2probe_model::cause::LossCause;
+use ros2probe_model::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CAROL, Host};
 
 #[test]

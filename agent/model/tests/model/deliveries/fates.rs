@@ -1,7 +1,7 @@
 //! Every sample that was sent is delivered, lost for one cause or irrelevant, whatever happens.
 
 use proptest::prelude::*;
-use ros2probe_model::cause::LossCause;
+use ros2probe_model::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, Host, Seen};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};

@@ -2,7 +2,7 @@
 
 use std::net::SocketAddrV4;
 
-use ros2probe_model::cause::LossCause;
+use ros2probe_model::loss::LossCause;
 use ros2probe_model::observer::Settings;
 use ros2probe_model::snapshot::Direction;
 use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, Seen};

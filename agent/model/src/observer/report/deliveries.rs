@@ -7,8 +7,10 @@ use ros2probe_wire::{EntityId, Guid, Timestamp};
 use crate::delivery::{Delivery, Receiver, Totals};
 use crate::observer::Observer;
 use crate::receivers::readers;
+use crate::route::Direction;
 use crate::routes::KnownRoute;
-use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Direction, SocketFacts};
+use crate::snapshot::{AcknowledgementFacts, DeliveryFacts};
+use crate::sockets::SocketFacts;
 use crate::topic::Topic;
 
 /// Nodes by their endpoints.

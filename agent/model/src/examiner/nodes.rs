@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
-use super::Diagnosis;
-use super::examiner::Findings;
+use super::Findings;
+use crate::diagnosis::Diagnosis;
 use crate::discovery::{Discovery, Node, Participant};
 
 /// One node with whom it belongs to.

@@ -1,4 +1,8 @@
-//! When to look, and what is kept of it.
+//! Finds what is wrong with the graph: examines discovery and topics when they changed, and keeps
+//! what it finds within caps.
+
+mod endpoints;
+mod nodes;
 
 use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap};
@@ -7,16 +11,16 @@ use std::sync::Arc;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
-use super::endpoints::{EndpointExaminer, UnmatchedEndpoint};
-use super::{Diagnoses, Diagnosis, QosPairs, nodes};
+use crate::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::discovery::Discovery;
 use crate::size::Size;
 use crate::topic::Topics;
+use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
 /// How long an endpoint is alone before that is a finding: nodes start one after another.
-pub(super) const PATIENCE: u64 = 5 * SECOND;
+const PATIENCE: u64 = 5 * SECOND;
 /// Most findings kept of each kind.
-pub(super) const PER_KIND: usize = 256;
+const PER_KIND: usize = 256;
 /// Most series of incompatible pairs.
 const MAX_QOS_PAIRS: usize = 1024;
 /// Steps that one look may take, some ten nanoseconds each, and how many for one topic.
@@ -40,12 +44,12 @@ pub struct Examiner {
 
 /// Collects findings within the caps.
 #[derive(Debug)]
-pub(super) struct Findings {
+struct Findings {
     list: Vec<Diagnosis>,
     counts: [usize; Diagnosis::KINDS.len()],
-    pub(super) qos_pairs: Vec<QosPairs>,
+    qos_pairs: Vec<QosPairs>,
     left_out: u64,
-    pub(super) unexamined: u64,
+    unexamined: u64,
     /// Steps that may still be taken, and how many for this topic.
     steps: usize,
     steps_here: usize,
@@ -165,7 +169,7 @@ impl Findings {
     }
 
     /// One more, if its kind has room.
-    pub(super) fn add(&mut self, diagnosis: Diagnosis) {
+    fn add(&mut self, diagnosis: Diagnosis) {
         let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
         let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
         match own.next() {
@@ -178,17 +182,17 @@ impl Findings {
     }
 
     /// As many more of which only the number is known.
-    pub(super) const fn leave_out(&mut self, count: u64) {
+    const fn leave_out(&mut self, count: u64) {
         self.left_out += count;
     }
 
     /// Another topic is looked at.
-    pub(super) const fn turn(&mut self) {
+    const fn turn(&mut self) {
         self.steps_here = STEPS_PER_TOPIC;
     }
 
     /// Whether so many steps may still be taken; takes them.
-    pub(super) const fn spend(&mut self, steps: usize) -> bool {
+    const fn spend(&mut self, steps: usize) -> bool {
         let may = steps <= self.steps && steps <= self.steps_here;
         if may {
             self.steps -= steps;
@@ -213,7 +217,7 @@ impl Findings {
 
 /// Domains of which it is known that not everything is known: a ROS participant lives there of
 /// which no endpoint was announced in the agent's hearing, although each has some.
-pub(super) fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
+fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {
         participant.proxy.enclave.is_some() && participant.endpoints.is_empty()

@@ -10,15 +10,17 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Duration, EntityId, Guid, Timestamp};
 
-use super::discovery::{Discovery, Endpoint, ParticipantProxy};
-use super::observer::Observer;
-use super::snapshot::{
-    DecodeErrorCount, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts,
-    Snapshot, SocketFacts, TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchState,
-    WatchedTopicFacts,
+use super::Observer;
+use crate::discovery::{Discovery, Endpoint, ParticipantProxy};
+use crate::expectation::WatchState;
+use crate::measurement::Measurement;
+use crate::snapshot::{
+    DecodeErrorCount, EndpointFacts, NodeFacts, ParticipantFacts, ProcessFacts, Snapshot,
+    TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchedTopicFacts,
 };
-use super::topic::{Topic, Watched};
-use super::transport::transports;
+use crate::sockets::SocketFacts;
+use crate::topic::{Topic, Watched};
+use crate::transport::transports;
 
 pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
     let nodes = nodes_of_endpoints(&observer.discovery);

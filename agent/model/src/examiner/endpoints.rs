@@ -8,9 +8,10 @@ use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid};
 
-use super::examiner::{Findings, half_known};
-use super::matching::{self, Offer, Policies, Policy, Verdict};
-use super::{Diagnosis, QosPairs, TopicKey, Unmatched};
+use super::{Findings, half_known};
+use crate::diagnosis::{
+    self, Diagnosis, Offer, Policies, Policy, QosPairs, TopicKey, Unmatched, Verdict,
+};
 use crate::discovery::{Discovery, Endpoint};
 use crate::topic::Topic;
 use crate::topic_kind::TopicKind;
@@ -172,14 +173,14 @@ fn compare<'a>(
     let mut open = writers.len() as u64 * readers.len() as u64;
     'all: for writer in &mut *writers {
         for reader in &mut *readers {
-            if !findings.spend(matching::effort(writer.offer.qos, reader.offer.qos)) {
+            if !findings.spend(diagnosis::effort(writer.offer.qos, reader.offer.qos)) {
                 break 'all;
             }
             open -= 1;
             let hindrance = if writer.message_type != reader.message_type {
                 Some(Unmatched::Type)
             } else {
-                match matching::verdict(writer.offer, reader.offer) {
+                match diagnosis::verdict(writer.offer, reader.offer) {
                     Verdict::Match => None,
                     Verdict::Partition => Some(Unmatched::Partition),
                     Verdict::Incompatible(policies) => {

@@ -1,0 +1,100 @@
+//! What a topic is called, in DDS and in ROS, and which watches cover it.
+
+use std::sync::Arc;
+
+use ros2probe_wire::DomainId;
+use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
+
+use super::topic_kind::TopicKind;
+use crate::watch::Watchlist;
+
+/// What a topic is called and what it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Naming {
+    /// DDS name; of a CPU buffer topic that of the topic beside it.
+    pub dds_name: Arc<str>,
+    /// ROS name, or the DDS name.
+    pub name: Arc<str>,
+    /// What it is.
+    pub kind: TopicKind,
+    /// Hidden by ROS convention.
+    pub hidden: bool,
+    /// The endpoint serves the topic from beside it, and is not one of its publishers.
+    pub is_buffer: bool,
+    /// Its samples are messages.
+    pub counts: bool,
+}
+
+impl Naming {
+    /// Of a DDS topic.
+    #[must_use]
+    pub fn of(topic: &DdsTopic) -> Self {
+        let demangled = topic.demangle();
+        let kind = TopicKind::of_demangled(&demangled);
+        let (is_buffer, counts) = match demangled {
+            Demangled::CpuBuffer(_) => (true, true),
+            Demangled::Buffer(_) => (true, false),
+            _ => (false, true),
+        };
+        let named = |name: &RosName, dds_name: &DdsTopic| Self {
+            dds_name: dds_name.as_str().into(),
+            name: name.as_str().into(),
+            kind,
+            hidden: name.is_hidden(),
+            is_buffer,
+            counts,
+        };
+        match &demangled {
+            Demangled::CpuBuffer(name) | Demangled::Buffer(name) => {
+                named(name, &DdsTopic::of_topic(name))
+            }
+            Demangled::Topic(name)
+            | Demangled::ServiceRequest(name)
+            | Demangled::ServiceReply(name) => named(name, topic),
+            Demangled::RosDiscovery | Demangled::NotRos => Self::verbatim(topic, kind),
+        }
+    }
+
+    fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
+        let name: Arc<str> = topic.as_str().into();
+        Self {
+            dds_name: Arc::clone(&name),
+            name,
+            kind,
+            hidden: false,
+            is_buffer: false,
+            counts: true,
+        }
+    }
+
+    /// Watchlist entries that cover it. Entries are about topics: services are covered only by
+    /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
+    /// `/**` is every topic that `ros2 topic list` shows.
+    pub(super) fn covered_by(&self, domain_id: DomainId, watchlist: &Watchlist) -> Vec<usize> {
+        let mut covering = watchlist.matching(domain_id, self.watched_as());
+        if self.hidden && !self.kind.is_service() {
+            let names_hidden = |index: &usize| {
+                watchlist
+                    .watches()
+                    .get(*index)
+                    .is_some_and(|watch| watch.pattern.contains("/_"))
+            };
+            covering.retain(names_hidden);
+        }
+        covering
+    }
+
+    /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
+    pub(super) fn is_named_by(&self, domain_id: Option<DomainId>, watchlist: &Watchlist) -> bool {
+        watchlist.names(domain_id, self.watched_as())
+    }
+
+    /// The name that watches are about.
+    fn watched_as(&self) -> &str {
+        if self.kind.is_service() {
+            &self.dds_name
+        } else {
+            &self.name
+        }
+    }
+}
