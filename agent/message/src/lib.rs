@@ -1,7 +1,7 @@
 //! ROS messages without ROS: definitions of types, their hashes, and the text of a payload.
 //!
-//! - [`Library`] finds the definition of a type in directories, in an installed ROS or among the
-//!   embedded ones, by name and announced hash, and returns a [`MessageType`].
+//! - [`Library`] finds a type's definition by name and announced hash, in directories, an installed
+//!   ROS or the embedded definitions, and returns a [`MessageType`].
 //! - [`decode()`] decodes a CDR payload of that type into a [`Value`] tree that borrows from it.
 //! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them; [`Truncation`]
 //!   limits their length. [`filter`] evaluates an expression over a message.

@@ -1,7 +1,7 @@
 //! A type's definition as one text, in the form of bags (encoding `ros2msg` of MCAP's registry).
 //!
 //! Uses the order of `rosbag2_cpp`: the type's own text, then each nested message once, below a
-//! line of `=`, sorted within a file and each followed by its own nested messages.
+//! line of `=`. Those of a file are sorted, each followed by its own nested messages.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
