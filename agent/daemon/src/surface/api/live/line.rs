@@ -3,6 +3,9 @@
 //! Rows are arrays where there are many of them. Members and elements are only ever added at the
 //! end.
 
+use std::borrow::Cow;
+
+use ros2probe_model::names::TypeName;
 use ros2probe_wire::Guid;
 use serde::Serialize;
 use utoipa::ToSchema;
@@ -96,7 +99,7 @@ pub(in super::super) struct Participant<'a>(
     #[schema(value_type = String)]
     pub Guid,
     pub u32,
-    pub &'a str,
+    #[schema(value_type = String)] pub Cow<'a, str>,
     pub Option<&'a str>,
     pub Option<u32>,
     pub Option<&'a str>,
@@ -119,7 +122,7 @@ pub(in super::super) struct Topic<'a>(
     pub &'a str,
     pub &'a str,
     pub &'a str,
-    pub &'a [String],
+    #[schema(value_type = Vec<String>)] pub &'a [TypeName],
     pub u8,
     pub u8,
     pub u8,

@@ -5,6 +5,7 @@ use std::hash::Hash;
 
 use ros2probe_wire::{DomainId, EntityId, Guid};
 
+use super::super::endpoint::vendor;
 use super::super::index::Index;
 use super::line::{Endpoint, Graph, Node, Participant, Topic};
 use crate::watches::{InForce, Origin};
@@ -88,7 +89,7 @@ impl Ids {
                 self.participants.number(facts.guid, round),
                 facts.guid,
                 facts.domain_id.0,
-                &facts.vendor,
+                vendor(facts.vendor),
                 process.host.as_deref(),
                 process.id,
                 process.name.as_deref(),
@@ -109,7 +110,7 @@ impl Ids {
                 .push(Node(id, domain_id.0, name, participants, hidden.into()));
         }
         for facts in snapshot.topics.iter().filter(|topic| is_shown(topic)) {
-            let key = (facts.domain_id, facts.dds_name.clone());
+            let key = (facts.domain_id, facts.dds_name.to_string());
             let id = self.topics.number(key, round);
             let watched = watched(facts, index, in_force);
             graph.topics.push(Topic(
@@ -158,8 +159,8 @@ impl Ids {
             self.participants.number(participant, round),
             facts.guid,
             facts.transports,
-            &facts.reliability,
-            &facts.durability,
+            facts.qos.reliability.label(),
+            facts.qos.durability.label(),
         )
     }
 }
@@ -181,11 +182,11 @@ pub(super) fn is_measured<'a>(topic: &'a TopicFacts, index: &Index<'a>) -> bool 
 fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> u8 {
     let (mut own, mut glob) = (0, 0);
     for (watch, _) in index.watches(topic) {
-        if watch.pattern != topic.name {
+        if *watch.watch.pattern != *topic.name {
             glob = 4;
             continue;
         }
-        let entry = in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0));
+        let entry = in_force.find(&watch.watch.pattern, watch.watch.domain_id.map(|id| id.0));
         own = entry.map_or(own, |entry| match entry.origin {
             Origin::Config => 1,
             Origin::CommandLine => 2,
