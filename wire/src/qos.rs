@@ -41,12 +41,21 @@ macro_rules! kind {
                     _ => None,
                 }
             }
+
+            /// The word ROS has for it, or `UNKNOWN`.
+            #[must_use]
+            pub const fn label(self) -> &'static str {
+                match self.name() {
+                    Some(name) => name,
+                    None => "UNKNOWN",
+                }
+            }
         }
 
         /// Formats a value without a ROS word as `UNKNOWN`.
         impl fmt::Display for $name {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.pad(self.name().unwrap_or("UNKNOWN"))
+                f.pad(self.label())
             }
         }
     };

@@ -71,6 +71,15 @@ impl Duration {
         let fraction_nanoseconds = (fraction as u64 * 1_000_000_000 + (1 << 31)) >> 32;
         Self::Finite(seconds.cast_unsigned() as u64 * 1_000_000_000 + fraction_nanoseconds)
     }
+
+    /// Its nanoseconds; `None` if it never ends.
+    #[must_use]
+    pub const fn nanoseconds(self) -> Option<u64> {
+        match self {
+            Self::Finite(nanoseconds) => Some(nanoseconds),
+            Self::Infinite => None,
+        }
+    }
 }
 
 #[cfg(test)]

@@ -176,8 +176,8 @@ impl Known {
             cookie,
             process_id: owner.map(|owner| owner.process_id),
             own_process_id: owner.map(|owner| owner.own_process_id),
-            process: owner.map(|owner| owner.process_name.clone()),
-            cgroup: groups.path(socket.cgroup).map(str::to_owned),
+            process: owner.map(|owner| owner.process_name.as_str().into()),
+            cgroup: groups.path(socket.cgroup).map(Into::into),
             unidentified_drops: unnamed.map_or(0, |(now, before)| now.saturating_sub(before)),
         }
     }

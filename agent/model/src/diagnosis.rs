@@ -9,11 +9,11 @@
 mod matching;
 
 use std::cmp::Ordering;
-use std::sync::Arc;
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
+use super::names::{DdsName, NodeName, TopicName, TypeName};
 use super::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
@@ -24,9 +24,9 @@ pub struct TopicKey {
     /// Its domain.
     pub domain_id: DomainId,
     /// Its DDS name: with the domain its identity.
-    pub dds_name: Arc<str>,
+    pub dds_name: DdsName,
     /// Its ROS name, or the DDS name.
-    pub name: Arc<str>,
+    pub name: TopicName,
     /// What it is.
     pub kind: TopicKind,
 }
@@ -50,14 +50,14 @@ pub enum Diagnosis {
         /// Topic.
         topic: TopicKey,
         /// ROS types, sorted.
-        types: Vec<Arc<str>>,
+        types: Vec<TypeName>,
     },
     /// One type with several definitions: they do talk, and misread each other.
     TypeHashConflict {
         /// Topic.
         topic: TopicKey,
         /// ROS type.
-        message_type: Arc<str>,
+        message_type: TypeName,
         /// RIHS01 hashes, sorted.
         hashes: Vec<TypeHash>,
     },
@@ -66,7 +66,7 @@ pub enum Diagnosis {
         /// Domain.
         domain_id: DomainId,
         /// Fully qualified name.
-        node: Arc<str>,
+        node: NodeName,
         /// The participant of each, sorted; one that has several of them is there as often.
         participants: Vec<Guid>,
     },
@@ -91,7 +91,7 @@ pub enum Diagnosis {
     /// One node that is in several domains: half of its topics are where nobody looks for them.
     NodeInSeveralDomains {
         /// Fully qualified name.
-        node: Arc<str>,
+        node: NodeName,
         /// One of its participants, the lowest.
         participant: Guid,
         /// Domains, sorted.

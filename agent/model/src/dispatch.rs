@@ -7,17 +7,19 @@ use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
+use super::names::{DdsName, TopicName, TypeName};
+
 /// The topic of a sample.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Topic {
     /// Domain.
     pub domain_id: DomainId,
     /// ROS name, or the DDS name where it follows no ROS convention.
-    pub name: Arc<str>,
+    pub name: TopicName,
     /// DDS name.
-    pub dds_name: Arc<str>,
+    pub dds_name: DdsName,
     /// ROS name of the type, as in `sensor_msgs/msg/PointCloud2`.
-    pub message_type: Arc<str>,
+    pub message_type: TypeName,
     /// What the writer announced.
     pub offered: Option<Arc<Offered>>,
 }
@@ -28,7 +30,7 @@ pub struct Offered {
     /// RIHS01 hash of its type; not before Iron.
     pub type_hash: Option<TypeHash>,
     /// Quality of service.
-    pub qos: Qos,
+    pub qos: Arc<Qos>,
 }
 
 /// One message. Immutable, shared by all who want it.

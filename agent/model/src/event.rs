@@ -7,7 +7,6 @@
 //! events at any speed.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
@@ -18,6 +17,7 @@ use super::churn;
 use super::diagnosis::Diagnosis;
 use super::expectation::WatchState;
 use super::loss::Loss;
+use super::names::{DdsName, NodeName, TopicName, TypeName};
 use super::size::Size;
 
 /// Events of one class in a second of the source's clock.
@@ -27,7 +27,7 @@ const MANY: usize = 1024;
 /// Writers whose losses of one second are added up.
 const BURSTS: usize = 1024;
 /// Longest text kept, as of a topic's name.
-const TEXT: usize = 256;
+pub(crate) const TEXT: usize = 256;
 /// Longest list kept, as of the participants of a duplicate node.
 const LIST: usize = 8;
 
@@ -69,9 +69,9 @@ pub enum EventKind {
         /// Writer or reader.
         role: Role,
         /// DDS topic.
-        topic: Arc<str>,
+        topic: DdsName,
         /// ROS type.
-        message_type: Arc<str>,
+        message_type: TypeName,
     },
     /// A node came or went.
     Node {
@@ -82,7 +82,7 @@ pub enum EventKind {
         /// The participant it lives in.
         participant: Guid,
         /// Fully qualified name.
-        name: Arc<str>,
+        name: NodeName,
     },
     /// A writer's samples of about one second were settled as lost.
     Loss(LossBurst),
@@ -91,7 +91,7 @@ pub enum EventKind {
         /// Its domain.
         domain_id: DomainId,
         /// ROS name.
-        topic: Arc<str>,
+        topic: TopicName,
         /// The entry's pattern.
         watch: Box<str>,
         /// How it stood; `None` when this is the first look.
@@ -106,7 +106,7 @@ pub enum EventKind {
         /// Its domain.
         domain_id: DomainId,
         /// ROS name.
-        topic: Arc<str>,
+        topic: TopicName,
         /// The entry's pattern.
         watch: Box<str>,
         /// When its last message came, if any did.
@@ -127,9 +127,9 @@ pub struct LossBurst {
     /// Whose.
     pub writer: Guid,
     /// Domain and DDS topic, where the writer was announced.
-    pub topic: Option<(DomainId, Arc<str>)>,
+    pub topic: Option<(DomainId, DdsName)>,
     /// Its node, where that is known.
-    pub node: Option<Arc<str>>,
+    pub node: Option<NodeName>,
     /// How many.
     pub count: u64,
     /// First lost sequence number.
@@ -287,9 +287,9 @@ impl Events {
     }
 
     /// This writer is no more: its burst, if there is one, was on this topic.
-    pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &Arc<str>) {
+    pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &DdsName) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
-            burst.losses.topic = Some((domain_id, Arc::clone(topic)));
+            burst.losses.topic = Some((domain_id, topic.clone()));
         }
     }
 
@@ -317,15 +317,6 @@ impl Events {
 pub fn bounded(text: &str) -> &str {
     text.get(..text.floor_char_boundary(TEXT))
         .unwrap_or_default()
-}
-
-/// Likewise of a shared one.
-#[must_use]
-pub fn bounded_shared(text: &Arc<str>) -> Arc<str> {
-    if text.len() <= TEXT {
-        return Arc::clone(text);
-    }
-    bounded(text).into()
 }
 
 /// A finding with no more of its lists than is kept.
@@ -433,10 +424,13 @@ mod tests {
 
     #[test]
     fn kept_texts_are_cut_between_characters() {
-        let long: Arc<str> = "\u{e9}".repeat(5_000).into();
+        let long: TopicName = "\u{e9}".repeat(5_000).into();
         assert_eq!(bounded(&long).len(), TEXT);
-        assert_eq!(bounded_shared(&long).len(), TEXT);
-        let short: Arc<str> = "/points".into();
-        assert!(Arc::ptr_eq(&short, &bounded_shared(&short)));
+        assert_eq!(long.bounded(TEXT).len(), TEXT);
+        let short: TopicName = "/points".into();
+        assert!(std::sync::Arc::ptr_eq(
+            &short.shared(),
+            &short.bounded(TEXT).shared()
+        ));
     }
 }

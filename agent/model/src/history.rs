@@ -12,6 +12,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 
 use super::histogram::Histogram;
 use super::measurement::Measurement;
+use super::names::DdsName;
 use super::rate::SECONDS as WINDOW;
 use super::size::Size;
 use super::snapshot::TableFacts;
@@ -87,7 +88,7 @@ struct Bfloat16(u16);
 /// Ids of topics by domain and DDS name.
 #[derive(Clone, Debug, Default)]
 struct Names {
-    by_domain: BTreeMap<DomainId, BTreeMap<Arc<str>, u32>>,
+    by_domain: BTreeMap<DomainId, BTreeMap<DdsName, u32>>,
 }
 
 /// What had been counted of a topic by the end of the second before.
@@ -136,7 +137,7 @@ impl History {
     pub fn take<'a>(
         &mut self,
         now: Timestamp,
-        topics: impl Iterator<Item = (DomainId, &'a Arc<str>, Measurement)>,
+        topics: impl Iterator<Item = (DomainId, &'a DdsName, Measurement)>,
     ) {
         if self.seconds.back().is_some_and(|last| now < last.at) {
             // Times would run backwards within a chart.
@@ -210,7 +211,7 @@ impl History {
     }
 
     /// An id for a topic that has none; `None` where as many are named as may be.
-    fn name(&mut self, domain_id: DomainId, dds_name: &Arc<str>) -> Option<u32> {
+    fn name(&mut self, domain_id: DomainId, dds_name: &DdsName) -> Option<u32> {
         if self.names.len() >= self.most {
             self.evictions += 1;
             return None;
@@ -218,7 +219,7 @@ impl History {
         self.last = self.last.checked_add(1)?;
         let names = &mut Arc::make_mut(&mut self.names).by_domain;
         let names = names.entry(domain_id).or_default();
-        names.insert(Arc::clone(dds_name), self.last);
+        names.insert(dds_name.clone(), self.last);
         Some(self.last)
     }
 
@@ -430,11 +431,11 @@ mod tests {
         counted
     }
 
-    fn name(text: &str) -> Arc<str> {
+    fn name(text: &str) -> DdsName {
         text.into()
     }
 
-    fn take(history: &mut History, second: u64, topics: &[(&Arc<str>, Measurement)]) {
+    fn take(history: &mut History, second: u64, topics: &[(&DdsName, Measurement)]) {
         let topics = topics
             .iter()
             .map(|(name, counted)| (DomainId(0), *name, counted.clone()));

@@ -47,6 +47,7 @@ pub mod limits;
 pub mod loss;
 pub mod loss_causes;
 pub mod measurement;
+pub mod names;
 pub mod naming;
 pub mod observer;
 pub mod payloads;

@@ -1,10 +1,9 @@
 //! What a topic is called, in DDS and in ROS, and which watches cover it.
 
-use std::sync::Arc;
-
 use ros2probe_wire::DomainId;
 use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
 
+use super::names::{DdsName, TopicName};
 use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
@@ -12,9 +11,9 @@ use crate::watch::Watchlist;
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Naming {
     /// DDS name; of a CPU buffer topic that of the topic beside it.
-    pub dds_name: Arc<str>,
+    pub dds_name: DdsName,
     /// ROS name, or the DDS name.
-    pub name: Arc<str>,
+    pub name: TopicName,
     /// What it is.
     pub kind: TopicKind,
     /// Hidden by ROS convention.
@@ -56,10 +55,10 @@ impl Naming {
     }
 
     fn verbatim(topic: &DdsTopic, kind: TopicKind) -> Self {
-        let name: Arc<str> = topic.as_str().into();
+        let dds_name = DdsName::from(topic.as_str());
         Self {
-            dds_name: Arc::clone(&name),
-            name,
+            name: TopicName::of_dds(&dds_name),
+            dds_name,
             kind,
             hidden: false,
             is_buffer: false,

@@ -24,12 +24,13 @@ use ros2probe_wire::{DomainId, Guid, Reason, Record, Timestamp};
 
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use super::discovery_fragments::DiscoveryFragments;
-use super::event::bounded_shared;
+use super::event::TEXT;
 use super::examiner::Examiner;
 use super::input::{Input, Output};
 use super::interest::Interest;
 use super::journal::Journal;
 use super::measurement::Measurement;
+use super::names::DdsName;
 use super::naming::Naming;
 use super::payloads::Payloads;
 use super::profiler::{Profiler, RecordOutcome, UNDELIVERED};
@@ -335,7 +336,7 @@ impl Observer {
     pub fn measured(
         &self,
         now: Timestamp,
-    ) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
+    ) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
         report::measured(self, self.wall_clock.model_time(now))
     }
 
@@ -422,8 +423,8 @@ impl Observer {
                 covering.filter_map(|(index, _)| Some(watchlist.watches().get(*index)?.trace));
             let subject = WriterDescription {
                 domain_id: topic.domain_id,
-                topic: bounded_shared(&topic.naming.name),
-                message_type: bounded_shared(&endpoint.message_type),
+                topic: topic.naming.name.bounded(TEXT),
+                message_type: endpoint.message_type.bounded(TEXT),
                 reliable: traits(endpoint).reliable,
             };
             (topic.watched == Watched::Yes).then(|| (subject, ratios.fold(0.0, f64::max)))
@@ -479,9 +480,9 @@ impl Observer {
         };
         if naming.dds_name == endpoint.topic {
             // One copy of the name for all who keep it.
-            naming.dds_name = Arc::clone(&endpoint.topic);
+            naming.dds_name = endpoint.topic.clone();
         }
-        let (role, message_type) = (endpoint.role, Arc::clone(&endpoint.message_type));
+        let (role, message_type) = (endpoint.role, endpoint.message_type.clone());
         let (id, is_new) = self
             .topics
             .join(endpoint.domain_id, &naming, guid, role, now);
@@ -509,7 +510,7 @@ impl Observer {
         self.tracer.forget(guid);
         self.retire(guid, now);
         self.payloads.release(guid, now);
-        let (domain_id, topic) = (endpoint.domain_id, bounded_shared(&endpoint.topic));
+        let (domain_id, topic) = (endpoint.domain_id, endpoint.topic.bounded(TEXT));
         self.journal.events.name(guid, domain_id, &topic);
         let id = naming(endpoint).and_then(|naming| self.topics.find(endpoint.domain_id, &naming));
         if let Some(id) = id {

@@ -7,17 +7,22 @@ mod delivery;
 
 use std::sync::Arc;
 
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::Qos;
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{DomainId, Duration, Guid, Timestamp};
 
 pub use super::churn::ChurnCount;
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 pub use super::expectation::WatchState;
 pub use super::measurement::{Breakdown, Delivered, Measurement, SampledFacts};
+use super::names::{DdsName, NodeName, TopicName, TypeName};
 pub use super::route::Direction;
 pub use super::sockets::SocketFacts;
 use super::topic_kind::TopicKind;
-pub use delivery::{AcknowledgementFacts, DeliveryFacts};
+use super::watch::Watch;
+pub use delivery::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 
 /// All facts at `at`. Lists are sorted by their identity.
 #[derive(Clone, Debug, Default)]
@@ -63,18 +68,18 @@ pub struct ParticipantFacts {
     pub guid: Guid,
     /// Domain, when announced or derivable from the discovery port.
     pub domain_id: DomainId,
-    /// Vendor in words, or the two bytes in hex.
-    pub vendor: String,
+    /// Its implementation.
+    pub vendor: VendorId,
     /// ROS enclave; `None` means it is no ROS participant.
-    pub enclave: Option<String>,
+    pub enclave: Option<Arc<str>>,
     /// Where it lives.
     pub process: ProcessFacts,
     /// When its first announcement was seen.
     pub first_seen: Timestamp,
     /// When anything of it was last seen.
     pub last_seen: Timestamp,
-    /// Lease in nanoseconds; `None` = infinite.
-    pub lease_nanoseconds: Option<u64>,
+    /// How long it is believed alive without a sign of life.
+    pub lease: Duration,
     /// Announces security: its user data may be encrypted.
     pub secured: bool,
     /// Known from before the agent's start and not heard since.
@@ -87,14 +92,14 @@ pub struct ParticipantFacts {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ProcessFacts {
     /// Host name when announced.
-    pub host: Option<String>,
+    pub host: Option<Arc<str>>,
     /// Process id: of the socket's holder, else as announced, perhaps in a container's count, or
     /// its low 16 bits where the GUID holds those.
     pub id: Option<u32>,
     /// Process name: as announced, else that of the socket's holder.
-    pub name: Option<String>,
+    pub name: Option<Arc<str>>,
     /// Control group of the socket, as a path below the root: which container.
-    pub cgroup: Option<String>,
+    pub cgroup: Option<Arc<str>>,
 }
 
 /// One ROS node.
@@ -103,7 +108,7 @@ pub struct NodeFacts {
     /// Domain of its participant.
     pub domain_id: DomainId,
     /// Fully qualified name, `/robot1/lidar`.
-    pub name: String,
+    pub name: NodeName,
     /// Its participant.
     pub participant: Guid,
     /// Its writers.
@@ -118,17 +123,17 @@ pub struct TopicFacts {
     /// Domain.
     pub domain_id: DomainId,
     /// ROS name for topics, the DDS name where it follows no ROS convention.
-    pub name: String,
+    pub name: TopicName,
     /// DDS name.
-    pub dds_name: String,
+    pub dds_name: DdsName,
     /// What kind of ROS channel.
     pub kind: TopicKind,
     /// Hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
     /// Message types announced on it, ROS form, sorted; more than one is a fault.
-    pub message_types: Vec<String>,
+    pub message_types: Vec<TypeName>,
     /// RIHS01 type hashes announced, sorted.
-    pub type_hashes: Vec<String>,
+    pub type_hashes: Vec<TypeHash>,
     /// Live writers.
     pub publishers: Vec<EndpointFacts>,
     /// Live readers.
@@ -216,29 +221,13 @@ pub struct EndpointFacts {
     /// GUID.
     pub guid: Guid,
     /// Node name when `ros_discovery_info` told.
-    pub node: Option<String>,
-    /// `RELIABLE`, `BEST_EFFORT`, ...
-    pub reliability: String,
-    /// `VOLATILE`, `TRANSIENT_LOCAL`, ...
-    pub durability: String,
-    /// `KEEP_LAST (10)`, `KEEP_ALL`, `UNKNOWN`.
-    pub history: String,
-    /// Deadline in nanoseconds; `None` = infinite.
-    pub deadline_nanoseconds: Option<u64>,
-    /// Lifespan in nanoseconds; `None` = infinite.
-    pub lifespan_nanoseconds: Option<u64>,
-    /// `AUTOMATIC`, `MANUAL_BY_TOPIC`, ...
-    pub liveliness: String,
-    /// Liveliness lease in nanoseconds; `None` = infinite.
-    pub liveliness_lease_nanoseconds: Option<u64>,
-    /// `SHARED` or `EXCLUSIVE`.
-    pub ownership: &'static str,
-    /// Partitions; empty is the default one.
-    pub partitions: Vec<String>,
+    pub node: Option<NodeName>,
+    /// Quality of service.
+    pub qos: Arc<Qos>,
     /// ROS type.
-    pub message_type: String,
+    pub message_type: TypeName,
     /// RIHS01 hash.
-    pub type_hash: Option<String>,
+    pub type_hash: Option<TypeHash>,
     /// When it was announced.
     pub first_seen: Timestamp,
     /// What was measured of this writer while its topic was watched.
@@ -247,13 +236,23 @@ pub struct EndpointFacts {
     pub transports: u8,
 }
 
+impl EndpointFacts {
+    /// Its history in words: `KEEP_LAST (10)`, `KEEP_ALL` or, as it is often not announced,
+    /// `UNKNOWN`.
+    #[must_use]
+    pub fn history(&self) -> String {
+        let history = self.qos.history;
+        history.map_or_else(|| "UNKNOWN".to_owned(), |history| history.to_string())
+    }
+}
+
 /// A writer that sends without a known announcement.
 #[derive(Clone, Debug)]
 pub struct UnknownWriterFacts {
     /// GUID.
     pub guid: Guid,
-    /// Vendor: its participant's, else the one whose mark its GUID bears, else empty.
-    pub vendor: String,
+    /// Vendor: its participant's, else the one whose mark its GUID bears.
+    pub vendor: Option<VendorId>,
     /// Where it lives.
     pub process: ProcessFacts,
     /// First record.
@@ -265,10 +264,8 @@ pub struct UnknownWriterFacts {
 /// One watchlist entry and the topics it covers now.
 #[derive(Clone, Debug)]
 pub struct WatchFacts {
-    /// The name or glob as configured.
-    pub pattern: String,
-    /// Domain restriction.
-    pub domain_id: Option<DomainId>,
+    /// The entry as configured.
+    pub watch: Arc<Watch>,
     /// Covered topics with their state; a literal name that does not exist yet is listed with
     /// [`WatchState::NotPublished`].
     pub topics: Vec<WatchedTopicFacts>,
@@ -280,7 +277,7 @@ pub struct WatchedTopicFacts {
     /// Domain.
     pub domain_id: DomainId,
     /// ROS name.
-    pub topic: String,
+    pub topic: TopicName,
     /// Where it stands.
     pub state: WatchState,
     /// Which expectations are broken: `min_rate_hz`, `max_loss_ratio`, ...

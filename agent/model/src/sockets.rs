@@ -5,6 +5,7 @@
 //! new socket is refused and counted, for the ones at hand have been told apart already.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::size::Size;
 
@@ -19,9 +20,9 @@ pub struct SocketFacts {
     /// participants announce.
     pub own_process_id: Option<u32>,
     /// Its name.
-    pub process: Option<String>,
+    pub process: Option<Arc<str>>,
     /// Control group, as a path below the root.
-    pub cgroup: Option<String>,
+    pub cgroup: Option<Arc<str>>,
     /// Datagrams that the socket had no room for and of which it is not known what they held.
     pub unidentified_drops: u64,
 }

@@ -5,7 +5,6 @@
 //! its counters, so that its silence is seen rather than its series missed.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::Arc;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, Guid, Timestamp};
@@ -13,6 +12,7 @@ use ros2probe_wire::{DomainId, Guid, Timestamp};
 use super::delivery::Totals;
 use super::expectation::Judgement;
 use super::measurement::Measurement;
+use super::names::{DdsName, TypeName};
 use super::naming::Naming;
 use super::selection::{RequestIds, SampleRequest};
 use super::size::Size;
@@ -47,7 +47,7 @@ pub struct Topic {
     /// Writers and readers beside it.
     pub buffer_endpoints: Vec<Guid>,
     /// Type of the endpoint that came last, for when none is left.
-    pub last_type: Option<Arc<str>>,
+    pub last_type: Option<TypeName>,
     /// Whether it is measured.
     pub watched: Watched,
     /// Watchlist entries that cover it, and how it stands with them.
@@ -72,7 +72,7 @@ pub struct Topic {
 #[derive(Debug, Default)]
 pub struct Topics {
     topics: HashMap<TopicId, Box<Topic>>,
-    index: BTreeMap<(DomainId, Arc<str>), TopicId>,
+    index: BTreeMap<(DomainId, DdsName), TopicId>,
     /// Those without endpoints, by the time when the last one went.
     vanished: BTreeSet<(Timestamp, TopicId)>,
     /// Those of them that hold a measuring place.
@@ -122,7 +122,7 @@ impl Topics {
     #[must_use]
     pub fn find(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicId> {
         self.index
-            .get(&(domain_id, Arc::clone(&naming.dds_name)))
+            .get(&(domain_id, naming.dds_name.clone()))
             .copied()
     }
 
@@ -376,8 +376,7 @@ impl Topics {
     fn create(&mut self, domain_id: DomainId, naming: &Naming) -> TopicId {
         self.created += 1;
         let id = TopicId(self.created);
-        self.index
-            .insert((domain_id, Arc::clone(&naming.dds_name)), id);
+        self.index.insert((domain_id, naming.dds_name.clone()), id);
         self.topics.insert(
             id,
             Box::new(Topic {

@@ -15,6 +15,7 @@ use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, Timestamp};
 
 use super::identity::Identity;
+use super::names::{TopicName, TypeName};
 use super::route::Destination;
 use super::samples::{Budget, Progress, Samples};
 use super::size::{Size, largest};
@@ -95,9 +96,9 @@ pub struct WriterDescription {
     /// Domain.
     pub domain_id: DomainId,
     /// ROS name.
-    pub topic: Arc<str>,
+    pub topic: TopicName,
     /// Type.
-    pub message_type: Arc<str>,
+    pub message_type: TypeName,
     /// Its readers may acknowledge.
     pub reliable: bool,
 }

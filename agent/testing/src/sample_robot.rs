@@ -16,11 +16,14 @@ use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
     Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
-    Snapshot, SocketFacts, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
-    WatchFacts, WatchState, WatchedTopicFacts,
+    Snapshot, SocketFacts, Subscriber, TableFacts, TopicFacts, Transport, TransportCount,
+    UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_model::watch::Watch;
 use ros2probe_wire::discovery::TypeHash;
+use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
+use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
@@ -38,12 +41,12 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         participants: vec![ParticipantFacts {
             guid,
             domain_id: DomainId(0),
-            vendor: "eProsima Fast DDS".to_owned(),
-            enclave: Some("/".to_owned()),
+            vendor: VendorId::EPROSIMA,
+            enclave: Some("/".into()),
             process: process(),
             first_seen: Timestamp(1),
             last_seen: Timestamp(2),
-            lease_nanoseconds: Some(20_000_000_000),
+            lease: ros2probe_wire::Duration::Finite(20_000_000_000),
             secured: false,
             restored: false,
             addresses: Addresses::default(),
@@ -52,26 +55,25 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             cookie: 77,
             process_id: Some(42),
             own_process_id: Some(7),
-            process: Some("mapper".to_owned()),
-            cgroup: Some("/robot.slice".to_owned()),
+            process: Some("mapper".into()),
+            cgroup: Some("/robot.slice".into()),
             unidentified_drops: 5,
         }],
         nodes: vec![NodeFacts {
             domain_id: DomainId(0),
-            name: "/lidar".to_owned(),
+            name: "/lidar".into(),
             participant: guid,
             writers: Vec::new(),
             readers: Vec::new(),
         }],
         watches: vec![WatchFacts {
-            pattern: "/**".to_owned(),
-            domain_id: None,
+            watch: Arc::new(Watch::named("/**").unwrap()),
             topics: topics.iter().map(watched).collect(),
         }],
         topics,
         unknown_writers: vec![UnknownWriterFacts {
             guid,
-            vendor: String::new(),
+            vendor: None,
             process: process(),
             first_seen: Timestamp(3),
             measurement: measurement(),
@@ -166,10 +168,10 @@ fn diagnoses() -> Diagnoses {
 
 fn process() -> ProcessFacts {
     ProcessFacts {
-        host: Some("robot".to_owned()),
+        host: Some("robot".into()),
         id: Some(42),
-        name: Some("mapper".to_owned()),
-        cgroup: Some("/robot.slice".to_owned()),
+        name: Some("mapper".into()),
+        cgroup: Some("/robot.slice".into()),
     }
 }
 
@@ -206,17 +208,16 @@ pub fn topic(name: &str) -> TopicFacts {
     let guid = |entity: u8| Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, entity, 3]));
     let endpoint = |guid: Guid| EndpointFacts {
         guid,
-        node: Some("/lidar".to_owned()),
-        reliability: "RELIABLE".to_owned(),
-        durability: "VOLATILE".to_owned(),
-        history: "KEEP_LAST (10)".to_owned(),
-        deadline_nanoseconds: None,
-        lifespan_nanoseconds: None,
-        liveliness: "AUTOMATIC".to_owned(),
-        liveliness_lease_nanoseconds: None,
-        ownership: "SHARED",
-        partitions: Vec::new(),
-        message_type: "sensor_msgs/msg/PointCloud2".to_owned(),
+        node: Some("/lidar".into()),
+        qos: Arc::new(Qos {
+            reliability: Reliability::RELIABLE,
+            history: Some(History {
+                kind: HistoryKind::KEEP_LAST,
+                depth: 10,
+            }),
+            ..Qos::defaults(Role::Writer, VendorId::EPROSIMA)
+        }),
+        message_type: "sensor_msgs/msg/PointCloud2".into(),
         type_hash: None,
         first_seen: Timestamp(4),
         measurement: Some(Box::new(measurement())),
@@ -224,11 +225,11 @@ pub fn topic(name: &str) -> TopicFacts {
     };
     TopicFacts {
         domain_id: DomainId(0),
-        name: name.to_owned(),
-        dds_name: format!("rt{name}"),
+        name: name.into(),
+        dds_name: format!("rt{name}").into(),
         kind: TopicKind::Topic,
         hidden: false,
-        message_types: vec!["sensor_msgs/msg/PointCloud2".to_owned()],
+        message_types: vec!["sensor_msgs/msg/PointCloud2".into()],
         type_hashes: Vec::new(),
         publishers: vec![endpoint(guid(1))],
         subscriptions: vec![endpoint(guid(2))],
@@ -240,7 +241,7 @@ pub fn topic(name: &str) -> TopicFacts {
         acknowledgements: vec![AcknowledgementFacts {
             writer: guid(1),
             reader: guid(2),
-            node: Some("/mapper".to_owned()),
+            node: Some("/mapper".into()),
             acknowledged: 123_400,
             missing: 2,
             requested: 9,
@@ -269,17 +270,17 @@ pub fn delivery(direction: Direction) -> DeliveryFacts {
         direction,
         destination: (Ipv4Addr::new(10, 0, 0, 2), 7411).into(),
         subscriber: if received {
-            format!("participant {participant}")
+            Subscriber::Participant(participant)
         } else {
-            String::new()
+            Subscriber::Unknown
         },
         participant: received.then_some(participant),
         readers: vec![guid([0, 0, 2, 4])],
-        nodes: vec!["/mapper".to_owned()],
+        nodes: vec!["/mapper".into()],
         sockets: vec![77],
         process_id: Some(42),
-        process: Some("mapper".to_owned()),
-        cgroup: Some("/robot.slice".to_owned()),
+        process: Some("mapper".into()),
+        cgroup: Some("/robot.slice".into()),
         first_seen: Timestamp(5),
         last_seen: Timestamp(6),
         delivered: if received { delivered() } else { sent() },

@@ -155,7 +155,7 @@ impl Counts {
         for topic in &snapshot.topics {
             if let Some(all) = &topic.measurement {
                 let numbers = (all.messages, all.bytes, all.lost);
-                counts.measured.insert(topic.dds_name.clone(), numbers);
+                counts.measured.insert(topic.dds_name.to_string(), numbers);
             }
         }
         for unknown in &snapshot.unknown_writers {

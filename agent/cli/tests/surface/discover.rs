@@ -12,6 +12,7 @@ use ros2probe_daemon::discover::session::{MOST_PACKETS, Outgoing, Session, Targe
 use ros2probe_model::discovery::{Addresses, hexadecimal};
 use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_wire::discovery::Role;
+use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -261,12 +262,12 @@ fn who_has_secrets_or_no_address_is_not_asked() {
     let participant = |secured, metatraffic: &[&str]| ParticipantFacts {
         guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
         domain_id: DomainId(0),
-        vendor: String::new(),
+        vendor: VendorId::UNKNOWN,
         enclave: None,
         process: ProcessFacts::default(),
         first_seen: Timestamp(1),
         last_seen: Timestamp(1),
-        lease_nanoseconds: None,
+        lease: ros2probe_wire::Duration::Infinite,
         secured,
         restored: false,
         addresses: Addresses {

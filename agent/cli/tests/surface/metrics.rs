@@ -335,7 +335,7 @@ fn series_of_deliveries_are_capped_and_never_twice() {
             let destination = (Ipv4Addr::from(0x0a00_0000 + u32::from(host)), 7411).into();
             let delivery = DeliveryFacts {
                 destination,
-                process: Some("\"}\n\\".to_owned()),
+                process: Some("\"}\n\\".into()),
                 ..one.clone()
             };
             // Two sockets that no label tells apart are one series.
@@ -398,10 +398,10 @@ fn hostile_names_stay_inside_their_label() {
 fn no_series_appears_twice() {
     let mut snapshot = sample_robot::snapshot(["/points", "/points"]);
     let mut dds = sample_robot::topic("/points");
-    (dds.kind, dds.dds_name) = (TopicKind::Dds, "/points".to_owned());
+    (dds.kind, dds.dds_name) = (TopicKind::Dds, "/points".into());
     snapshot.topics.push(dds);
     let mut request = sample_robot::topic("/points");
-    (request.kind, request.dds_name) = (TopicKind::ServiceRequest, "rq/pointsRequest".to_owned());
+    (request.kind, request.dds_name) = (TopicKind::ServiceRequest, "rq/pointsRequest".into());
     snapshot.topics.push(request);
     let nodes = snapshot.nodes.clone();
     snapshot.nodes.extend(nodes);
@@ -424,13 +424,15 @@ fn no_series_appears_twice() {
 fn a_watched_topic_that_nobody_announced_begins_with_zero() {
     let missing = WatchedTopicFacts {
         domain_id: DomainId(0),
-        topic: "/cmd_vel".to_owned(),
+        topic: "/cmd_vel".into(),
         state: WatchState::NotPublished,
         violations: Vec::new(),
     };
     let watch = WatchFacts {
-        pattern: "/cmd_vel".to_owned(),
-        domain_id: Some(DomainId(0)),
+        watch: Arc::new(Watch {
+            domain_id: Some(DomainId(0)),
+            ..Watch::named("/cmd_vel").unwrap()
+        }),
         topics: vec![missing],
     };
     let snapshot = Snapshot {

@@ -155,7 +155,7 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
                 let Some(measured) = &topic.measurement else {
                     continue;
                 };
-                let key = (topic.domain_id, topic.dds_name.clone());
+                let key = (topic.domain_id, topic.dds_name.to_string());
                 let given = counts.remove(&key).unwrap_or_default();
                 // A stranger's samples count for its topic once it is announced.
                 let unannounced = unannounced(&news, &key.1);

@@ -96,10 +96,13 @@ impl HeardParticipant {
         Self {
             prefix: facts.guid.prefix,
             domain_id: facts.domain_id.0,
-            vendor: facts.vendor.clone(),
-            process: name.clone(),
+            vendor: facts
+                .vendor
+                .name()
+                .map_or_else(|| facts.vendor.to_string(), str::to_owned),
+            process: name.as_deref().map(str::to_owned),
             process_id: *id,
-            host: host.clone(),
+            host: host.as_deref().map(str::to_owned),
             target: Target::of(facts),
         }
     }

@@ -1,7 +1,6 @@
 //! What discovery says of topics, as far as a bag or its report says it: from a snapshot within the
 //! agent, from an agent's answers where a client records.
 
-use std::borrow::Cow;
 use std::collections::HashMap;
 
 use crate::subscriptions::line::seconds;
@@ -11,6 +10,7 @@ use ros2probe_api::samples::OfferedQos;
 use ros2probe_api::topics::Topic;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_model::topic_kind::TopicKind;
+use ros2probe_wire::qos::Durability;
 
 const VOLATILE: &str = "VOLATILE";
 
@@ -85,7 +85,7 @@ impl From<&Topic<'_>> for PublishedTopic {
         Self {
             domain_id: topic.domain_id,
             name: topic.name.to_string(),
-            message_types: owned(&topic.message_types),
+            message_types: printed(&topic.message_types),
             subscribed: !topic.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             durable_publishers: durable_publishers
@@ -101,7 +101,8 @@ fn is_ros_topic(kind: &str) -> bool {
     TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
 }
 
-fn owned(texts: &[Cow<'_, str>]) -> Vec<String> {
+/// Each as it is printed.
+fn printed<T: ToString>(texts: &[T]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }
 
@@ -125,11 +126,12 @@ impl From<&TopicFacts> for PublishedTopic {
         let passages = facts.transports.iter();
         let passages = passages.map(|count| (count.transport.label(), count.pairs));
         let publishers = facts.publishers.iter();
-        let durable_publishers = publishers.filter(|publisher| publisher.durability != VOLATILE);
+        let durable_publishers =
+            publishers.filter(|publisher| publisher.qos.durability != Durability::VOLATILE);
         Self {
             domain_id: facts.domain_id.0,
-            name: facts.name.clone(),
-            message_types: facts.message_types.clone(),
+            name: facts.name.to_string(),
+            message_types: printed(&facts.message_types),
             subscribed: !facts.subscriptions.is_empty(),
             other_transport: other_transport(passages).map(str::to_owned),
             durable_publishers: durable_publishers
@@ -184,8 +186,8 @@ impl Publisher {
 impl From<&TopicFacts> for DiscoveredTopic {
     fn from(facts: &TopicFacts) -> Self {
         Self {
-            message_types: facts.message_types.clone(),
-            type_hashes: facts.type_hashes.clone(),
+            message_types: printed(&facts.message_types),
+            type_hashes: printed(&facts.type_hashes),
             publishers: facts.publishers.iter().map(Publisher::from).collect(),
             subscribed: !facts.subscriptions.is_empty(),
         }
@@ -195,8 +197,8 @@ impl From<&TopicFacts> for DiscoveredTopic {
 impl From<&Topic<'_>> for DiscoveredTopic {
     fn from(topic: &Topic<'_>) -> Self {
         Self {
-            message_types: owned(&topic.message_types),
-            type_hashes: owned(&topic.type_hashes),
+            message_types: printed(&topic.message_types),
+            type_hashes: printed(&topic.type_hashes),
             publishers: topic.publishers.iter().map(Publisher::from).collect(),
             subscribed: !topic.subscriptions.is_empty(),
         }
@@ -223,16 +225,17 @@ impl From<&Endpoint<'_>> for Publisher {
 
 impl From<&EndpointFacts> for Publisher {
     fn from(facts: &EndpointFacts) -> Self {
+        let qos = &facts.qos;
         Self {
             guid: facts.guid.to_string(),
             qos: OfferedQos {
-                reliability: facts.reliability.clone(),
-                durability: facts.durability.clone(),
-                history: facts.history.clone(),
-                deadline_seconds: facts.deadline_nanoseconds.map(seconds),
-                lifespan_seconds: facts.lifespan_nanoseconds.map(seconds),
-                liveliness: facts.liveliness.clone(),
-                liveliness_lease_seconds: facts.liveliness_lease_nanoseconds.map(seconds),
+                reliability: qos.reliability.to_string(),
+                durability: qos.durability.to_string(),
+                history: facts.history(),
+                deadline_seconds: qos.deadline.nanoseconds().map(seconds),
+                lifespan_seconds: qos.lifespan.nanoseconds().map(seconds),
+                liveliness: qos.liveliness.to_string(),
+                liveliness_lease_seconds: qos.liveliness_lease.nanoseconds().map(seconds),
             },
         }
     }

@@ -527,8 +527,8 @@ impl<'a> Recorder<'a> {
         };
         let before = taken
             .offered
-            .insert(writer.to_string(), offered.qos.clone());
-        if before.is_some_and(|before| before == offered.qos) {
+            .insert(writer.to_string(), (*offered.qos).clone());
+        if before.is_some_and(|before| before == *offered.qos) {
             return Ok(());
         }
         taken.description.publishers = taken.offered.values().cloned().collect();

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use super::Item;
 use super::channel::QueuedBytes;
+use ros2probe_model::names::DdsName;
 
 /// Entries by their place in the order of coming.
 #[derive(Debug, Default)]
@@ -32,7 +33,7 @@ struct Entry {
 }
 
 /// Domain and DDS name: writers of one topic stand together.
-type Key = (u32, Arc<str>);
+type Key = (u32, DdsName);
 
 /// What waits of one topic; never empty.
 #[derive(Debug, Default)]
@@ -120,5 +121,5 @@ fn key(item: &Item) -> Option<Key> {
         Item::Missed(missed) => &missed.topic,
         Item::Clock(_) | Item::End(_) => return None,
     };
-    Some((topic.domain_id.0, Arc::clone(&topic.dds_name)))
+    Some((topic.domain_id.0, topic.dds_name.clone()))
 }

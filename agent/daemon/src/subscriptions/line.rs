@@ -1,5 +1,7 @@
 //! Items of a subscription as lines of the API's stream, and back.
 
+use std::sync::Arc;
+
 use ros2probe_api::samples::{self, Clock, End, Line, OfferedQos};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Liveliness, Qos, Reliability, Role};
@@ -81,7 +83,7 @@ pub fn offered(offered: &Offered) -> samples::Offered {
 pub(super) fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
-        qos: qos(&offered.qos),
+        qos: Arc::new(qos(&offered.qos)),
     }
 }
 

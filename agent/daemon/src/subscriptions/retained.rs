@@ -153,7 +153,7 @@ mod tests {
                 message_type: "tf2_msgs/msg/TFMessage".into(),
                 offered: Some(Arc::new(Offered {
                     type_hash: None,
-                    qos,
+                    qos: Arc::new(qos),
                 })),
             }),
             time: Timestamp(time),

@@ -11,6 +11,7 @@ use super::ros2_metrics::TopicRow;
 use crate::settings_cell::Settings;
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::loss::LossCause;
+use ros2probe_model::snapshot::Subscriber;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts, TopicFacts,
 };
@@ -77,7 +78,7 @@ impl<'a> Deliveries<'a> {
             Direction::Received => &mut self.received,
         };
         let identity =
-            |facts: &'a DeliveryFacts| (facts.writer, facts.destination, facts.subscriber.as_str());
+            |facts: &'a DeliveryFacts| (facts.writer, facts.destination, facts.subscriber);
         if let Some(twin) = list
             .last_mut()
             .filter(|last| std::ptr::eq(last.row, row) && identity(last.facts) == identity(facts))
@@ -179,7 +180,7 @@ impl<'a> Deliveries<'a> {
                 domain_id,
                 topic,
                 Label::Address(facts.destination),
-                Label::Text(&facts.subscriber),
+                Label::Subscriber(facts.subscriber),
                 Label::Text(&nodes),
                 participant,
                 Label::Text(facts.process.as_deref().unwrap_or_default()),
@@ -220,9 +221,9 @@ impl<'a> Deliveries<'a> {
 
 impl<'a> Delivery<'a> {
     /// What tells receivers apart in the labels that describe them.
-    fn receiver(&self) -> (*const TopicRow<'a>, SocketAddr, &'a str) {
+    fn receiver(&self) -> (*const TopicRow<'a>, SocketAddr, Subscriber) {
         let row = std::ptr::from_ref(self.row);
-        (row, self.facts.destination, &self.facts.subscriber)
+        (row, self.facts.destination, self.facts.subscriber)
     }
 
     fn labels(&self) -> [Label<'_>; 5] {
@@ -232,7 +233,7 @@ impl<'a> Delivery<'a> {
             topic,
             Label::Guid(self.facts.writer),
             Label::Address(self.facts.destination),
-            Label::Text(&self.facts.subscriber),
+            Label::Subscriber(self.facts.subscriber),
         ]
     }
 }

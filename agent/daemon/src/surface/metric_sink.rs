@@ -8,7 +8,9 @@ use std::fmt;
 use std::hash::{Hash as _, Hasher as _};
 use std::net::SocketAddr;
 
+use ros2probe_model::snapshot::Subscriber;
 use ros2probe_wire::Guid;
+use ros2probe_wire::rtps::VendorId;
 
 use super::catalogue::Metric;
 use super::otlp::points::Points;
@@ -25,6 +27,8 @@ pub(super) enum Label<'a> {
     Number(u64),
     Guid(Guid),
     Address(SocketAddr),
+    Vendor(VendorId),
+    Subscriber(Subscriber),
 }
 
 /// A sample value.

@@ -11,6 +11,8 @@ use crate::config::Watch;
 use crate::series_name::series_name;
 use crate::settings_cell::Settings;
 use ros2probe_model::histogram::Histogram;
+use ros2probe_model::names::TypeName;
+use ros2probe_model::snapshot::UnknownWriterFacts;
 use ros2probe_model::snapshot::{
     EndpointFacts, Measurement, ProcessFacts, SampledFacts, Snapshot, TopicFacts, WatchFacts,
     WatchState,
@@ -158,7 +160,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
             family.info(&[
                 Label::Number(participant.domain_id.into()),
                 Label::Guid(participant.guid),
-                Label::Text(&participant.vendor),
+                Label::Vendor(participant.vendor),
                 host,
                 process,
                 pid,
@@ -200,20 +202,20 @@ fn unknown_writers(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resul
     let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
     sink.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
         unknown().try_for_each(|writer| {
-            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            let labels = [Label::Guid(writer.guid), unknown_vendor(writer)];
             family.sample(&labels, writer.measurement.messages)
         })
     })?;
     sink.family(&metric::UNKNOWN_WRITER_RATE, |family| {
         unknown().try_for_each(|writer| {
-            let labels = [Label::Guid(writer.guid), Label::Text(&writer.vendor)];
+            let labels = [Label::Guid(writer.guid), unknown_vendor(writer)];
             family.sample(&labels, writer.measurement.rate_hz)
         })
     })?;
     sink.family(&metric::UNKNOWN_WRITER_INFO, |family| {
         unknown().try_for_each(|writer| {
             let [host, process, pid, cgroup] = place(&writer.process);
-            let (guid, vendor) = (Label::Guid(writer.guid), Label::Text(&writer.vendor));
+            let (guid, vendor) = (Label::Guid(writer.guid), unknown_vendor(writer));
             family.info(&[guid, vendor, host, process, pid, cgroup])
         })
     })
@@ -254,13 +256,13 @@ fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
             continue;
         }
         let participant = participants.get(&node.participant);
-        let vendor = participant.map_or("", |participant| participant.vendor.as_str());
+        let vendor = participant.map(|participant| participant.vendor);
         let host = participant.and_then(|participant| participant.process.host.as_deref());
         family.info(&[
             Label::Number(node.domain_id.into()),
             Label::Text(&node.name),
             Label::Guid(node.participant),
-            Label::Text(vendor),
+            vendor.map_or(Label::Text(""), Label::Vendor),
             Label::Text(host.unwrap_or_default()),
         ])?;
     }
@@ -458,10 +460,11 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     } else {
         &facts.publishers
     };
-    let policies = |policy: fn(&EndpointFacts) -> &String| joined(endpoints.iter().map(policy));
-    let message_types = joined(facts.message_types.iter());
-    let reliability = policies(|endpoint| &endpoint.reliability);
-    let durability = policies(|endpoint| &endpoint.durability);
+    let policies =
+        |policy: fn(&EndpointFacts) -> &'static str| joined(endpoints.iter().map(policy));
+    let message_types = joined(facts.message_types.iter().map(TypeName::as_str));
+    let reliability = policies(|endpoint| endpoint.qos.reliability.label());
+    let durability = policies(|endpoint| endpoint.qos.durability.label());
     family.info(&[
         domain_id,
         topic,
@@ -473,8 +476,8 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
 }
 
 /// The different values, sorted, a few of them.
-fn joined<'a>(values: impl Iterator<Item = &'a String>) -> String {
-    let different: BTreeSet<&str> = values.map(String::as_str).collect();
+fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
+    let different: BTreeSet<&str> = values.collect();
     let mut text = String::new();
     for value in different.iter().take(MAX_JOINED) {
         if !text.is_empty() {
@@ -563,14 +566,21 @@ fn configured<'c>(
     watch: &WatchFacts,
     configured: &'c [Arc<Watch>],
 ) -> Option<&'c Watch> {
-    let same =
-        |other: &&Watch| (&other.pattern, other.domain_id) == (&watch.pattern, watch.domain_id);
+    let same = |other: &&Watch| {
+        (&other.pattern, other.domain_id) == (&watch.watch.pattern, watch.watch.domain_id)
+    };
     let there = configured.get(place).map(|watch| &**watch).filter(same);
     there.or_else(|| configured.iter().map(|watch| &**watch).find(same))
 }
 
+/// What the vendor of a writer is, as far as it is known.
+fn unknown_vendor(writer: &UnknownWriterFacts) -> Label<'static> {
+    writer.vendor.map_or(Label::Text(""), Label::Vendor)
+}
+
 /// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.
-fn watch_name(watch: &WatchFacts) -> Cow<'_, str> {
+fn watch_name(facts: &WatchFacts) -> Cow<'_, str> {
+    let watch = &facts.watch;
     match watch.domain_id {
         None => Cow::Borrowed(&watch.pattern),
         Some(domain_id) => Cow::Owned(format!("{}@{domain_id}", watch.pattern)),

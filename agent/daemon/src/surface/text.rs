@@ -113,6 +113,8 @@ impl<'a> Text<'a> {
                 Label::Number(number) => write!(escaped, "{number}")?,
                 Label::Guid(guid) => write!(escaped, "{guid}")?,
                 Label::Address(address) => write!(escaped, "{address}")?,
+                Label::Vendor(vendor) => write!(escaped, "{vendor}")?,
+                Label::Subscriber(subscriber) => write!(escaped, "{subscriber}")?,
             }
             self.out.write_char('"')?;
             before = ',';

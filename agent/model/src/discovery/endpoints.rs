@@ -1,7 +1,8 @@
 //! SEDP: writers and readers, and those that wait for their participant (RTPS 2.5, 8.5.4).
 
-use std::cmp::Reverse;
 use std::sync::Arc;
+
+use std::cmp::Reverse;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::rtps::Locator;
@@ -89,10 +90,12 @@ impl Discovery {
             if *known.topic == *announcement.topic.as_str() {
                 let before = (
                     known.type_hash,
-                    known.qos.clone(),
-                    Arc::clone(&known.message_type),
+                    Arc::clone(&known.qos),
+                    known.message_type.clone(),
                 );
-                known.qos = announcement.qos.clone();
+                if *known.qos != announcement.qos {
+                    known.qos = Arc::new(announcement.qos.clone());
+                }
                 known.type_hash = announcement.type_hash;
                 known.message_type = announcement.type_name.message().as_str().into();
                 let unchanged = before.0 == known.type_hash
@@ -132,7 +135,7 @@ impl Discovery {
             topic: announcement.topic.as_str().into(),
             message_type: announcement.type_name.message().as_str().into(),
             type_hash: announcement.type_hash,
-            qos: announcement.qos,
+            qos: Arc::new(announcement.qos),
             first_seen: at,
             shared_memory,
             data_sharing: announcement.datasharing,

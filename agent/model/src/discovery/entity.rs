@@ -7,7 +7,8 @@ use ros2probe_wire::{DomainId, Guid};
 
 use super::facts::{Endpoint, ParticipantProxy};
 use crate::churn::{Entity, Event};
-use crate::event::{EventKind, bounded, bounded_shared};
+use crate::event::{EventKind, TEXT, bounded};
+use crate::names::{DdsName, NodeName, TypeName};
 
 /// One participant, endpoint or node.
 pub(super) struct DiscoveredEntity<'a> {
@@ -19,8 +20,8 @@ pub(super) struct DiscoveredEntity<'a> {
 /// What it is. An endpoint's names are shared, for it is often taken out before it is told of.
 enum EntityDetails<'a> {
     Participant(&'a ParticipantProxy),
-    Endpoint(Role, Arc<str>, Arc<str>),
-    Node(&'a Arc<str>),
+    Endpoint(Role, DdsName, TypeName),
+    Node(&'a NodeName),
 }
 
 impl<'a> DiscoveredEntity<'a> {
@@ -37,8 +38,7 @@ impl<'a> DiscoveredEntity<'a> {
     }
 
     pub(super) fn endpoint(guid: Guid, endpoint: &Endpoint) -> DiscoveredEntity<'static> {
-        let names = [&endpoint.topic, &endpoint.message_type];
-        let [topic, message_type] = names.map(Arc::clone);
+        let (topic, message_type) = (endpoint.topic.clone(), endpoint.message_type.clone());
         DiscoveredEntity {
             domain_id: endpoint.domain_id,
             guid,
@@ -47,7 +47,7 @@ impl<'a> DiscoveredEntity<'a> {
     }
 
     /// A node of this participant.
-    pub(super) const fn node(domain_id: DomainId, participant: Guid, name: &'a Arc<str>) -> Self {
+    pub(super) const fn node(domain_id: DomainId, participant: Guid, name: &'a NodeName) -> Self {
         Self {
             domain_id,
             guid: participant,
@@ -67,8 +67,8 @@ impl<'a> DiscoveredEntity<'a> {
     pub(super) fn name(&self) -> Arc<str> {
         match &self.details {
             EntityDetails::Participant(_) => Arc::default(),
-            EntityDetails::Endpoint(_, topic, _) => Arc::clone(topic),
-            EntityDetails::Node(name) => Arc::clone(name),
+            EntityDetails::Endpoint(_, topic, _) => topic.shared(),
+            EntityDetails::Node(name) => name.shared(),
         }
     }
 
@@ -82,7 +82,7 @@ impl<'a> DiscoveredEntity<'a> {
         let (domain_id, guid) = (*domain_id, *guid);
         match details {
             EntityDetails::Participant(proxy) => {
-                let text = |text: &Option<Box<str>>| text.as_deref().map(bounded).map(Into::into);
+                let text = |text: &Option<Arc<str>>| text.as_deref().map(bounded).map(Into::into);
                 EventKind::Participant {
                     change,
                     domain_id,
@@ -97,14 +97,14 @@ impl<'a> DiscoveredEntity<'a> {
                 domain_id,
                 guid,
                 role: *role,
-                topic: bounded_shared(topic),
-                message_type: bounded_shared(message_type),
+                topic: topic.bounded(TEXT),
+                message_type: message_type.bounded(TEXT),
             },
             EntityDetails::Node(name) => EventKind::Node {
                 change,
                 domain_id,
                 participant: guid,
-                name: bounded_shared(name),
+                name: name.bounded(TEXT),
             },
         }
     }

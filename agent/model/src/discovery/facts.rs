@@ -13,6 +13,7 @@ use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::priority::Priority;
+use crate::names::{DdsName, NodeName, TypeName};
 
 /// Addresses kept of one participant and kind.
 pub(super) const ADDRESSES: usize = 16;
@@ -52,11 +53,11 @@ pub struct ParticipantProxy {
     /// Implementation.
     pub vendor: VendorId,
     /// ROS enclave.
-    pub enclave: Option<Box<str>>,
+    pub enclave: Option<Arc<str>>,
     /// Host name.
-    pub host: Option<Box<str>>,
+    pub host: Option<Arc<str>>,
     /// Process name.
-    pub process_name: Option<Box<str>>,
+    pub process_name: Option<Arc<str>>,
     /// Process id, or its low 16 bits.
     pub process_id: Option<u32>,
     /// Lease.
@@ -112,7 +113,7 @@ pub struct Participant {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Node {
     /// Fully qualified name.
-    pub name: Arc<str>,
+    pub name: NodeName,
     /// Its writers.
     pub writers: Vec<Guid>,
     /// Its readers.
@@ -127,13 +128,13 @@ pub struct Endpoint {
     /// Domain of its participant.
     pub domain_id: DomainId,
     /// DDS topic.
-    pub topic: Arc<str>,
+    pub topic: DdsName,
     /// ROS type.
-    pub message_type: Arc<str>,
+    pub message_type: TypeName,
     /// RIHS01 hash.
     pub type_hash: Option<TypeHash>,
     /// Quality of service.
-    pub qos: Qos,
+    pub qos: Arc<Qos>,
     /// First announcement.
     pub first_seen: Timestamp,
     /// Whether it can be reached through shared memory; `None` = as its participant.

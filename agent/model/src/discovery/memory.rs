@@ -166,7 +166,7 @@ impl Remembered {
         endpoints: Vec<RememberedEndpoint>,
     ) -> Self {
         let proxy = &participant.proxy;
-        let text = |text: &Option<Box<str>>| text.as_deref().map(str::to_owned);
+        let text = |text: &Option<Arc<str>>| text.as_deref().map(str::to_owned);
         let [first, second] = proxy.vendor.0;
         Self {
             prefix: prefix.to_string(),
@@ -233,7 +233,7 @@ impl RememberedNode {
     fn of(node: &Node) -> Self {
         let all = |guids: &[Guid]| guids.iter().map(|guid| digits(*guid)).collect();
         Self {
-            name: node.name.as_ref().to_owned(),
+            name: node.name.to_string(),
             writers: all(&node.writers),
             readers: all(&node.readers),
         }
@@ -260,8 +260,8 @@ impl RememberedEndpoint {
         let qos = &endpoint.qos;
         Self {
             guid: digits(guid),
-            topic: endpoint.topic.as_ref().to_owned(),
-            message_type: endpoint.message_type.as_ref().to_owned(),
+            topic: endpoint.topic.to_string(),
+            message_type: endpoint.message_type.to_string(),
             type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
             reliability: qos.reliability.0,
             durability: qos.durability.0,
@@ -305,10 +305,10 @@ impl RememberedEndpoint {
         let endpoint = Endpoint {
             role,
             domain_id,
-            topic: Arc::from(topic.as_str()),
-            message_type: Arc::from(message_type.as_str()),
+            topic: topic.as_str().into(),
+            message_type: message_type.as_str().into(),
             type_hash: self.type_hash.as_deref().and_then(TypeHash::parse),
-            qos: Qos {
+            qos: Arc::new(Qos {
                 reliability: Reliability(self.reliability),
                 durability: Durability(self.durability),
                 history: self.history.map(history),
@@ -327,7 +327,7 @@ impl RememberedEndpoint {
                 destination_order: DestinationOrder(self.matching.destination_order),
                 presentation: self.matching.presentation(),
                 representations: self.matching.representations(),
-            },
+            }),
             first_seen: now,
             shared_memory: self.shared_memory,
             data_sharing: self.data_sharing,
@@ -440,7 +440,7 @@ mod tests {
             topic: "rt/points".into(),
             message_type: "std_msgs/msg/String".into(),
             type_hash: None,
-            qos: qos.clone(),
+            qos: Arc::new(qos.clone()),
             first_seen: Timestamp(1),
             shared_memory: None,
             data_sharing: false,
@@ -454,9 +454,9 @@ mod tests {
                 .qos
         };
         let mut kept = serde_json::to_value(RememberedEndpoint::of(guid, &endpoint)).unwrap();
-        assert_eq!(back(&kept), qos);
+        assert_eq!(*back(&kept), qos);
         kept.as_object_mut().unwrap().remove("matching");
-        assert_eq!(back(&kept), defaults);
+        assert_eq!(*back(&kept), defaults);
     }
 
     #[test]

@@ -1,7 +1,5 @@
 //! Nodes, as `ros_discovery_info` announces them.
 
-use std::sync::Arc;
-
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
@@ -14,15 +12,16 @@ use super::{
 };
 use crate::churn::Event;
 use crate::journal::Journal;
+use crate::names::NodeName;
 
 /// Names of `one` that are not in `other`, each as often as it is missing there.
-pub(super) fn difference(one: &[Arc<str>], other: &[Arc<str>]) -> Vec<Arc<str>> {
+pub(super) fn difference(one: &[NodeName], other: &[NodeName]) -> Vec<NodeName> {
     let mut rest: Vec<_> = other.to_vec();
     let mut missing = Vec::new();
     for name in one {
         match rest.iter().position(|each| each == name) {
             Some(index) => drop(rest.swap_remove(index)),
-            None => missing.push(Arc::clone(name)),
+            None => missing.push(name.clone()),
         }
     }
     missing
@@ -150,7 +149,7 @@ impl Discovery {
         let after: Vec<_> = participant
             .nodes
             .iter()
-            .map(|node| Arc::clone(&node.name))
+            .map(|node| node.name.clone())
             .collect();
         self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
         let before: Vec<_> = before.into_iter().map(|node| node.name).collect();

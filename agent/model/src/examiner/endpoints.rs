@@ -2,7 +2,6 @@
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
-use std::sync::Arc;
 
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::rtps::VendorId;
@@ -13,6 +12,7 @@ use crate::diagnosis::{
     self, Diagnosis, Offer, Policies, Policy, QosPairs, TopicKey, Unmatched, Verdict,
 };
 use crate::discovery::{Discovery, Endpoint};
+use crate::names::TypeName;
 use crate::topic::Topic;
 use crate::topic_kind::TopicKind;
 
@@ -38,7 +38,7 @@ pub(super) struct UnmatchedEndpoint {
 /// Endpoints of one role for which every verdict is the same.
 #[derive(Debug)]
 struct Group<'a> {
-    message_type: &'a Arc<str>,
+    message_type: &'a TypeName,
     offer: Offer<'a>,
     members: Vec<Guid>,
     /// Why they have no counterpart; `None` once they have, or may have.
@@ -59,8 +59,8 @@ impl<'a> EndpointExaminer<'a> {
         let naming = &topic.naming;
         let key = || TopicKey {
             domain_id: topic.domain_id,
-            dds_name: Arc::clone(&naming.dds_name),
-            name: Arc::clone(&naming.name),
+            dds_name: naming.dds_name.clone(),
+            name: naming.name.clone(),
             kind: naming.kind,
         };
         let mut writers = self.groups(&topic.writers);
@@ -137,7 +137,7 @@ impl<'a> EndpointExaminer<'a> {
 
     /// Are there several types, or several definitions of one?
     fn types(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
-        let mut types: BTreeMap<&Arc<str>, BTreeSet<TypeHash>> = BTreeMap::new();
+        let mut types: BTreeMap<&TypeName, BTreeSet<TypeHash>> = BTreeMap::new();
         for guid in topic.writers.iter().chain(&topic.readers) {
             if let Some((endpoint, _)) = self.endpoint(*guid) {
                 let hashes = types.entry(&endpoint.message_type).or_default();
@@ -153,7 +153,7 @@ impl<'a> EndpointExaminer<'a> {
         for (message_type, hashes) in types.into_iter().filter(|(_, hashes)| hashes.len() > 1) {
             findings.add(Diagnosis::TypeHashConflict {
                 topic: key(),
-                message_type: Arc::clone(message_type),
+                message_type: message_type.clone(),
                 hashes: hashes.into_iter().take(MAX_NAMED).collect(),
             });
         }

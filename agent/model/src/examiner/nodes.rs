@@ -2,13 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
-use std::sync::Arc;
 
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 use super::Findings;
 use crate::diagnosis::Diagnosis;
 use crate::discovery::{Discovery, Node, Participant};
+use crate::names::NodeName;
 
 /// One node with whom it belongs to.
 #[derive(Clone, Copy, Debug)]
@@ -20,7 +20,7 @@ struct HostedNode<'a> {
 
 /// Adds what is found.
 pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
-    let mut names: BTreeMap<&Arc<str>, Vec<HostedNode<'_>>> = BTreeMap::new();
+    let mut names: BTreeMap<&NodeName, Vec<HostedNode<'_>>> = BTreeMap::new();
     for (prefix, participant) in discovery.participants() {
         // Who was there before the agent's start and was not heard since may be its own successor.
         if participant.restored.is_some() {
@@ -44,7 +44,7 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
                 domain_id: nodes
                     .first()
                     .map_or(DomainId(0), |each| each.participant.domain_id),
-                node: Arc::clone(name),
+                node: (*name).clone(),
                 participants: nodes.iter().map(HostedNode::guid).collect(),
             });
         }
@@ -56,7 +56,7 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
 /// on the same machine. Robots whose nodes have the same names and whose domains keep them apart
 /// are a fleet as it should be.
 fn several_domains(
-    name: &Arc<str>,
+    name: &NodeName,
     nodes: &[HostedNode<'_>],
     discovery: &Discovery,
     findings: &mut Findings,
@@ -84,9 +84,9 @@ fn several_domains(
     }
 }
 
-fn finding(name: &Arc<str>, participant: Guid, domains: &BTreeSet<DomainId>) -> Diagnosis {
+fn finding(name: &NodeName, participant: Guid, domains: &BTreeSet<DomainId>) -> Diagnosis {
     Diagnosis::NodeInSeveralDomains {
-        node: Arc::clone(name),
+        node: name.clone(),
         participant,
         domains: domains.iter().copied().collect(),
     }

@@ -8,7 +8,7 @@ use ros2probe_wire::time::SECOND;
 
 use super::{JUMP, Observer, TICK, graph};
 use crate::diagnosis;
-use crate::event::{EventKind, bounded, bounded_finding, bounded_shared};
+use crate::event::{EventKind, TEXT, bounded, bounded_finding};
 use crate::expectation::Evidence;
 use crate::expectation::WatchState;
 use crate::rate::Slot;
@@ -44,12 +44,12 @@ impl Observer {
         let discovery = &self.discovery;
         self.journal.events.end_bursts(|burst| {
             if let Some(endpoint) = discovery.endpoints().get(&burst.writer) {
-                burst.topic = Some((endpoint.domain_id, bounded_shared(&endpoint.topic)));
+                burst.topic = Some((endpoint.domain_id, endpoint.topic.bounded(TEXT)));
             }
             let participant = discovery.participants().get(&burst.writer.prefix);
             let mut nodes = participant.into_iter().flat_map(|known| &known.nodes);
             let node = nodes.find(|node| node.writers.contains(&burst.writer));
-            burst.node = node.map(|node| bounded_shared(&node.name));
+            burst.node = node.map(|node| node.name.bounded(TEXT));
         });
     }
 
@@ -158,7 +158,7 @@ impl Observer {
                 let (domain_id, name) = (topic.domain_id, &topic.naming.name);
                 let kind = EventKind::Expectation {
                     domain_id,
-                    topic: bounded_shared(name),
+                    topic: name.bounded(TEXT),
                     watch: bounded(&watch.pattern).into(),
                     from,
                     to,
@@ -168,7 +168,7 @@ impl Observer {
                 if to == WatchState::Silent {
                     let kind = EventKind::Silence {
                         domain_id,
-                        topic: bounded_shared(name),
+                        topic: name.bounded(TEXT),
                         watch: bounded(&watch.pattern).into(),
                         last_message: evidence.last_message,
                     };

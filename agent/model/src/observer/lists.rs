@@ -132,9 +132,9 @@ impl Observer {
                     Some(requested) if measured => {
                         let topic = dispatch::Topic {
                             domain_id: topic.domain_id,
-                            name: Arc::clone(&topic.naming.name),
-                            dds_name: Arc::clone(&topic.naming.dds_name),
-                            message_type: Arc::clone(&endpoint.message_type),
+                            name: topic.naming.name.clone(),
+                            dds_name: topic.naming.dds_name.clone(),
+                            message_type: endpoint.message_type.clone(),
                             offered: Some(Arc::new(Offered {
                                 type_hash: endpoint.type_hash,
                                 qos: endpoint.qos.clone(),

@@ -6,14 +6,14 @@ mod deliveries;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, Duration, EntityId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
 
 use super::Observer;
 use crate::discovery::{Discovery, Endpoint, ParticipantProxy};
 use crate::expectation::WatchState;
 use crate::measurement::Measurement;
+use crate::names::{DdsName, NodeName};
 use crate::snapshot::{
     DecodeErrorCount, EndpointFacts, NodeFacts, ParticipantFacts, ProcessFacts, Snapshot,
     TableFacts, TopicFacts, UnknownWriterFacts, WatchFacts, WatchedTopicFacts,
@@ -59,12 +59,12 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
             ParticipantFacts {
                 guid: Guid::new(*prefix, EntityId::PARTICIPANT),
                 domain_id: participant.domain_id,
-                vendor: proxy.vendor.to_string(),
-                enclave: proxy.enclave.as_deref().map(Into::into),
+                vendor: proxy.vendor,
+                enclave: proxy.enclave.clone(),
                 process: process(Some(proxy), holders.get(prefix).copied()),
                 first_seen: participant.first_seen,
                 last_seen: participant.last_seen,
-                lease_nanoseconds: nanoseconds(proxy.lease),
+                lease: proxy.lease,
                 secured: proxy.secured,
                 restored: participant.restored.is_some(),
                 addresses: participant.addresses.clone(),
@@ -81,7 +81,7 @@ fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
         for node in &participant.nodes {
             facts.push(NodeFacts {
                 domain_id: participant.domain_id,
-                name: node.name.as_ref().to_owned(),
+                name: node.name.clone(),
                 participant: Guid::new(*prefix, EntityId::PARTICIPANT),
                 writers: node.writers.clone(),
                 readers: node.readers.clone(),
@@ -99,12 +99,12 @@ fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
 }
 
 /// Which node an endpoint belongs to.
-fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &str> {
+fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
     let mut nodes = HashMap::with_capacity(discovery.endpoints().len());
     for participant in discovery.participants().values() {
         for node in &participant.nodes {
             for guid in node.writers.iter().chain(&node.readers) {
-                nodes.insert(*guid, &*node.name);
+                nodes.insert(*guid, &node.name);
             }
         }
     }
@@ -114,7 +114,7 @@ fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &str> {
 fn topic(
     observer: &Observer,
     topic: &Topic,
-    nodes: &HashMap<Guid, &str>,
+    nodes: &HashMap<Guid, &NodeName>,
     now: Timestamp,
 ) -> TopicFacts {
     let endpoint = |guid: &Guid| {
@@ -143,9 +143,9 @@ fn topic(
     let all = || publishers.iter().chain(&subscriptions);
     let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
     if topic.is_vanished() {
-        message_types.extend(topic.last_type.as_deref().map(ToOwned::to_owned));
+        message_types.extend(topic.last_type.clone());
     }
-    let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash.clone()).collect();
+    let type_hashes: BTreeSet<_> = all().filter_map(|each| each.type_hash).collect();
     let mut measurement = apart(observer, topic, now);
     if let Some(sum) = &mut measurement {
         let own = publishers
@@ -156,8 +156,8 @@ fn topic(
     let totals = deliveries::totals(observer, topic);
     TopicFacts {
         domain_id: topic.domain_id,
-        name: topic.naming.name.as_ref().to_owned(),
-        dds_name: topic.naming.dds_name.as_ref().to_owned(),
+        name: topic.naming.name.clone(),
+        dds_name: topic.naming.dds_name.clone(),
         kind: topic.naming.kind,
         hidden: topic.naming.hidden,
         message_types: message_types.into_iter().collect(),
@@ -180,7 +180,7 @@ fn topic(
 pub(super) fn measured(
     observer: &Observer,
     now: Timestamp,
-) -> impl Iterator<Item = (DomainId, &Arc<str>, Measurement)> {
+) -> impl Iterator<Item = (DomainId, &DdsName, Measurement)> {
     let topics = observer.topics.iter().map(|(_, topic)| topic);
     let topics = topics.filter(|topic| topic.watched == Watched::Yes);
     topics.filter_map(move |topic| {
@@ -217,25 +217,15 @@ fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
 fn endpoint_facts(
     guid: Guid,
     endpoint: &Endpoint,
-    node: Option<&str>,
+    node: Option<&NodeName>,
     measurement: Option<Box<Measurement>>,
 ) -> EndpointFacts {
-    let qos = &endpoint.qos;
-    let history = qos.history;
     EndpointFacts {
         guid,
-        node: node.map(ToOwned::to_owned),
-        reliability: qos.reliability.to_string(),
-        durability: qos.durability.to_string(),
-        history: history.map_or_else(|| "UNKNOWN".to_owned(), |history| history.to_string()),
-        deadline_nanoseconds: nanoseconds(qos.deadline),
-        lifespan_nanoseconds: nanoseconds(qos.lifespan),
-        liveliness: qos.liveliness.to_string(),
-        liveliness_lease_nanoseconds: nanoseconds(qos.liveliness_lease),
-        ownership: qos.ownership.name().unwrap_or("UNKNOWN"),
-        partitions: qos.partitions.iter().map(ToString::to_string).collect(),
-        message_type: endpoint.message_type.as_ref().to_owned(),
-        type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
+        node: node.cloned(),
+        qos: Arc::clone(&endpoint.qos),
+        message_type: endpoint.message_type.clone(),
+        type_hash: endpoint.type_hash,
         first_seen: endpoint.first_seen,
         measurement,
         transports: 0,
@@ -267,12 +257,10 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
 
 /// What a participant says of where it lives, and who holds the socket it sends by.
 fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
-    let said = |text: fn(&ParticipantProxy) -> &Option<Box<str>>| {
-        proxy
-            .and_then(|proxy| text(proxy).as_deref())
-            .map(str::to_owned)
+    let said = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
+        proxy.and_then(|proxy| text(proxy).clone())
     };
-    let held = |text: fn(&SocketFacts) -> &Option<String>| holder.and_then(|it| text(it).clone());
+    let held = |text: fn(&SocketFacts) -> &Option<Arc<str>>| holder.and_then(|it| text(it).clone());
     let id = holder.and_then(|holder| holder.process_id);
     ProcessFacts {
         host: said(|proxy| &proxy.host),
@@ -282,14 +270,14 @@ fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> Pr
     }
 }
 
-/// The vendor in words; without an announcement the GUID tells where it begins with a known one's
-/// mark, as RTPS 2.5, 9.3.1.5 asks for and Fast DDS and Cyclone DDS 0.10 do.
-fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> String {
+/// The vendor; without an announcement the GUID tells where it begins with a known one's mark, as
+/// RTPS 2.5, 9.3.1.5 asks for and Fast DDS and Cyclone DDS 0.10 do.
+fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> Option<VendorId> {
     let [first, second, ..] = guid.prefix.0;
     let marked = VendorId([first, second]);
     match proxy {
-        Some(proxy) => proxy.vendor.to_string(),
-        None => marked.name().unwrap_or_default().to_owned(),
+        Some(proxy) => Some(proxy.vendor),
+        None => marked.name().is_some().then_some(marked),
     }
 }
 
@@ -299,8 +287,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
         .watches()
         .iter()
         .map(|watch| WatchFacts {
-            pattern: watch.pattern.clone(),
-            domain_id: watch.domain_id,
+            watch: Arc::clone(watch),
             topics: Vec::new(),
         })
         .collect();
@@ -311,7 +298,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
             };
             fact.topics.push(WatchedTopicFacts {
                 domain_id: topic.domain_id,
-                topic: topic.naming.name.as_ref().to_owned(),
+                topic: topic.naming.name.clone(),
                 state: judgement.state(),
                 violations: judgement.violations(),
             });
@@ -327,7 +314,7 @@ fn watches(observer: &Observer) -> Vec<WatchFacts> {
         if watch.is_literal() && fact.topics.is_empty() && !is_rejected(&watch.pattern) {
             fact.topics.push(WatchedTopicFacts {
                 domain_id: watch.domain_id.unwrap_or(DomainId(0)),
-                topic: watch.pattern.clone(),
+                topic: watch.pattern.as_str().into(),
                 state: WatchState::NotPublished,
                 violations: Vec::new(),
             });
@@ -421,11 +408,4 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         table("spans", spans, spans_limit, spans_evictions),
         table("payloads", payloads, payloads_limit, payloads_evictions),
     ]
-}
-
-const fn nanoseconds(duration: Duration) -> Option<u64> {
-    match duration {
-        Duration::Finite(nanoseconds) => Some(nanoseconds),
-        Duration::Infinite => None,
-    }
 }

@@ -106,11 +106,12 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
             "1.16" => "Eclipse Cyclone DDS",
             _ => "eProsima Fast DDS",
         };
+        let found = ours.vendor.to_string();
         assert!(
-            ours.vendor.contains(vendor) || vendor.contains(&ours.vendor),
+            found.contains(vendor) || vendor.contains(&found),
             "{ours:?}"
         );
-        let lease = ours.lease_nanoseconds.map(|lease| lease as f64 / 1e9);
+        let lease = ours.lease.nanoseconds().map(|lease| lease as f64 / 1e9);
         assert_eq!(lease, Some(theirs.lease), "{name}: lease of {guid}");
         assert_eq!(
             (ours.domain_id, ours.enclave.as_deref()),
@@ -160,11 +161,11 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
             "BEST_EFFORT"
         };
         assert_eq!(
-            ours.reliability,
+            ours.qos.reliability.label(),
             theirs.reliability.as_deref().unwrap_or(role_default)
         );
         assert_eq!(
-            ours.durability,
+            ours.qos.durability.label(),
             theirs.durability.as_deref().unwrap_or("VOLATILE"),
             "{what}"
         );
@@ -174,15 +175,18 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
             (None, "1.16") => "KEEP_LAST (1)".to_owned(),
             (None, _) => "UNKNOWN".to_owned(),
         };
-        assert_eq!(ours.history, history, "{what}");
+        assert_eq!(ours.history(), history, "{what}");
         let lifespan = theirs.lifespan.as_ref().and_then(serde_json::Value::as_f64);
         assert_eq!(
-            ours.lifespan_nanoseconds.map(|span| span as f64 / 1e9),
+            ours.qos
+                .lifespan
+                .nanoseconds()
+                .map(|span| span as f64 / 1e9),
             lifespan,
             "{what}"
         );
         assert_eq!(
-            (ours.deadline_nanoseconds, ours.liveliness.as_str()),
+            (ours.qos.deadline.nanoseconds(), ours.qos.liveliness.label()),
             (None, "AUTOMATIC")
         );
         let hash = theirs
@@ -190,7 +194,11 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
             .as_deref()
             .and_then(|data| data.split("typehash=").nth(1));
         let hash = hash.and_then(|rest| rest.split(';').next());
-        assert_eq!(ours.type_hash.as_deref(), hash, "{what}");
+        assert_eq!(
+            ours.type_hash.map(|hash| hash.to_string()).as_deref(),
+            hash,
+            "{what}"
+        );
     }
     assert!(
         compared * 10 >= theirs.len() * 9,
@@ -376,7 +384,7 @@ fn losses(name: &str, facts: &Facts, replayed: &Replayed) {
         let writers = facts
             .writers
             .iter()
-            .filter(|(_, writer)| writer.topic == topic.dds_name);
+            .filter(|(_, writer)| topic.dds_name == writer.topic);
         let lost: usize = writers
             .map(|(guid, _)| ours.get(guid.as_str()).map_or(0, BTreeSet::len))
             .sum();

@@ -141,7 +141,7 @@ impl World {
         self.snapshot()
             .nodes
             .into_iter()
-            .map(|node| node.name)
+            .map(|node| node.name.to_string())
             .collect()
     }
 }

@@ -31,14 +31,7 @@ const ANSWERS: [&str; 9] = [
     "watch.rs",
 ];
 /// Likewise single structs: what is handed out, what lasts for one look, lengths.
-const ANSWER: [&str; 6] = [
-    "Taken",
-    "Findings",
-    "UnknownWriters",
-    "SpanStage",
-    "Past",
-    "SocketFacts",
-];
+const ANSWER: [&str; 5] = ["Taken", "Findings", "UnknownWriters", "SpanStage", "Past"];
 /// What others hold and the model only shares.
 const SHARED: [&str; 2] = ["Arc<", "&'"];
 

@@ -169,7 +169,7 @@ impl Host {
             self.observer.input(Input::Socket(SocketFacts {
                 cookie,
                 process_id: Some(process_id),
-                process: Some("listener".to_owned()),
+                process: Some("listener".into()),
                 ..SocketFacts::default()
             }));
         }

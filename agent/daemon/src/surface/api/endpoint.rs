@@ -6,9 +6,12 @@ use super::index::Index;
 use super::measured::measurement;
 use ros2probe_api::endpoints::{Endpoint, Process, Qos};
 use ros2probe_model::snapshot::{EndpointFacts, ProcessFacts};
+use ros2probe_wire::Duration;
+use ros2probe_wire::rtps::VendorId;
 
 /// One writer or reader.
 pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpoint<'a> {
+    let qos = &facts.qos;
     let participant = index.participant(facts.guid);
     let enclave = participant.and_then(|participant| participant.enclave.as_deref());
     Endpoint {
@@ -16,18 +19,18 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
         node: facts.node.as_deref().map(Cow::Borrowed),
         enclave: enclave.map(Cow::Borrowed),
         message_type: Cow::Borrowed(&facts.message_type),
-        type_hash: facts.type_hash.as_deref().map(Cow::Borrowed),
-        vendor: participant.map(|participant| Cow::Borrowed(&*participant.vendor)),
+        type_hash: facts.type_hash.map(|hash| Cow::Owned(hash.to_string())),
+        vendor: participant.map(|participant| vendor(participant.vendor)),
         qos: Qos {
-            reliability: Cow::Borrowed(&facts.reliability),
-            durability: Cow::Borrowed(&facts.durability),
-            history: Cow::Borrowed(&facts.history),
-            deadline_seconds: seconds(facts.deadline_nanoseconds),
-            lifespan_seconds: seconds(facts.lifespan_nanoseconds),
-            liveliness: Cow::Borrowed(&facts.liveliness),
-            liveliness_lease_seconds: seconds(facts.liveliness_lease_nanoseconds),
-            ownership: Cow::Borrowed(facts.ownership),
-            partitions: texts(&facts.partitions),
+            reliability: Cow::Borrowed(qos.reliability.label()),
+            durability: Cow::Borrowed(qos.durability.label()),
+            history: Cow::Owned(facts.history()),
+            deadline_seconds: seconds(qos.deadline),
+            lifespan_seconds: seconds(qos.lifespan),
+            liveliness: Cow::Borrowed(qos.liveliness.label()),
+            liveliness_lease_seconds: seconds(qos.liveliness_lease),
+            ownership: Cow::Borrowed(qos.ownership.label()),
+            partitions: texts(&qos.partitions),
         },
         first_seen_timestamp_seconds: facts.first_seen.seconds(),
         measurement: facts.measurement.as_deref().map(measurement),
@@ -44,10 +47,20 @@ pub(super) fn process(facts: &ProcessFacts) -> Process<'_> {
     }
 }
 
-/// Nanoseconds as seconds.
+/// A vendor in words, or its two bytes in hex.
+pub(super) fn vendor(vendor: VendorId) -> Cow<'static, str> {
+    match vendor.name() {
+        Some(name) => Cow::Borrowed(name),
+        None => Cow::Owned(vendor.to_string()),
+    }
+}
+
+/// A duration in seconds; `None` if it never ends.
 #[expect(clippy::cast_precision_loss, reason = "microseconds survive")]
-pub(super) fn seconds(nanoseconds: Option<u64>) -> Option<f64> {
-    nanoseconds.map(|nanoseconds| nanoseconds as f64 / 1e9)
+pub(super) fn seconds(duration: Duration) -> Option<f64> {
+    duration
+        .nanoseconds()
+        .map(|nanoseconds| nanoseconds as f64 / 1e9)
 }
 
 /// Texts of the snapshot, borrowed.

@@ -37,7 +37,7 @@ pub(super) async fn show(
     let topic = find(state.known(), name, domain.checked()?)?;
     let past = context.latest.past();
     let mut view = History {
-        topic: topic.name.clone(),
+        topic: topic.name.to_string(),
         domain_id: topic.domain_id.0,
         interval_seconds: 1,
         timestamp_seconds: state.known().at.seconds(),

@@ -11,7 +11,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::endpoint::process;
+use super::endpoint::{process, vendor};
 use super::finding::diagnosis;
 use super::index::{Ends, Index};
 use super::nearest::hint;
@@ -90,7 +90,7 @@ async fn show(
         let all = nodes(snapshot).filter_map(|nodes| Some((nodes.first()?, nodes)));
         all.filter(|(node, _)| scope.admits(node.domain_id))
     };
-    let found = admitted().filter(|(node, _)| node.name == name);
+    let found = admitted().filter(|(node, _)| *node.name == *name);
     let found = found.map(|(node, nodes)| (node.domain_id, nodes)).collect();
     let missing = || {
         let hint = hint(&name, admitted().map(|(node, _)| node.name.as_str()));
@@ -196,7 +196,7 @@ impl<'a> NodeAnswers<'a> {
         let participant = self.index.participant(node.participant);
         NodeInstance {
             participant: node.participant.to_string(),
-            vendor: participant.map(|participant| Cow::Borrowed(&*participant.vendor)),
+            vendor: participant.map(|participant| vendor(participant.vendor)),
             process: participant.map(|participant| process(&participant.process)),
         }
     }
@@ -206,9 +206,9 @@ impl<'a> NodeAnswers<'a> {
         let about = found.filter(|finding| match finding {
             Diagnosis::DuplicateNode {
                 domain_id, node, ..
-            } => *domain_id == own.domain_id && **node == own.name,
+            } => *domain_id == own.domain_id && *node == own.name,
             Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
-                domains.contains(&own.domain_id) && **node == own.name
+                domains.contains(&own.domain_id) && *node == own.name
             }
             _ => false,
         });

@@ -11,7 +11,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::endpoint::{process, seconds};
+use super::endpoint::{process, seconds, vendor};
 use super::measured::measurement;
 use super::parameters::Parameters;
 use super::problem::Problem;
@@ -75,7 +75,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
     Participant {
         guid: facts.guid.to_string(),
         domain_id: facts.domain_id.0,
-        vendor: Cow::Borrowed(&facts.vendor),
+        vendor: vendor(facts.vendor),
         enclave: facts.enclave.as_deref().map(Cow::Borrowed),
         process: process(&facts.process),
         nodes: counts.map_or_else(Vec::new, |(nodes, ..)| nodes.clone()),
@@ -83,7 +83,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
         readers: counts.map_or(0, |(.., readers)| *readers),
         metatraffic_addresses: Cow::Borrowed(&facts.addresses.metatraffic),
         default_addresses: Cow::Borrowed(&facts.addresses.default),
-        lease_seconds: seconds(facts.lease_nanoseconds),
+        lease_seconds: seconds(facts.lease),
         first_seen_timestamp_seconds: facts.first_seen.seconds(),
         last_seen_timestamp_seconds: facts.last_seen.seconds(),
         secured: facts.secured,
@@ -94,7 +94,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
 fn unknown_writer(facts: &UnknownWriterFacts) -> UnknownWriter<'_> {
     UnknownWriter {
         guid: facts.guid.to_string(),
-        vendor: Cow::Borrowed(&facts.vendor),
+        vendor: facts.vendor.map_or_else(Cow::default, vendor),
         process: process(&facts.process),
         first_seen_timestamp_seconds: facts.first_seen.seconds(),
         measurement: measurement(&facts.measurement),

@@ -5,6 +5,7 @@
 //! socket: an id that a participant announces may belong to another host or namespace.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use axum::Json;
@@ -40,7 +41,7 @@ async fn list(State(context): State<Context>) -> Result<Json<ProcessList>, Probl
 }
 
 /// Processes that hold a participant's socket on this host, and what discovery calls them.
-fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<String>> {
+fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<Arc<str>>> {
     let mut ids = BTreeMap::new();
     for participant in &snapshot.participants {
         let process = &participant.process;
@@ -52,7 +53,7 @@ fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<String>> {
     ids
 }
 
-fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessList {
+fn read(ids: BTreeMap<u32, Option<Arc<str>>>) -> ProcessList {
     let mut unreadable = 0;
     let mut processes = Vec::new();
     for (process_id, name) in ids.into_iter().take(MAX_PROCESSES) {
@@ -62,7 +63,7 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessList {
         };
         processes.push(ProcessUsage {
             process_id,
-            process: name.unwrap_or(usage.name),
+            process: name.map_or(usage.name, |name| name.to_string()),
             cpu_seconds: usage.cpu_seconds,
             memory_bytes: usage.resident_bytes,
             threads: usage.threads,
@@ -81,24 +82,24 @@ fn read(ids: BTreeMap<u32, Option<String>>) -> ProcessList {
 mod tests {
     use super::*;
     use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
-    use ros2probe_wire::DomainId;
-    use ros2probe_wire::{Guid, Timestamp};
+    use ros2probe_wire::rtps::VendorId;
+    use ros2probe_wire::{DomainId, Duration, Guid, Timestamp};
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
             guid: Guid::default(),
             domain_id: DomainId(0),
-            vendor: String::new(),
+            vendor: VendorId::default(),
             enclave: None,
             process: ProcessFacts {
                 host: None,
                 id: Some(id),
                 name: None,
-                cgroup: cgroup.map(str::to_owned),
+                cgroup: cgroup.map(Into::into),
             },
             first_seen: Timestamp(1),
             last_seen: Timestamp(1),
-            lease_nanoseconds: None,
+            lease: Duration::Infinite,
             secured: false,
             restored: false,
             addresses: Default::default(),

@@ -133,8 +133,8 @@ impl<'a> Circumstances<'a> {
 
     fn unwatched(&self, topic: &'a TopicFacts) -> (ReasonCode, String) {
         let name = match topic.kind.is_service() {
-            true => &topic.dds_name,
-            false => &topic.name,
+            true => topic.dds_name.as_str(),
+            false => topic.name.as_str(),
         };
         let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
         if is_covered && !topic.hidden {

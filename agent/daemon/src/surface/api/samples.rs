@@ -21,6 +21,7 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::body_stream::{Pieces, stream_of};
+use super::endpoint::printed;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
@@ -290,9 +291,9 @@ fn topics(
     topics
         .take(most)
         .map(|topic| OpenTopic {
-            topic: topic.name.clone(),
+            topic: topic.name.to_string(),
             domain_id: topic.domain_id.0,
-            types: topic.message_types.clone(),
+            types: printed(&topic.message_types),
         })
         .collect()
 }

@@ -239,7 +239,10 @@ impl<'a> TopicAnswers<'a> {
             hidden: facts.hidden,
             vanished: facts.vanished,
             message_types: texts(&facts.message_types),
-            type_hashes: texts(&facts.type_hashes),
+            type_hashes: printed(&facts.type_hashes)
+                .into_iter()
+                .map(Cow::Owned)
+                .collect(),
             publishers: facts.publishers.iter().map(endpoint).collect(),
             subscriptions: facts.subscriptions.iter().map(endpoint).collect(),
             watches: watches.map(|watching| self.watching(*watching)).collect(),
@@ -279,6 +282,7 @@ impl<'a> TopicAnswers<'a> {
     }
 
     fn watching(&self, (watch, topic): Standing<'a>) -> Watching<'a> {
+        let watch = &watch.watch;
         let entry = self
             .in_force
             .find(&watch.pattern, watch.domain_id.map(|id| id.0));
@@ -300,7 +304,7 @@ fn delivery(facts: &DeliveryFacts) -> Delivery<'_> {
         writer: facts.writer.to_string(),
         direction: facts.direction.label().into(),
         destination: facts.destination.to_string(),
-        subscriber: Cow::Borrowed(&facts.subscriber),
+        subscriber: Cow::Owned(facts.subscriber.to_string()),
         readers: printed(&facts.readers),
         nodes: texts(&facts.nodes),
         process_id: facts.process_id,

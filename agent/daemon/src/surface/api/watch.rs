@@ -324,7 +324,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
     let facts = snapshot.and_then(|snapshot| {
         let mut all = snapshot.watches.iter();
         let same = |facts: &&WatchFacts| {
-            (&facts.pattern, facts.domain_id) == (&watch.pattern, watch.domain_id)
+            (&facts.watch.pattern, facts.watch.domain_id) == (&watch.pattern, watch.domain_id)
         };
         Some((snapshot, all.find(same)?))
     });
@@ -387,7 +387,7 @@ fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<WatchedTopic> {
         let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
         WatchedTopic {
             domain_id: watched.domain_id.0,
-            topic: watched.topic.clone(),
+            topic: watched.topic.to_string(),
             state: Open::Known(match watched.state {
                 snapshot::WatchState::Ok => TopicState::Ok,
                 snapshot::WatchState::Violated => TopicState::Violated,

@@ -286,6 +286,8 @@ fn value(label: &Label<'_>) -> Value {
         },
         Label::Guid(guid) => Value::StringValue(guid.to_string()),
         Label::Address(address) => Value::StringValue(address.to_string()),
+        Label::Vendor(vendor) => Value::StringValue(vendor.to_string()),
+        Label::Subscriber(subscriber) => Value::StringValue(subscriber.to_string()),
     }
 }
 

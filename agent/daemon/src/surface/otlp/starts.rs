@@ -84,6 +84,8 @@ impl Starts {
                 Label::Number(number) => number.hash(&mut hasher),
                 Label::Guid(guid) => guid.hash(&mut hasher),
                 Label::Address(address) => address.hash(&mut hasher),
+                Label::Vendor(vendor) => vendor.hash(&mut hasher),
+                Label::Subscriber(subscriber) => subscriber.hash(&mut hasher),
             }
         }
         hasher.finish()

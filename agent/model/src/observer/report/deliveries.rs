@@ -5,16 +5,17 @@ use std::collections::{BTreeSet, HashMap};
 use ros2probe_wire::{EntityId, Guid, Timestamp};
 
 use crate::delivery::{Delivery, Receiver, Totals};
+use crate::names::NodeName;
 use crate::observer::Observer;
 use crate::receivers::readers;
 use crate::route::Direction;
 use crate::routes::KnownRoute;
-use crate::snapshot::{AcknowledgementFacts, DeliveryFacts};
+use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 use crate::sockets::SocketFacts;
 use crate::topic::Topic;
 
 /// Nodes by their endpoints.
-type Nodes<'a> = HashMap<Guid, &'a str>;
+type Nodes<'a> = HashMap<Guid, &'a NodeName>;
 
 /// What became of a topic's samples, of live writers and of those that have gone.
 pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
@@ -46,11 +47,11 @@ pub(super) fn deliveries(
         }));
     }
     facts.sort_by(|one, other| {
-        (one.writer, one.direction, one.destination, &one.subscriber).cmp(&(
+        (one.writer, one.direction, one.destination, one.subscriber).cmp(&(
             other.writer,
             other.direction,
             other.destination,
-            &other.subscriber,
+            other.subscriber,
         ))
     });
     facts
@@ -89,10 +90,10 @@ fn delivery_facts(
     let (first_seen, last_seen) = delivery.seen();
     let participant = owner.map(|prefix| Guid::new(prefix, EntityId::PARTICIPANT));
     let subscriber = match (participant, process_id, main.socket) {
-        (Some(participant), ..) => format!("participant {participant}"),
-        (None, Some(process_id), _) => format!("process {process_id}"),
-        (None, None, 0) => String::new(),
-        (None, None, socket) => format!("socket {socket}"),
+        (Some(participant), ..) => Subscriber::Participant(participant),
+        (None, Some(process_id), _) => Subscriber::Process(process_id),
+        (None, None, 0) => Subscriber::Unknown,
+        (None, None, socket) => Subscriber::Socket(socket),
     };
     DeliveryFacts {
         writer,
@@ -101,7 +102,7 @@ fn delivery_facts(
         subscriber,
         participant,
         readers,
-        nodes: nodes.into_iter().map(ToOwned::to_owned).collect(),
+        nodes: nodes.into_iter().cloned().collect(),
         sockets,
         process_id,
         process: socket.and_then(|socket| socket.process.clone()),
@@ -130,7 +131,7 @@ pub(super) fn acknowledgements(
         let next = measured.writer.next();
         let acknowledged = subscribers.acknowledgements(*writer, next, now);
         facts.extend(acknowledged.map(|fact| AcknowledgementFacts {
-            node: nodes.get(&fact.reader).map(|node| (*node).to_owned()),
+            node: nodes.get(&fact.reader).copied().cloned(),
             ..fact
         }));
     }

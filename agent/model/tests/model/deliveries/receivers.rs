@@ -216,8 +216,8 @@ fn a_socket_is_shown_with_its_process_and_what_died_there_without_a_name() {
         cookie: bob.socket,
         process_id: Some(42),
         own_process_id: Some(42),
-        process: Some("planner".to_owned()),
-        cgroup: Some("/robot".to_owned()),
+        process: Some("planner".into()),
+        cgroup: Some("/robot".into()),
         unidentified_drops: 3,
     }));
     let delivery = &host.deliveries()[0];

@@ -5,6 +5,7 @@ use std::net::SocketAddrV4;
 use ros2probe_model::loss::LossCause;
 use ros2probe_model::observer::Settings;
 use ros2probe_model::snapshot::Direction;
+use ros2probe_model::snapshot::Subscriber;
 use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, Seen};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
@@ -128,7 +129,7 @@ fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs
     let [delivery] = &host.deliveries()[..] else {
         panic!("one group: {:#?}", host.deliveries())
     };
-    assert_eq!(delivery.subscriber, "");
+    assert_eq!(delivery.subscriber, Subscriber::Unknown);
     assert_eq!(
         (delivery.delivered.recovered, delivery.delivered.lost()),
         (5, 4)

@@ -2,6 +2,7 @@
 
 use ros2probe_model::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
+use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::{EntityId, GuidPrefix};
 
 use super::{ALICE, BOB, NODES, OTHER, STRING, WRITER, World, alice, bob};
@@ -21,8 +22,10 @@ fn repeated_announcements_are_no_events_and_changed_ones_are() {
     assert_eq!(counts("appeared"), [1, 1, 1]);
     assert_eq!(counts("changed"), [0, 1, 0]);
     assert_eq!(
-        world.topic(0, "/chatter").unwrap().publishers[0].reliability,
-        "BEST_EFFORT"
+        world.topic(0, "/chatter").unwrap().publishers[0]
+            .qos
+            .reliability,
+        Reliability::BEST_EFFORT
     );
 }
 

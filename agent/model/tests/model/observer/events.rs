@@ -187,7 +187,7 @@ fn expectations_are_judged_in_the_sources_time() {
         let facts = world.snapshot().watches.remove(0);
         (facts.topics[0].topic.clone(), facts.topics[0].state)
     };
-    let at = |state| ("/chatter".to_owned(), state);
+    let at = |state| ("/chatter".into(), state);
     assert_eq!(state(&world), at(WatchState::NotPublished));
     world.spdp(ALICE, 100);
     world.sedp(alice(WRITER), "rt/chatter");

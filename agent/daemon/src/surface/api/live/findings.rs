@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::{DomainId, Guid};
+use ros2probe_wire::{DomainId, Duration, Guid};
 
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
@@ -324,7 +324,10 @@ fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
             let mut topics = all.snapshot.topics.iter();
             let facts = topics
                 .find(|facts| facts.domain_id == topic.domain_id && facts.name == topic.topic);
-            let about = format!("{}|{}|{}", topic.domain_id, topic.topic, watch.pattern);
+            let about = format!(
+                "{}|{}|{}",
+                topic.domain_id, topic.topic, watch.watch.pattern
+            );
             list.push(Finding {
                 domain_id: Some(topic.domain_id.0),
                 topic: facts.and_then(|facts| all.ids.topic(facts.domain_id, &facts.dds_name)),
@@ -425,28 +428,32 @@ impl<'a> Ends<'a> {
 
     /// The node of an endpoint, else its GUID.
     fn who(&self, guid: Guid) -> String {
-        let node = self.0.get(&guid).and_then(|endpoint| endpoint.node.clone());
-        node.unwrap_or_else(|| guid.to_string())
+        let node = self
+            .0
+            .get(&guid)
+            .and_then(|endpoint| endpoint.node.as_ref());
+        node.map_or_else(|| guid.to_string(), ToString::to_string)
     }
 
     /// What the one offers and the other requests.
     fn difference(&self, policy: Policy, writer: Guid, reader: Guid) -> String {
         let value = |guid: Guid| {
             let endpoint = self.0.get(&guid)?;
-            let seconds = |nanoseconds: Option<u64>| match nanoseconds {
+            let qos = &endpoint.qos;
+            let seconds = |duration: Duration| match duration.nanoseconds() {
                 Some(nanoseconds) => format!("{} ms", nanoseconds / 1_000_000),
                 None => "infinite".to_owned(),
             };
             match policy {
-                Policy::Reliability => Some(endpoint.reliability.clone()),
-                Policy::Durability => Some(endpoint.durability.clone()),
-                Policy::Deadline => Some(seconds(endpoint.deadline_nanoseconds)),
+                Policy::Reliability => Some(qos.reliability.to_string()),
+                Policy::Durability => Some(qos.durability.to_string()),
+                Policy::Deadline => Some(seconds(qos.deadline)),
                 Policy::Liveliness => Some(format!(
                     "{}, {}",
-                    endpoint.liveliness,
-                    seconds(endpoint.liveliness_lease_nanoseconds)
+                    qos.liveliness,
+                    seconds(qos.liveliness_lease)
                 )),
-                Policy::Ownership => Some(endpoint.ownership.to_owned()),
+                Policy::Ownership => Some(qos.ownership.to_string()),
                 Policy::LatencyBudget
                 | Policy::DestinationOrder
                 | Policy::Presentation

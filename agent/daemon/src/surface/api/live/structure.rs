@@ -6,7 +6,7 @@ use std::hash::Hash;
 
 use ros2probe_wire::{DomainId, EntityId, Guid};
 
-use super::super::endpoint::texts;
+use super::super::endpoint::{texts, vendor};
 use super::super::index::Index;
 use crate::watches::{InForce, Origin};
 use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
@@ -90,7 +90,7 @@ impl Ids {
                 self.participants.number(facts.guid, round),
                 facts.guid.to_string(),
                 facts.domain_id.0,
-                Cow::Borrowed(&*facts.vendor),
+                vendor(facts.vendor),
                 process.host.as_deref().map(Cow::Borrowed),
                 process.id,
                 process.name.as_deref().map(Cow::Borrowed),
@@ -115,7 +115,7 @@ impl Ids {
             ));
         }
         for facts in snapshot.topics.iter().filter(|topic| is_shown(topic)) {
-            let key = (facts.domain_id, facts.dds_name.clone());
+            let key = (facts.domain_id, facts.dds_name.to_string());
             let id = self.topics.number(key, round);
             let watched = watched(facts, index, in_force);
             graph.topics.push(Topic(
@@ -164,8 +164,8 @@ impl Ids {
             self.participants.number(participant, round),
             facts.guid.to_string(),
             facts.transports,
-            Cow::Borrowed(&*facts.reliability),
-            Cow::Borrowed(&*facts.durability),
+            Cow::Borrowed(facts.qos.reliability.label()),
+            Cow::Borrowed(facts.qos.durability.label()),
         )
     }
 }
@@ -187,11 +187,11 @@ pub(super) fn is_measured<'a>(topic: &'a TopicFacts, index: &Index<'a>) -> bool 
 fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> u8 {
     let (mut own, mut glob) = (0, 0);
     for (watch, _) in index.watches(topic) {
-        if watch.pattern != topic.name {
+        if *watch.watch.pattern != *topic.name {
             glob = 4;
             continue;
         }
-        let entry = in_force.find(&watch.pattern, watch.domain_id.map(|id| id.0));
+        let entry = in_force.find(&watch.watch.pattern, watch.watch.domain_id.map(|id| id.0));
         own = entry.map_or(own, |entry| match entry.origin {
             Origin::Config => 1,
             Origin::CommandLine => 2,

@@ -34,6 +34,7 @@ use crate::subscriptions::{
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{Library, Limits, MessageType, decode};
 use ros2probe_model::dispatch::Sample;
+use ros2probe_model::names::TypeName;
 use tree::{ELEMENTS, Tree};
 
 /// Streams at once, of all listeners: each has the bytes of all messages of its topic captured.
@@ -89,7 +90,7 @@ struct Stream {
 /// The type in the last `type` line.
 #[derive(Clone)]
 struct Known {
-    name: Arc<str>,
+    name: TypeName,
     hash: Option<String>,
     found: Option<Arc<MessageType>>,
 }
@@ -118,7 +119,7 @@ pub(super) async fn definition(
 ) -> Result<Response, Problem> {
     let state = context.latest.state();
     let topic = find(state.known(), name, domain.checked()?)?;
-    let hash = topic.type_hashes.first().cloned();
+    let hash = topic.type_hashes.first().map(ToString::to_string);
     let name = topic.message_types.first().cloned().unwrap_or_default();
     let library = Arc::clone(&context.library);
     let found = spawn_blocking(move || look_up(&library, &name, hash.as_deref()).0).await;
@@ -302,7 +303,7 @@ impl Stream {
         let node = topics.find_map(|topic| {
             let mut publishers = topic.publishers.iter();
             let publisher = publishers.find(|publisher| publisher.guid == sample.writer)?;
-            publisher.node.clone()
+            publisher.node.as_ref().map(ToString::to_string)
         });
         let line = Message {
             time: sample.time.seconds(),
@@ -331,7 +332,7 @@ impl Stream {
             return known.found.clone();
         }
         let library = Arc::clone(&self.context.library);
-        let (wanted, announced) = (Arc::clone(name), hash.clone());
+        let (wanted, announced) = (name.clone(), hash.clone());
         let found = spawn_blocking(move || look_up(&library, &wanted, announced.as_deref())).await;
         let (line, found) = found.unwrap_or_else(|_| {
             let reason = "looking for its definition failed".to_owned();
@@ -339,7 +340,7 @@ impl Stream {
         });
         write_line(lines, &Line::Type(line));
         self.known = Some(Known {
-            name: Arc::clone(name),
+            name: name.clone(),
             hash,
             found: found.clone(),
         });
