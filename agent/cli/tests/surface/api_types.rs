@@ -43,7 +43,7 @@ fn get<T: DeserializeOwned + Serialize>(agent: &LocalAgent, path: &str) -> T {
 /// A replay that goes on for longer than the test, with a place for bags.
 fn agent(capture: &str, configuration: &Path) -> LocalAgent {
     let configuration = configuration.to_str().unwrap();
-    let arguments = ["--speed", "0.2", "--config", configuration];
+    let arguments = ["--speed", "0.5", "--config", configuration];
     let mut agent = LocalAgent::replay(&mut rp(), &page::data(capture), &arguments);
     agent.wait_for_log("ready");
     agent
@@ -52,8 +52,8 @@ fn agent(capture: &str, configuration: &Path) -> LocalAgent {
 #[test]
 fn answers_of_a_running_robot_read_as_their_types_and_write_the_same_again() {
     for capture in [
-        "cyclonedds/points-besteffort-lossy-2ns",
-        "cyclonedds/samehost-any",
+        "cyclonedds/lifecycle-2ns",
+        "fastrtps-udp/lifecycle-2ns",
     ] {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("ros2probe.yaml");
