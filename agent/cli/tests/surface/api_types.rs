@@ -51,10 +51,7 @@ fn agent(capture: &str, configuration: &Path) -> LocalAgent {
 
 #[test]
 fn answers_of_a_running_robot_read_as_their_types_and_write_the_same_again() {
-    for capture in [
-        "cyclonedds/lifecycle-2ns",
-        "fastrtps-udp/lifecycle-2ns",
-    ] {
+    for capture in ["cyclonedds/lifecycle-2ns", "fastrtps-udp/lifecycle-2ns"] {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("ros2probe.yaml");
         let bags = directory.path().join("bags");
@@ -102,10 +99,8 @@ fn recordings(agent: &LocalAgent) {
     let written: WrittenSnapshot = asked(agent, "POST", "/snapshots/last", (), 201);
     assert!(written.messages > 0);
     let list: SnapshotList = get(agent, "/snapshots");
-    assert_eq!(
-        (&*list.snapshots[0].name, list.snapshots[0].written),
-        ("last", 1)
-    );
+    assert_eq!(list.snapshots[0].name, "last");
+    assert_eq!(list.snapshots.len(), 1);
 }
 
 /// The topic of which most messages come.
