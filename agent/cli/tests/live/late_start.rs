@@ -227,7 +227,7 @@ fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
     let planned = planned.map(|line| line.trim().split(',').next().unwrap_or_default());
     assert_eq!(planned.collect::<Vec<_>>(), plan, "{said}");
     std::thread::sleep(SETTLE);
-    let sent = count(&recording.finish()?, &scene.from_the_monitor())?;
+    let sent = count(&recording.finish()?, &scene.packets_of_discover())?;
     assert_eq!(sent, 0, "a dry run sent");
     Ok(())
 }
@@ -255,7 +255,7 @@ fn discovers_all_names(scene: &Scene, agent: &Agent<'_>) -> Result<String> {
 /// the introduction and ends with the goodbye.
 fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> Result<()> {
     let monitor = scene.link.monitor.address();
-    let ours = scene.from_the_monitor();
+    let ours = scene.packets_of_discover();
     let sent = printed
         .lines()
         .filter_map(|line| line.trim().strip_prefix("sent "));
@@ -376,7 +376,7 @@ impl Scene {
     }
 
     /// Filter for the packets that `rp discover` sends.
-    fn from_the_monitor(&self) -> String {
+    fn packets_of_discover(&self) -> String {
         format!("udp and src host {}", self.link.monitor.address())
     }
 

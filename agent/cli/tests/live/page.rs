@@ -143,7 +143,12 @@ fn processes_are_listed(host: &Namespace, robots: &[Process]) -> Result<()> {
 /// The stream of a topic's messages begins with its type, and each message has its header's stamp.
 fn messages_are_decoded(host: &Namespace, topic: &str) -> Result<()> {
     let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
-    let told = lines(host, &path, 3)?;
+    // On a busy machine the robot itself may send nothing for seconds.
+    let mut told = Vec::new();
+    harness::wait_until("a stream with a message", || {
+        told = lines(host, &path, 3)?;
+        Ok(told.iter().any(|line| line.get("message").is_some()))
+    })?;
     let known = told.iter().find(|line| line.get("type").is_some());
     let known = known.with_context(|| format!("{told:?}"))?;
     ensure!(known["type"]["known"] == true, "{known}");
