@@ -24,7 +24,7 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{SLOTS, claim_outgoing, count, piece, release, scratch, setting},
+    maps::{SLOTS, Scratch, claim_outgoing, count, piece, release, scratch, setting},
     pieces,
     verdict::{self, progress},
 };
@@ -175,29 +175,9 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     let (Some(mut working), Some(handed)) = (scratch(slot), handed(slot)) else {
         return 0;
     };
-    let zero = core::hint::black_box(0);
-    if len < walk::HEADER_LEN || len > MAX_LEN {
-        count(slot, Counter::Malformed, 1);
+    if let Err(reason) = locate(handed, address, len, in_list) {
+        count(slot, reason, 1);
         return 0;
-    }
-    handed.next = zero;
-    handed.start = zero;
-    if in_list == 0 {
-        (handed.list, handed.buffers) = (u64::from(zero), zero);
-        (handed.address, handed.end) = (address, len);
-    } else {
-        // A std::vector: the addresses at which its contents begin and end.
-        let Some([begin, end]) = read::<[u64; 2]>(address) else {
-            count(slot, Counter::Unreadable, 1);
-            return 0;
-        };
-        let buffers = end.wrapping_sub(begin) / BUFFER;
-        if buffers == 0 || buffers > MAX_BUFFERS {
-            count(slot, Counter::Malformed, 1);
-            return 0;
-        }
-        (handed.list, handed.buffers) = (begin, buffers as u32);
-        (handed.address, handed.end) = (u64::from(zero), zero);
     }
     let message = Message { slot };
     let Some([magic, _version, source @ ..]) = message.words::<5>(0) else {
@@ -212,27 +192,7 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     // SAFETY: no preconditions.
     let now = unsafe { bpf_ktime_get_ns() };
     let scratch = working.get();
-    scratch.packet.now = now;
-    scratch.packet.host = zero;
-    scratch.count = zero;
-    scratch.unknown = zero;
-    scratch.repeated = zero;
-    scratch.named = scratch.named.wrapping_add(1);
-    // SAFETY: no preconditions.
-    let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // Built as in `host::identify`.
-    let token = scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff);
-    let record = &mut scratch.walk.record;
-    record.time = now;
-    record.destination = [zero; 4];
-    record.destination_port = zero as u16;
-    record.source_port = zero as u16;
-    record.interface = zero;
-    record.datagram = zero;
-    record.socket = u64::from(zero);
-    record.elapsed = zero;
-    record.unused = zero as u16;
-    record.flags = zero as u16;
+    let token = clear(scratch, slot, now);
     scratch.walk.begin(source, len);
     if len > MAX_CAPTURED {
         scratch.walk.record.datagram_len = MAX_CAPTURED as u16;
@@ -268,6 +228,58 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     );
     verdict::flush(records, u32::from(flag::SHM | flag::EXACT), slot);
     1
+}
+
+/// Notes where the message's bytes lie; returns the counter of a message that is not read.
+#[inline(always)]
+fn locate(handed: &mut Handed, address: u64, len: u32, in_list: u32) -> Result<(), Counter> {
+    let zero = core::hint::black_box(0);
+    if len < walk::HEADER_LEN || len > MAX_LEN {
+        return Err(Counter::Malformed);
+    }
+    handed.next = zero;
+    handed.start = zero;
+    if in_list == 0 {
+        (handed.list, handed.buffers) = (u64::from(zero), zero);
+        (handed.address, handed.end) = (address, len);
+        return Ok(());
+    }
+    // A std::vector: the addresses at which its contents begin and end.
+    let [begin, end] = read::<[u64; 2]>(address).ok_or(Counter::Unreadable)?;
+    let buffers = end.wrapping_sub(begin) / BUFFER;
+    if buffers == 0 || buffers > MAX_BUFFERS {
+        return Err(Counter::Malformed);
+    }
+    (handed.list, handed.buffers) = (begin, buffers as u32);
+    (handed.address, handed.end) = (u64::from(zero), zero);
+    Ok(())
+}
+
+/// Clears the working memory for a message without addresses; returns the message's token.
+#[inline(always)]
+fn clear(scratch: &mut Scratch, slot: u32, now: u64) -> u32 {
+    let zero = core::hint::black_box(0);
+    scratch.packet.now = now;
+    scratch.packet.host = zero;
+    scratch.count = zero;
+    scratch.unknown = zero;
+    scratch.repeated = zero;
+    scratch.named = scratch.named.wrapping_add(1);
+    let record = &mut scratch.walk.record;
+    record.time = now;
+    record.destination = [zero; 4];
+    record.destination_port = zero as u16;
+    record.source_port = zero as u16;
+    record.interface = zero;
+    record.datagram = zero;
+    record.socket = u64::from(zero);
+    record.elapsed = zero;
+    record.unused = zero as u16;
+    record.flags = zero as u16;
+    // SAFETY: no preconditions.
+    let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
+    // Built as in `host::identify`.
+    scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff)
 }
 
 /// Walks one submessage, as `verdict::advance` does.

@@ -274,16 +274,7 @@ impl LiveSource {
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.poll(&clocks, observer);
         }
-        if clocks.monotonic.wrapping_sub(self.wanted_asked) >= TENTH {
-            self.wanted_asked = clocks.monotonic;
-            let wanted = observer.wanted_of_shared_memory();
-            if let Shm::Running(shared_memory) = &self.shared_memory {
-                shared_memory.want(wanted);
-            }
-            if let Some(exact) = &self.exact {
-                exact.want(wanted == Wanted::EverySample);
-            }
-        }
+        self.apply_wanted(clocks.monotonic, observer);
         if held_up {
             // Its rings may have been too small: silence does not mean that participants left,
             // since this process did not read.
@@ -293,6 +284,21 @@ impl LiveSource {
         }
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
+    }
+
+    /// Passes what the model wants of shared memory to its readers, ten times a second.
+    fn apply_wanted(&mut self, now: u64, observer: &Observer) {
+        if now.wrapping_sub(self.wanted_asked) < TENTH {
+            return;
+        }
+        self.wanted_asked = now;
+        let wanted = observer.wanted_of_shared_memory();
+        if let Shm::Running(shared_memory) = &self.shared_memory {
+            shared_memory.want(wanted);
+        }
+        if let Some(exact) = &self.exact {
+            exact.want(wanted == Wanted::EverySample);
+        }
     }
 
     /// Passes everything that still waits to the model, at the end.

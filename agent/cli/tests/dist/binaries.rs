@@ -35,7 +35,7 @@ fn graph() -> String {
     data("tests/fixtures/cli/graph.pcap.gz")
 }
 
-/// What both programs say, which is the same.
+/// Runs both programs, and returns their output, which is the same.
 fn both(arguments: &[&str]) -> Output {
     let native = Program::native().run(arguments);
     let arm = Program::arm().run(arguments);
@@ -78,7 +78,7 @@ fn the_same_kernel_object_is_in_each_binary_byte_for_byte() {
     let object = std::fs::read(data("../../agent-ebpf/filter.bpf.o")).unwrap();
     for path in program::all() {
         let binary = std::fs::read(&path).unwrap();
-        // Where it begins is a multiple of 8, because it is read in place.
+        // Its offset is a multiple of 8, because it is read in place.
         let found = binary
             .chunks_exact(8)
             .zip((0..).step_by(8))
@@ -210,7 +210,7 @@ fn a_replay_is_served_the_same() {
     let views = views.filter(|(_, methods)| methods.get("get").is_some());
     let mut asked = 0;
     for (view, _) in views {
-        // Streams end with the agent; what it says of itself and of its times is its own.
+        // Streams end with the agent; its own metrics and times differ.
         let own = ["/samples", "/health", "/events", "/live", "/processes"];
         if own.contains(&view.as_str()) || view.ends_with("/messages") || view.ends_with("/history")
         {

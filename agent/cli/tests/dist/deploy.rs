@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize as _;
 use serde_yaml::Value;
 
-/// What `promtool` of Debian was built without.
+/// Features that Debian's `promtool` lacks.
 const NOT_BUILT_IN: &str = "kubernetes_sd_configs";
 
 #[test]
@@ -324,12 +324,25 @@ fn the_daemon_set_s_configuration_is_one_and_its_paths_are_mounted() -> Result<(
 #[test]
 fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_root() -> Result<()> {
     let text = std::fs::read_to_string(deploy().join("Dockerfile"))?.replace("\\\n", " ");
-    let of = |instruction: &str| -> Vec<&str> {
-        let lines = text.lines();
-        lines
-            .filter_map(|line| line.strip_prefix(instruction)?.strip_prefix(' '))
-            .collect()
-    };
+    image_is_built_for_this_version_without_root(&text)?;
+    image_copies_the_binary_and_the_configuration(&text)?;
+    ensure!(instructions(&text, "ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
+    ensure!(
+        instructions(&text, "CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]
+    );
+    capabilities_are_those_of_the_unit(&text)
+}
+
+/// Returns the arguments of each instruction of this name in a Dockerfile.
+fn instructions<'t>(text: &'t str, instruction: &str) -> Vec<&'t str> {
+    let lines = text.lines();
+    lines
+        .filter_map(|line| line.strip_prefix(instruction)?.strip_prefix(' '))
+        .collect()
+}
+
+fn image_is_built_for_this_version_without_root(text: &str) -> Result<()> {
+    let of = |instruction| instructions(text, instruction);
     let arguments = of("ARG");
     ensure!(
         arguments.contains(&concat!("VERSION=", env!("CARGO_PKG_VERSION"))),
@@ -345,13 +358,17 @@ fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_ro
     };
     let ids: Vec<u32> = user.split(':').map(str::parse).collect::<Result<_, _>>()?;
     ensure!(ids.len() == 2 && !ids.contains(&0), "{user}");
+    Ok(())
+}
 
+/// The build context holds what the image copies, and no more.
+fn image_copies_the_binary_and_the_configuration(text: &str) -> Result<()> {
     let ignored = std::fs::read_to_string(deploy().join("Dockerfile.dockerignore"))?;
     let taken: Vec<&str> = ignored
         .lines()
         .filter_map(|line| line.strip_prefix('!'))
         .collect();
-    let copied: Vec<(&str, &str)> = of("COPY")
+    let copied: Vec<(&str, &str)> = instructions(text, "COPY")
         .iter()
         .filter_map(|line| line.split_once(' '))
         .collect();
@@ -369,9 +386,11 @@ fn the_image_is_what_make_dist_makes_with_the_unit_s_capabilities_and_without_ro
     );
     ensure!(taken == ["target/dist/rp-*", settings.0], "{taken:?}");
     ensure!(deploy().join("..").join(settings.0).exists());
-    ensure!(of("ENTRYPOINT") == [r#"["/usr/bin/rp"]"#]);
-    ensure!(of("CMD") == [r#"["run", "--config", "/etc/ros2probe/ros2probe.yaml"]"#]);
+    Ok(())
+}
 
+/// The file's capabilities and those of `docker run` are the unit's.
+fn capabilities_are_those_of_the_unit(text: &str) -> Result<()> {
     let set = text
         .split("setcap ")
         .nth(1)
@@ -444,7 +463,7 @@ fn documents(file: &str) -> Result<Vec<Value>> {
     Ok(documents.collect::<Result<_, _>>()?)
 }
 
-/// What the unit's process may have.
+/// Returns the capabilities that the unit's process may have.
 fn bounding_set() -> Result<BTreeSet<String>> {
     let unit = std::fs::read_to_string(deploy().join("../systemd/ros2probe.service"))?;
     let set = unit
@@ -467,7 +486,7 @@ fn pod() -> Result<Value> {
     Ok(set["spec"]["template"]["spec"].clone())
 }
 
-/// What a service has from here: where it is, and where the service sees it.
+/// Files of this directory that a service mounts: path here, and path in the service.
 fn mounts(service: &Value) -> Result<Vec<(PathBuf, String)>> {
     let mounts = service["volumes"].as_sequence().context("no volumes")?;
     let mut bound = Vec::new();
@@ -481,7 +500,7 @@ fn mounts(service: &Value) -> Result<Vec<(PathBuf, String)>> {
     Ok(bound)
 }
 
-/// Whether a URL is that of a service and of the port that it publishes.
+/// Returns whether a URL names a service and the port that it publishes.
 fn reaches(compose: &Value, url: &str) -> bool {
     let address = url
         .strip_prefix("http://")

@@ -1,4 +1,4 @@
-//! What is shipped: binaries, packages, the systemd unit and `deploy/`.
+//! The shipped files: binaries, packages, the systemd unit and `deploy/`.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

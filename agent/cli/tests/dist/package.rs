@@ -53,38 +53,74 @@ fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
     let new = changed(&old, directory.path())?;
     let host = Debian::start(Start::Systemd, directory.path())?;
     let (old, new) = (inside(&old)?, inside(&new)?);
-    let is = |command: &str, what: &str| -> Result<()> {
-        let said = host.text(command)?;
-        ensure!(said.trim() == what, "{command}: {said}, not {what}");
-        Ok(())
-    };
+    let upgrade = format!("dpkg --force-confold --install {new}");
 
     host.run(&format!("dpkg --install {old}"))?;
-    is(RUNS, "active")?;
-    is(STARTS_AT_BOOT, "enabled")?;
+    the_service_runs_as_its_user(&host)?;
+    an_older_systemd_gives_the_same_privileges(&host)?;
+    the_socket_admits_the_group_only(&host)?;
+    an_upgrade_keeps_the_operators_configuration(&host, &upgrade)?;
+    a_stopped_or_disabled_service_stays_so(&host, &old, &upgrade)?;
+    a_wrong_configuration_fails_the_service_only(&host, &upgrade)?;
+
+    host.run("dpkg --remove ros2probe")?;
+    prints(&host, RUNS, "inactive")?;
+    host.run(&format!(
+        "test -e {CONFIG} && test -d /var/lib/ros2probe && ! test -e /usr/bin/rp"
+    ))?;
+    host.run(&upgrade)?;
+    prints(&host, RUNS, "active")?;
+    prints(&host, STARTS_AT_BOOT, "enabled")?;
+    host.run("dpkg --purge ros2probe")?;
+    nothing_left(&host)
+}
+
+/// Fails unless the command prints this, whatever its exit code.
+fn prints(host: &Debian, command: &str, expected: &str) -> Result<()> {
+    let printed = host.text(command)?;
+    ensure!(
+        printed.trim() == expected,
+        "{command}: {printed}, not {expected}"
+    );
+    Ok(())
+}
+
+/// Returns what `systemctl` prints as the service's process, with the line break.
+fn main_process(host: &Debian) -> Result<String> {
+    host.run("systemctl show --property MainPID --value ros2probe")
+}
+
+fn the_service_runs_as_its_user(host: &Debian) -> Result<()> {
+    prints(host, RUNS, "active")?;
+    prints(host, STARTS_AT_BOOT, "enabled")?;
     ensure!(host.run("dpkg --verify ros2probe")?.is_empty());
     let page = host.get(17400, "/metrics")?;
     ensure!(page.contains("ros2probe_capture_source_info{"), "{page}");
     let others = "find /var/lib/ros2probe /run/ros2probe ! -user ros2probe";
     ensure!(host.run(others)?.is_empty(), "{}", host.run(others)?);
-    let process = host.run("systemctl show --property MainPID --value ros2probe")?;
-    is(&format!("stat -c %U /proc/{}", process.trim()), "ros2probe")?;
+    let owner = format!("stat -c %U /proc/{}", main_process(host)?.trim());
+    prints(host, &owner, "ros2probe")
+}
 
-    // What systemd before 247 is given instead comes to the same.
+/// The drop-in for systemd before 247.
+fn an_older_systemd_gives_the_same_privileges(host: &Debian) -> Result<()> {
     host.run(
         "mkdir /run/systemd/system/ros2probe.service.d && \
          cp /usr/share/ros2probe/systemd-before-247.conf /run/systemd/system/ros2probe.service.d/ && \
          systemctl daemon-reload && systemctl restart ros2probe",
     )?;
-    is(RUNS, "active")?;
-    let process = host.run("systemctl show --property MainPID --value ros2probe")?;
+    prints(host, RUNS, "active")?;
+    let process = main_process(host)?;
     let process = process.trim();
-    is(&format!("stat -c %U /proc/{process}"), "ros2probe")?;
+    prints(host, &format!("stat -c %U /proc/{process}"), "ros2probe")?;
     let bounds = host.run(&format!("grep CapBnd /proc/{process}/status"))?;
     ensure!(bounds.trim().ends_with("\t000000c000003000"), "{bounds}");
-    host.run("rm -r /run/systemd/system/ros2probe.service.d && systemctl daemon-reload")?;
+    host.run("rm -r /run/systemd/system/ros2probe.service.d && systemctl daemon-reload")
+        .map(drop)
+}
 
-    // Members of the group are let in by the socket, others by nothing when the address is off.
+/// `api.listen` is off.
+fn the_socket_admits_the_group_only(host: &Debian) -> Result<()> {
     host.run(&format!(
         "sed -i 's/^  # listen: 127.0.0.1:17401/  listen: off/' {CONFIG}; systemctl restart ros2probe"
     ))?;
@@ -103,59 +139,56 @@ fn a_host_with_systemd_is_served_until_the_package_is_purged() -> Result<()> {
         "{}",
         all(&list("stranger")?)
     );
+    Ok(())
+}
 
-    // The default changed and the operator's file did, too: the operator's stays.
-    let upgrade = format!("dpkg --force-confold --install {new}");
-    let before = host.run("systemctl show --property MainPID --value ros2probe")?;
-    host.run(&upgrade)?;
-    is(RUNS, "active")?;
-    let after = host.run("systemctl show --property MainPID --value ros2probe")?;
+/// Both the default and the operator's file have changed.
+fn an_upgrade_keeps_the_operators_configuration(host: &Debian, upgrade: &str) -> Result<()> {
+    let before = main_process(host)?;
+    host.run(upgrade)?;
+    prints(host, RUNS, "active")?;
+    let after = main_process(host)?;
     ensure!(before != after, "the service was not restarted");
     host.run(&format!(
         "grep -q 'listen: off' {CONFIG} && grep -q changed {CONFIG}.dpkg-dist"
-    ))?;
+    ))
+    .map(drop)
+}
 
-    // What the operator stopped or disabled stays so, from an upgrade on and a downgrade back.
+/// A downgrade and an upgrade leave the operator's choice.
+fn a_stopped_or_disabled_service_stays_so(host: &Debian, old: &str, upgrade: &str) -> Result<()> {
     host.run("systemctl stop ros2probe")?;
     host.run(&format!("dpkg --force-confold --install {old}"))?;
-    is(RUNS, "inactive")?;
-    is(STARTS_AT_BOOT, "enabled")?;
+    prints(host, RUNS, "inactive")?;
+    prints(host, STARTS_AT_BOOT, "enabled")?;
     host.run("systemctl disable --now ros2probe")?;
-    host.run(&upgrade)?;
-    is(RUNS, "inactive")?;
-    is(STARTS_AT_BOOT, "disabled")?;
+    host.run(upgrade)?;
+    prints(host, RUNS, "inactive")?;
+    prints(host, STARTS_AT_BOOT, "disabled")
+}
 
-    // A wrong configuration is said and fails nothing but the service; put right, it starts.
+/// The upgrade succeeds and prints the mistake. With the mistake corrected the service starts.
+fn a_wrong_configuration_fails_the_service_only(host: &Debian, upgrade: &str) -> Result<()> {
     host.run(&format!(
         "systemctl enable --now ros2probe; cp {CONFIG} /srv/; echo wach: [] >>{CONFIG}"
     ))?;
-    let said = host.attempt(&upgrade)?;
+    let output = host.attempt(upgrade)?;
     ensure!(
-        said.status.success() && all(&said).contains("wach: unknown key"),
+        output.status.success() && all(&output).contains("wach: unknown key"),
         "{}",
-        all(&said)
+        all(&output)
     );
-    is(
+    prints(
+        host,
         "dpkg-query -W -f '${db:Status-Status}' ros2probe",
         "installed",
     )?;
-    is(RUNS, "failed")?;
+    prints(host, RUNS, "failed")?;
     host.run(&format!(
         "cp /srv/ros2probe.yaml {CONFIG}; rm /srv/ros2probe.yaml"
     ))?;
-    host.run(&upgrade)?;
-    is(RUNS, "active")?;
-
-    host.run("dpkg --remove ros2probe")?;
-    is(RUNS, "inactive")?;
-    host.run(&format!(
-        "test -e {CONFIG} && test -d /var/lib/ros2probe && ! test -e /usr/bin/rp"
-    ))?;
-    host.run(&upgrade)?;
-    is(RUNS, "active")?;
-    is(STARTS_AT_BOOT, "enabled")?;
-    host.run("dpkg --purge ros2probe")?;
-    nothing_left(&host)
+    host.run(upgrade)?;
+    prints(host, RUNS, "active")
 }
 
 #[test]
@@ -190,7 +223,7 @@ fn a_host_without_systemd_takes_the_package_too() -> Result<()> {
     nothing_left(&host)
 }
 
-/// Nobody but dpkg remembers it, and the user is kept.
+/// A purge leaves the user and dpkg's own records only.
 fn nothing_left(host: &Debian) -> Result<()> {
     let left = host.run(
         "find / -xdev \\( -path /proc -o -path /sys -o -path /packages -o -path /var/log \\) -prune \
@@ -201,8 +234,8 @@ fn nothing_left(host: &Debian) -> Result<()> {
         .map(drop)
 }
 
-/// The agent with the unit's user and capabilities, where nobody reads units; nothing that it writes
-/// is root's.
+/// Runs the agent with the unit's user and capabilities on a host without systemd. Root owns none of
+/// the files that the agent writes.
 fn serves_as_the_unit_says(host: &Debian) -> Result<()> {
     let unit = host.run("cat /usr/lib/systemd/system/ros2probe.service")?;
     let setting = |key: &str| {
@@ -247,6 +280,14 @@ fn inside(package: &Path) -> Result<String> {
 }
 
 fn complete(archive: &Archive) -> Result<()> {
+    fields_and_scripts_are_complete(archive)?;
+    files_are_the_expected_ones(archive)?;
+    let manual = "usr/share/man/man1/rp-topic-hz.1.gz";
+    archive.manual_is_readable(manual)?;
+    archive.compressed_without_dates()
+}
+
+fn fields_and_scripts_are_complete(archive: &Archive) -> Result<()> {
     let control = &archive.control;
     let field = |name: &str| control.get(name).map(String::as_str);
     ensure!(field("Package") == Some("ros2probe"), "{control:?}");
@@ -273,7 +314,7 @@ fn complete(archive: &Archive) -> Result<()> {
         "{}",
         archive.conffiles
     );
-    // What dpkg of Ubuntu 20.04 can read.
+    // The dpkg of Ubuntu 20.04 cannot read members compressed with zstd.
     for member in &archive.members {
         ensure!(
             member == "debian-binary" || !member.ends_with(".zst"),
@@ -284,6 +325,11 @@ fn complete(archive: &Archive) -> Result<()> {
         let mode = archive.scripts.get(script).copied();
         ensure!(mode == Some(0o755), "{script}: {mode:?}");
     }
+    Ok(())
+}
+
+/// Each file has its mode, and root owns all of them.
+fn files_are_the_expected_ones(archive: &Archive) -> Result<()> {
     let manual = "usr/share/man/man1/";
     let (pages, others): (BTreeMap<_, _>, BTreeMap<_, _>) = archive
         .files
@@ -325,11 +371,10 @@ fn complete(archive: &Archive) -> Result<()> {
             entry.mode
         );
     }
-    archive.manual_is_readable(&format!("{manual}rp-topic-hz.1.gz"))?;
-    archive.compressed_without_dates()
+    Ok(())
 }
 
-/// Where the package has each page of `docs/`, so that the links of the README lead to them.
+/// Returns the package's path of each page of `docs/`, to which the links of the README lead.
 fn book() -> Result<Vec<String>> {
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let mut pages = Vec::new();

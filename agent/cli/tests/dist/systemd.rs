@@ -43,7 +43,7 @@ fn systemd_understands_every_line() {
     std::fs::write(&copy, text.replace("/usr/bin/rp", env!("CARGO_BIN_EXE_rp"))).unwrap();
     let output = systemd_analyze(&["verify", "--man=no"], &copy);
     let said = String::from_utf8_lossy(&output.stderr);
-    // What systemd says of other units on the machine is not ours.
+    // Messages about other units on the machine are ignored.
     let ours: Vec<&str> = said
         .lines()
         .filter(|line| line.contains("ros2probe"))

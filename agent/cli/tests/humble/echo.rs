@@ -1,5 +1,5 @@
-//! What `ros2 topic echo` of ROS 2 Humble prints of messages of every installed type, with each of
-//! its options, against what is printed here: byte for byte (`humble/oracle.py`).
+//! Compares the output with that of `ros2 topic echo` of ROS 2 Humble byte for byte, for messages
+//! of every installed type and each option (`humble/oracle.py`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead as _, BufReader};

@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 use std::process::Command;
 
-/// Where ROS 2 Humble is installed: `ROS2PROBE_ROS2`, or the usual place. Panics where it is not:
-/// a test that needs it must not pass without it.
+/// Returns the directory of ROS 2 Humble: `ROS2PROBE_ROS2`, or the default. Panics if it is
+/// missing: a test that needs it must not pass without it.
 pub fn prefix() -> PathBuf {
     let named = std::env::var_os("ROS2PROBE_ROS2").filter(|named| !named.is_empty());
     let prefix = named.map_or_else(|| PathBuf::from("/opt/ros/humble"), PathBuf::from);

@@ -1,5 +1,5 @@
 //! A robot of six topics made of real ROS 2 Humble nodes, 8 B to 2.7 MB and 1 to 200 Hz: the bag, `echo`
-//! and `hz` hold what its publisher's log holds, and what they lack is named and adds up to it.
+//! and `hz` hold the messages of its publisher's log, and name each message that they lack.
 //!
 //! Needs root and ROS 2 Humble: `make test-ros2`.
 
@@ -32,9 +32,8 @@ const TOPICS: [(&str, u64); 6] = [
 ];
 /// `echo` prints the messages of this topic by their numbers, which stand in the header's frame.
 const ECHOED: [&str; 3] = ["/imu", "/cam", "/odom"];
-/// Looking at shared memory captures this share of small messages at least, also on a busy machine,
-/// and large ones hardly ever: pieces of one lie in the same memory one after the other. What is not
-/// captured is counted, always.
+/// Polling of shared memory captures at least this share of small messages, also on a busy machine.
+/// Large messages are seldom captured: their pieces reuse the same memory. The rest is always counted.
 const CAPTURED: f64 = 0.7;
 const LARGE: [&str; 2] = ["/cam", "/points"];
 const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
@@ -51,7 +50,7 @@ const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
 
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Middleware {
-    /// Shared memory, by looking at it.
+    /// Shared memory, polled.
     FastLookedAt,
     /// Shared memory, with `capture.shm.exact: auto`.
     FastExact,
@@ -100,20 +99,11 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     })?;
 
     let bag = robot.directory.path().join("bag");
-    let output = bag.display().to_string();
-    let mut recorder = robot.rp("record", &["bag", "record", "-a", "-o", &output])?;
-    wait_until("it records all topics", || {
-        let said = recorder.errors();
-        let is_subscribed = |(topic, _): &(&str, u64)| said.contains(&format!("'{topic}'"));
-        Ok(said.contains("Recording...") && TOPICS.iter().all(is_subscribed))
-    })
-    .with_context(|| recorder.errors())?;
-    let mut echoes = Vec::new();
-    for topic in ECHOED {
-        let arguments = ["topic", "echo", topic, "--field", "header.frame_id"];
-        echoes.push((topic, robot.rp(&format!("echo{topic}"), &arguments)?));
-    }
-    let mut hz = robot.rp("hz", &["topic", "hz", "/imu"])?;
+    let Commands {
+        mut recorder,
+        mut echoes,
+        mut hz,
+    } = robot.commands(&bag)?;
     robot.wait_for_subscriptions(&agent, 2 + ECHOED.len())?;
     if middleware == Middleware::FastExact {
         let ability = [("ability", "shared_memory_exact")];
@@ -129,7 +119,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         Ok(robot.log("subscribe")? == published)
     })
     .with_context(|| robot.unreceived(&published))?;
-    // The last HEARTBEAT comes up to 3 s later, and what was not seen is waited for.
+    // The last HEARTBEAT comes up to 3 s later, and the agent waits for missing messages.
     std::thread::sleep(Duration::from_secs(4));
     let page = agent.scrape()?;
     hz.interrupt()?;
@@ -144,7 +134,31 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     println!("{}", recorder.errors());
 
     let is_looked_at = middleware == Middleware::FastLookedAt;
-    let (recorded, report) = (numbers(&bag)?, report_of(&bag)?);
+    let unknown_of = bag_holds_or_names_each_message(&bag, &published, &page, is_looked_at)?;
+    for (topic, echo) in &echoes {
+        let sent = published.get(*topic).context("not published")?;
+        let unseen = unknown_of.get(topic).copied().unwrap_or_default();
+        echo.prints_or_names_each_message(topic, sent, unseen)?;
+    }
+    let rates = hz.rates()?;
+    println!("hz /imu: {rates:?}");
+    let last = rates.last().context("hz printed nothing")?;
+    // Repaired messages come late: the subscriber's own rate is lower then.
+    let received = robot.rate("subscribe", "/imu")?;
+    let expected = received.min(200.0) - 4.0..204.0;
+    ensure!(expected.contains(last), "{rates:?}, received {received}");
+    Ok(())
+}
+
+/// Compares a bag, its report and the page with the publisher's log. Returns by topic the number of
+/// messages that could not be known to be missing.
+fn bag_holds_or_names_each_message(
+    bag: &Path,
+    published: &Numbers,
+    page: &Scrape,
+    is_looked_at: bool,
+) -> Result<BTreeMap<&'static str, u64>> {
+    let (recorded, report) = (numbers(bag)?, report_of(bag)?);
     let mut unknown_of = BTreeMap::new();
     for (topic, count) in TOPICS {
         let sent = published.get(topic).cloned().unwrap_or_default();
@@ -156,8 +170,8 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
             "{topic}: {} of {count} recorded, {missing} named as missing",
             in_bag.len()
         );
-        // What a writer sent before the first message that was seen of it, nobody can count, nor
-        // what it sent last, when neither that nor its HEARTBEAT nor an ACKNACK for it was seen.
+        // Messages before the first one seen of a writer cannot be counted, nor the last ones without
+        // an observed HEARTBEAT or ACKNACK for them.
         let (before, after) = match is_looked_at {
             true => unknown(&in_bag, &report, topic, count)?,
             false => (0, 0),
@@ -200,36 +214,17 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", topic)]);
         ensure!(lost == 0.0, "{topic}: {lost} lost: {}", page.doubts());
     }
-    for (topic, echo) in &echoes {
-        let sent = published.get(*topic).context("not published")?;
-        let (echoed, missed) = (echo.numbers()?, echo.missed());
-        let unseen = unknown_of.get(topic).copied().unwrap_or_default();
-        println!(
-            "echo {topic}: {} printed, {missed} named as missing",
-            echoed.len()
-        );
-        ensure!(
-            echoed.is_sorted_by(|one, next| one < next),
-            "{topic}: out of order"
-        );
-        let distinct: BTreeSet<u64> = echoed.iter().copied().collect();
-        ensure!(distinct.is_subset(sent), "{topic}: {echoed:?}");
-        ensure!(
-            distinct.len() as u64 + missed + unseen == sent.len() as u64,
-            "{topic}: {} printed and {missed} missing of {}:\n{}",
-            distinct.len(),
-            sent.len(),
-            echo.errors()
-        );
-    }
-    let rates = hz.rates()?;
-    println!("hz /imu: {rates:?}");
-    let last = rates.last().context("hz printed nothing")?;
-    // What is repaired comes late: the subscriber's own rate is lower then.
-    let received = robot.rate("subscribe", "/imu")?;
-    let expected = received.min(200.0) - 4.0..204.0;
-    ensure!(expected.contains(last), "{rates:?}, received {received}");
-    Ok(())
+    Ok(unknown_of)
+}
+
+/// Numbers of messages by topic.
+type Numbers = BTreeMap<String, BTreeSet<u64>>;
+
+/// The commands that run while the robot publishes.
+struct Commands {
+    recorder: Rp,
+    echoes: Vec<(&'static str, Rp)>,
+    hz: Rp,
 }
 
 /// The host of the nodes, with a `/dev/shm` of its own.
@@ -331,6 +326,29 @@ impl<'n> Robot<'n> {
         Process::start(&enter, "bash", arguments)
     }
 
+    /// Starts all commands, and waits until the recorder has subscribed to each topic.
+    fn commands(&self, bag: &Path) -> Result<Commands> {
+        let output = bag.display().to_string();
+        let recorder = self.rp("record", &["bag", "record", "-a", "-o", &output])?;
+        wait_until("it records all topics", || {
+            let said = recorder.errors();
+            let is_subscribed = |(topic, _): &(&str, u64)| said.contains(&format!("'{topic}'"));
+            Ok(said.contains("Recording...") && TOPICS.iter().all(is_subscribed))
+        })
+        .with_context(|| recorder.errors())?;
+        let mut echoes = Vec::new();
+        for topic in ECHOED {
+            let arguments = ["topic", "echo", topic, "--field", "header.frame_id"];
+            echoes.push((topic, self.rp(&format!("echo{topic}"), &arguments)?));
+        }
+        let hz = self.rp("hz", &["topic", "hz", "/imu"])?;
+        Ok(Commands {
+            recorder,
+            echoes,
+            hz,
+        })
+    }
+
     fn log_of(&self, role: &str) -> String {
         let log = self.directory.path().join(format!("{role}.jsonl"));
         log.display().to_string()
@@ -346,8 +364,8 @@ impl<'n> Robot<'n> {
     }
 
     /// Numbers by topic.
-    fn log(&self, role: &str) -> Result<BTreeMap<String, BTreeSet<u64>>> {
-        let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
+    fn log(&self, role: &str) -> Result<Numbers> {
+        let mut numbers: Numbers = BTreeMap::new();
         for event in self.events(role)? {
             numbers.entry(event.topic).or_default().insert(event.seq);
         }
@@ -364,8 +382,8 @@ impl<'n> Robot<'n> {
         Ok((times.len() - 1) as f64 * 1e9 / span as f64)
     }
 
-    /// What the subscriber lacks, for a failed test.
-    fn unreceived(&self, published: &BTreeMap<String, BTreeSet<u64>>) -> String {
+    /// Returns the messages that the subscriber lacks, for a failed test.
+    fn unreceived(&self, published: &Numbers) -> String {
         let received = self.log("subscribe").unwrap_or_default();
         let lacking = published.iter().map(|(topic, sent)| {
             let received = received.get(topic).cloned().unwrap_or_default();
@@ -405,6 +423,33 @@ impl<'n> Robot<'n> {
 }
 
 impl Rp {
+    fn prints_or_names_each_message(
+        &self,
+        topic: &str,
+        sent: &BTreeSet<u64>,
+        unseen: u64,
+    ) -> Result<()> {
+        let (echoed, missed) = (self.numbers()?, self.missed());
+        println!(
+            "echo {topic}: {} printed, {missed} named as missing",
+            echoed.len()
+        );
+        ensure!(
+            echoed.is_sorted_by(|one, next| one < next),
+            "{topic}: out of order"
+        );
+        let distinct: BTreeSet<u64> = echoed.iter().copied().collect();
+        ensure!(distinct.is_subset(sent), "{topic}: {echoed:?}");
+        ensure!(
+            distinct.len() as u64 + missed + unseen == sent.len() as u64,
+            "{topic}: {} printed and {missed} missing of {}:\n{}",
+            distinct.len(),
+            sent.len(),
+            self.errors()
+        );
+        Ok(())
+    }
+
     fn errors(&self) -> String {
         fs::read_to_string(&self.errors).unwrap_or_default()
     }
@@ -424,7 +469,7 @@ impl Rp {
             .collect()
     }
 
-    /// How many messages `echo` names as missing.
+    /// Returns how many messages `echo` names as missing.
     fn missed(&self) -> u64 {
         let errors = self.errors();
         let counts = errors
@@ -447,8 +492,8 @@ impl Rp {
 }
 
 /// Application numbers in a bag by topic: one below the writer's sequence number.
-fn numbers(bag: &Path) -> Result<BTreeMap<String, BTreeSet<u64>>> {
-    let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
+fn numbers(bag: &Path) -> Result<Numbers> {
+    let mut numbers: Numbers = BTreeMap::new();
     for file in fs::read_dir(bag)? {
         let path = file?.path();
         if path.extension().is_none_or(|extension| extension != "mcap") {

@@ -1,4 +1,4 @@
-//! Watches that come and go while the agent looks at a robot: how soon they count, what they leave
+//! Watches that are added and removed beside a running robot: how soon they count, what they leave
 //! behind, and that they outlive the agent.
 
 use std::collections::BTreeSet;
@@ -36,7 +36,7 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     );
     std::fs::write(&configuration, text)?;
     let start = || Agent::start(&host, env!("CARGO_BIN_EXE_rp"), &configuration);
-    let mut agent = start()?;
+    let agent = start()?;
     let api = Api { socket: &socket };
     let stream = Stream::small(4000);
     let _subscriber = Peer::start(&host, Stack::Cyclone, Role::Subscriber, &stream, &["/ekf"])?;
@@ -51,7 +51,21 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     publisher.go()?;
     soon(&agent, &api, &publisher)?;
 
-    // Somebody pulls the plug, and somebody else writes what is no list of watches.
+    watches_survive_a_kill(agent, &start, &api, &state)?;
+    a_corrupt_file_is_set_aside(&start, &api, &state)?;
+    state_of_a_newer_rp_stays(&start, &api, &state)
+}
+
+/// Starts an agent with the test's configuration.
+type Start<'a> = &'a dyn Fn() -> Result<Agent<'a>>;
+
+/// The watches are in the state directory before the kill, and in the next agent after it.
+fn watches_survive_a_kill(
+    mut agent: Agent<'_>,
+    start: Start<'_>,
+    api: &Api<'_>,
+    state: &Path,
+) -> Result<()> {
     for topic in ["imu?domain_id=0", "camera/**"] {
         ensure!(api.ask("POST", topic)?.0 == 201);
     }
@@ -70,18 +84,26 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     let watches = api.ask("GET", "")?.1;
     ensure!(topics(&watches) == ["/imu", "/camera/**"], "{watches}");
     ensure!(watches["watches"][0]["domain_id"] == 0 && watches["watches"][0]["origin"] == "api");
-    let health = get(&host, "http://127.0.0.1:17401/health")?;
+    let health = get(agent.host, "http://127.0.0.1:17401/health")?;
     ensure!(health.contains("\"watches_kept\":true"), "{health}");
     agent.process.terminate()?;
-    ensure!(!socket.exists(), "the socket's file stays");
-    std::fs::write(&file, "{\"version\": 1, \"watches\": [{}]}")?;
+    ensure!(!api.socket.exists(), "the socket's file stays");
+    Ok(())
+}
+
+fn a_corrupt_file_is_set_aside(start: Start<'_>, api: &Api<'_>, state: &Path) -> Result<()> {
+    let corrupt = "{\"version\": 1, \"watches\": [{}]}";
+    std::fs::write(state.join("watches.json"), corrupt)?;
     let mut agent = start()?;
     let watches = api.ask("GET", "")?.1;
     ensure!(topics(&watches).is_empty(), "{watches}");
     ensure!(state.join("watches.json.corrupt").exists());
     agent.process.terminate()?;
+    Ok(())
+}
 
-    // The operator goes back from a newer rp, and forth again.
+/// An older rp runs without the state of a newer one, and leaves its files as they are.
+fn state_of_a_newer_rp_stays(start: Start<'_>, api: &Api<'_>, state: &Path) -> Result<()> {
     let newer = |name: &str| (state.join(name), format!("{{\"version\":7,\"{name}\":0}}"));
     let newer = [newer("watches.json"), newer("discovery.json")];
     for (file, text) in &newer {
@@ -89,7 +111,7 @@ fn watches_come_and_go_with_the_robot_running() -> Result<()> {
     }
     let mut agent = start()?;
     ensure!(api.ask("POST", "imu")?.0 == 201);
-    let health = get(&host, "http://127.0.0.1:17401/health")?;
+    let health = get(agent.host, "http://127.0.0.1:17401/health")?;
     ensure!(health.contains("\"watches_kept\":false"), "{health}");
     let seen = |scrape: &Scrape| scrape.sum("ros2_participants", &[]) > 0.0;
     wait_for(&agent, seen).context("an agent without state sees nothing")?;
@@ -183,7 +205,7 @@ fn soon(agent: &Agent<'_>, api: &Api<'_>, publisher: &Peer) -> Result<()> {
         let scrape = wait_for(agent, |scrape| messages(scrape) > counted)?;
         rounds.push((asked, answered, messages(&scrape) - counted, last(&scrape)));
         ensure!(api.ask("DELETE", "imu")?.0 == 204);
-        // What was on its way still counts.
+        // Messages in flight still count.
         let mut settled = messages(&scrape);
         loop {
             std::thread::sleep(Duration::from_millis(300));
@@ -221,7 +243,7 @@ struct Api<'a> {
 }
 
 impl Api<'_> {
-    /// Asks for a watch, or for all; waits when it goes too fast.
+    /// Sends a request for one watch or for all, and repeats it after 429.
     fn ask(&self, method: &str, topic: &str) -> Result<(u16, Value)> {
         loop {
             let mut stream = UnixStream::connect(self.socket)?;
@@ -267,7 +289,7 @@ fn wait_for(agent: &Agent<'_>, wanted: impl Fn(&Scrape) -> bool) -> Result<Scrap
     }
 }
 
-/// What is on the page of topics and watches, and how full the tables are that hold them.
+/// Returns the page's series of topics and watches, and of the fill of their tables.
 fn series(scrape: &Scrape) -> BTreeSet<String> {
     let lines = scrape.0.lines();
     let named = lines.clone().filter_map(|line| line.rsplit_once(' '));

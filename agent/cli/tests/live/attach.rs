@@ -1,8 +1,9 @@
-//! The host hook comes and goes while nodes talk, and they notice nothing: no sample is lost, and
-//! nothing of it stays in the kernel, however its process ends and whoever else is there.
+//! The host hook attaches and detaches while nodes communicate, without effect on them. No sample
+//! is lost, and nothing stays in the kernel, however the process ends and whichever other programs
+//! are attached.
 //!
-//! The judges are the logs of the nodes, the kernel's own counters, and the kernel's answer to who
-//! is attached.
+//! The references are the nodes' logs, the kernel's own counters, and the kernel's list of attached
+//! programs.
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -226,7 +227,7 @@ fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
     })
 }
 
-/// What the agent is told.
+/// The agent's configuration file.
 struct Configuration {
     text: String,
     directory: TempDir,
@@ -311,7 +312,7 @@ impl Talks {
         for peer in talks.publishers.iter_mut().chain(&mut talks.subscribers) {
             peer.wait_matched()?;
         }
-        // Fast DDS tells its subscriber first.
+        // Fast DDS notifies its subscriber first.
         std::thread::sleep(Duration::from_millis(300));
         talks.publishers.iter_mut().try_for_each(Peer::go)?;
         Ok(talks)
@@ -338,7 +339,7 @@ impl Talks {
             let sent = publisher.log()?.writer_numbers("pub")?;
             let received = subscriber.log()?.writer_numbers("sub")?;
             let lost: Vec<_> = sent.difference(&received).collect();
-            // What a node kept from the CPU had no room for is nobody's fault.
+            // A node without CPU time may overflow its own receive buffer.
             ensure!(
                 lost.len() as u64 <= overflows,
                 "lost {lost:?} of {}, {overflows} overflows",
@@ -393,7 +394,7 @@ fn eventually(what: impl Fn() -> Result<()>) -> Result<()> {
     }
 }
 
-/// Ends a process at once; tells how many programs it held, which are gone.
+/// Kills a process, and returns how many programs it held, all gone by then.
 fn kill(agent: &mut Process) -> Result<usize> {
     let programs = bpf::programs_of(agent.pid())?;
     agent.signal("KILL")?;

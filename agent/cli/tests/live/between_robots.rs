@@ -18,7 +18,7 @@ use ros2probe_testing::harness::switch::Switched;
 /// Six seconds.
 const SAMPLES: u64 = 1_200;
 const STRETCH: u64 = 40;
-/// How long repairs, scrapes and rules may take on a busy machine.
+/// Longest time for repairs, scrapes and rules on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(40);
 /// Gaps are settled after a second; scrapes and rules take another one each.
 const STILL: Duration = Duration::from_millis(3500);
@@ -32,7 +32,7 @@ enum Source {
     Wire,
 }
 
-/// How one writer's samples fared from one robot to the other.
+/// Counts of one writer's samples from one robot to the other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Journey {
     published: u64,
@@ -109,7 +109,7 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
         "{} by the rule, {lost} lost",
         seen.difference
     );
-    // What the receiver's agent notices by itself ends with the last sample that came.
+    // The receiver's agent alone counts no loss after the last sample that arrived.
     ensure!(
         seen.before_host <= lost as f64 && seen.before_host >= lost as f64 - 20.0,
         "{} of {lost} noticed by the receiver",
@@ -167,7 +167,7 @@ fn point_clouds(stack: Stack) -> Result<()> {
     Ok(())
 }
 
-/// The publisher stays until it has been asked about.
+/// The publisher stays until its counts are read.
 fn stream() -> Stream {
     Stream {
         linger: 60.0,

@@ -1,6 +1,6 @@
-//! The page in a real Chromium: beside a robot that runs, on captures of what goes wrong, with names
-//! that mean harm, without rights, and while the agent or the tab is away. Each test plays a scenario
-//! of `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
+//! The page in a real Chromium: beside a running robot, on captures of faults, with hostile names,
+//! without rights, and while the agent or the tab is away. Each test plays a scenario of
+//! `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
 
 mod crowd;
 mod player;
@@ -168,7 +168,7 @@ fn an_incident_of_the_past_is_on_the_page_of_its_capture() -> Result<()> {
 
 #[test]
 fn a_mismatch_of_qos_leads_to_the_policy_that_does_not_fit() -> Result<()> {
-    // Before anybody says goodbye.
+    // The time before the first goodbye.
     let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
     capture.write_all(&beginning(&data("cyclonedds/qos-mismatch-2ns"), 5)?)?;
     let agent = replay(capture.path(), &[]);

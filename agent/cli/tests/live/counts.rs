@@ -1,10 +1,10 @@
 //! The agent on either end of a link counts exactly what passed there: three DDS stacks, small
 //! samples with 0, 10 and 20 % loss, point clouds of 644 KB and 2.72 MB.
 //!
-//! Loss is made before the packet taps of the publisher's host, so the samples that it takes are
-//! seen by no agent. The judges are what the peers log, the count of dropped datagrams, and what
-//! tshark reads in recordings of both ends: at 54 MB/s subscribers lose whole samples in their
-//! socket buffers, and only a recording tells what was on the wire.
+//! Datagrams are dropped before the packet taps of the publisher's host, so no agent sees them. The
+//! references are the peers' logs, the count of dropped datagrams, and tshark on recordings of both
+//! ends. At 54 MB/s subscribers lose whole samples in their socket buffers, and only a recording
+//! shows what was on the wire.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -227,7 +227,7 @@ struct Exchange {
     ends: [End; 2],
 }
 
-/// One end of the link: what was there, and what the agent there says.
+/// One end of the link: its recording, and the counts of its agent.
 struct End {
     name: &'static str,
     topic: String,
@@ -273,8 +273,8 @@ impl Exchange {
                 per_mille,
             )?),
         };
-        // Until it has classified both endpoints the agent does not learn who asks for what, and
-        // what is repaired at once passes for reordering.
+        // Until the agent has classified both endpoints it reads no ACKNACKs, and samples repaired
+        // at once count as reordered.
         std::thread::sleep(Duration::from_millis(500));
         publisher.go()?;
         publisher

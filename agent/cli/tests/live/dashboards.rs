@@ -86,7 +86,7 @@ fn every_panel_and_every_rule_has_data_of_two_robots() -> Result<()> {
     ] {
         roles.push(Process::start(&host.inside(), robot()?, ["--role", role])?);
     }
-    // A publisher that is never let go, and a subscriber that asks for more than it offers.
+    // A publisher that never starts, and a subscriber that requests more than it offers.
     let quiet = Stream {
         topic: "/quiet".to_owned(),
         ..Stream::small(1)
@@ -133,7 +133,7 @@ fn every_panel_and_every_rule_has_data_of_two_robots() -> Result<()> {
     Ok(())
 }
 
-/// Asks all, and those again that have had no answer yet.
+/// Runs all queries, and repeats those without an answer.
 fn ask(prometheus: &Prometheus<'_>, mut questions: Vec<Question>) -> Result<()> {
     let deadline = Instant::now() + Duration::from_secs(90);
     let all = questions.len();
@@ -146,7 +146,7 @@ fn ask(prometheus: &Prometheus<'_>, mut questions: Vec<Question>) -> Result<()> 
                 unanswered.push((question, answer));
             }
         }
-        // What is rightly empty has been asked once, which says that it is a query.
+        // A query whose answer may be empty has run once, so it is valid.
         unanswered.retain(|(question, _)| question.needs_an_answer());
         let late = unanswered.iter().map(|(question, answer)| {
             let Question {
@@ -227,7 +227,7 @@ fn of_rules(file: &Path) -> Result<Vec<Question>> {
         .filter_map(|group| group["rules"].as_sequence());
     let questions = rules.flatten().map(|rule| {
         let text = |key: &str| rule[key].as_str().map(str::to_owned);
-        // What is recorded must have been recorded; of an alert its condition is asked.
+        // A recording rule must have recorded its series; an alert is tested by its condition.
         let recorded = text("record").map(|name| (format!("rule: {name}"), name));
         let alert = text("alert").zip(text("expr"));
         let (name, expression) = recorded.or(alert).context("neither recorded nor alert")?;

@@ -1,6 +1,6 @@
-//! What `deploy/` promises of running systems, as far as it can be had without a container engine: an
-//! agent confined as the DaemonSet says sees its whole node, and a robot's Prometheus delivers what was
-//! measured while its link was down.
+//! The promises of `deploy/` for running systems, as far as they need no container engine. An agent
+//! confined as in the DaemonSet sees its whole node. A robot's Prometheus delivers the samples of a
+//! time without link.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
@@ -22,7 +22,7 @@ const OUTAGE: Duration = Duration::from_secs(8);
 /// Of a scrape a second, on a busy machine.
 const GAP: f64 = 6.0;
 
-/// What is not tried: the runtime's seccomp filter, and its own ways of setting all this up.
+/// Not covered: the runtime's seccomp filter, and its own setup of the confinement.
 #[test]
 fn an_agent_that_is_confined_as_the_daemon_set_says_sees_the_whole_node() -> Result<()> {
     let node = Namespace::alone()?;

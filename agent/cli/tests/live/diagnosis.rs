@@ -1,5 +1,5 @@
-//! What the agent says of two who cannot talk, and that they really do not: Fast DDS and Cyclone
-//! DDS, each alone and one with the other.
+//! Reports of endpoints that do not match, and that they really do not: Fast DDS and Cyclone DDS,
+//! each alone and with the other.
 
 use std::path::Path;
 use std::time::{Duration, Instant};

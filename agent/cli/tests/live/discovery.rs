@@ -1,6 +1,6 @@
-//! Who is there, live: robots of sixteen nodes that start at once, before or around the agent; those
-//! that leave or die; domains side by side; and what is shown of writers whose announcement was
-//! missed.
+//! Live discovery: robots of sixteen nodes that start at once, before or with the agent, and that
+//! leave or die. Domains run side by side, and writers without an observed announcement are shown
+//! as unknown.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::panic::resume_unwind;
@@ -15,9 +15,9 @@ use tempfile::TempDir;
 
 const STARTS: usize = 10;
 const NODES: usize = 16;
-/// What a whole robot may take to start on a busy machine.
+/// Longest start of a whole robot on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Less than the shortest lease: nobody is gone because it expired.
+/// Less than the shortest lease, so no participant has expired.
 const LEAVE: Duration = Duration::from_secs(8);
 /// Nodes that may leave without a goodbye.
 const SILENT: usize = NODES / 2;
@@ -304,9 +304,10 @@ impl<'a> Robot<'a> {
             .try_for_each(|watcher| watcher.wait(shown, PATIENCE, &what))
     }
 
-    /// Ends all nodes in order and sees them go; tells whether all said goodbye.
+    /// Ends all nodes in order, and returns whether the watchers saw all goodbyes.
     fn stop(mut self, watchers: &[Watcher<'_>]) -> Result<bool> {
-        // The monitor's first: at the robot's sockets nobody hears who goes when all have gone there.
+        // The monitor's nodes first: the goodbyes reach the robot's sockets only while some are
+        // open.
         for on_monitor in [1, 0] {
             let peers = self.peers.iter_mut().enumerate();
             let there = peers.filter(|(number, _)| number / 2 % 2 == on_monitor);
@@ -330,9 +331,9 @@ impl<'a> Robot<'a> {
         let Err(error) = left.collect::<Result<Vec<()>>>() else {
             return Ok(true);
         };
-        // RustDDS tells its sending thread to end right after it has given it the goodbye, and the
-        // thread heeds that first when it is late (dp_event_loop.rs, drain_queues, of 0.15): nothing
-        // is sent, and watchers of different kinds on different hosts miss the same ones.
+        // RustDDS ends its sending thread right after it queues the goodbye, and a late thread ends
+        // first (dp_event_loop.rs, drain_queues, of 0.15). Nothing is sent then, and watchers of
+        // different kinds on different hosts miss the same ones.
         let stay = |watcher: &Watcher<'_>| {
             let page = watcher.agent.scrape()?;
             anyhow::Ok(page.labels_of("ros2_participant_info", "participant"))

@@ -1,15 +1,17 @@
-//! A long time beside a robot that changes all the while: the agent's graph stays the true one, and
-//! its needs stay what they were. Seconds in `make test`, an hour in `make soak`.
+//! A long run beside a robot whose graph keeps changing: the agent's graph stays correct, and its
+//! memory stays flat. The run takes seconds in `make test`, and an hour in `make soak`.
 
+mod clock;
 mod views;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow, ensure};
+use clock::ClockStep;
 use ros2probe_testing::forged::crowd::{Crowd, Graph, Scale, Tally};
 use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
 use ros2probe_testing::harness;
@@ -24,17 +26,17 @@ use tempfile::TempDir;
 use views::{Views, graph_of};
 
 const API: &str = "http://127.0.0.1:17401";
-/// How long an agent may take to show what is so.
+/// Longest time until an agent shows a change.
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Of `make soak`: until what the agent holds is what it will be. Topics that vanished are kept for ten
+/// Part of `make soak` until the agent's tables are full. The agent keeps vanished topics for ten
 /// minutes.
 const WARM_UP: f64 = 0.15;
-/// What memory may rise from then on: the allocator finds its level in half an hour, though what is
-/// held stays the same (`docs/endurance.md`).
+/// Most that memory may rise after the warm-up. The allocator levels off in half an hour, although
+/// the tables stay the same size (`docs/endurance.md`).
 const FILLING: f64 = 0.06;
-/// Until it has.
+/// Part of the run until the allocator has levelled off.
 const LEVEL: f64 = 0.5;
-/// What memory may rise from then on.
+/// Most that memory may rise after that.
 const GROWTH: f64 = 0.02;
 
 #[test]
@@ -51,44 +53,70 @@ fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result
         std::fs::write(&file, text)?;
         Agent::start(host, &program, &file)
     };
-    // All topics, as in the package's configuration; and those that are asked for.
+    // One agent watches all topics, as the package's configuration does; the other one a few.
     let wire = start("wire", &link.monitor, ON_THE_WIRE.to_owned(), "/**")?;
     let sockets = at_the_sockets_of(&link.robot);
     let sockets = start("sockets", &link.robot, sockets, "/measured/**")?;
-    // Sockets belong to the cgroup that they were made in.
+    // A socket belongs to the cgroup of the thread that creates it.
     let sender = link
         .robot
         .hold(|| Sender::between(&link.robot, &link.monitor))??;
     let long = soak::long();
-    let scale = match long {
-        // The defaults hold a thousand; those whose lease has just ended count until that is noticed.
-        Some(_) => Scale {
+    let mut crowd = Crowd::new(sender, changing(long.is_some()));
+    let agents = [("on the wire", &wire), ("at the sockets", &sockets)];
+    for curve in &observed(agents, &mut crowd, long)? {
+        let last = curve.needs.last().context("nothing was drawn")?;
+        eprintln!("{}: {} births; at the end {last}", curve.name, crowd.born());
+        if let Some(long) = long {
+            memory_is_flat(curve, long)?;
+        }
+    }
+    // The defaults limit measured topics to 1000, and the agent counts those beyond.
+    if long.is_some() {
+        let refused = wire.scrape()?.sum("ros2probe_topics_rejected_total", &[]);
+        ensure!(refused > 0.0, "2000 topics and none refused");
+    }
+    Ok(())
+}
+
+/// A crowd whose participants and endpoints keep changing.
+fn changing(is_long: bool) -> Scale {
+    if is_long {
+        // The default limit is 1000; participants whose lease has just ended still count.
+        Scale {
             participants: 960,
             life: Duration::from_secs(90),
             endpoint_changes: 10.0,
             messages: 200.0,
             leases: &[(4, 25), (10, 35), (20, 39), (100, 1)],
-        },
-        None => Scale {
+        }
+    } else {
+        Scale {
             participants: 250,
             life: Duration::from_secs(15),
             endpoint_changes: 10.0,
             messages: 200.0,
             leases: &[(4, 60), (7, 40)],
-        },
-    };
-    let mut crowd = Crowd::new(sender, scale);
+        }
+    }
+}
+
+/// Lets the crowd live, and returns the memory of each agent over time. Fails if a graph was wrong.
+fn observed(
+    agents: [(&'static str, &Agent<'_>); 2],
+    crowd: &mut Crowd<Sender>,
+    long: Option<Duration>,
+) -> Result<Vec<Curve>> {
     let stop = AtomicBool::new(false);
     let period = Duration::from_secs(long.map_or(1, |_| 5));
-    let curves = std::thread::scope(|scope| -> Result<Vec<Curve>> {
+    std::thread::scope(|scope| {
         let stop = &stop;
-        let looks = [("on the wire", &wire), ("at the sockets", &sockets)];
-        let pens = looks.map(|(name, agent)| {
+        let pens = agents.map(|(name, agent)| {
             let (pid, host) = (agent.process.pid(), agent.host);
             scope.spawn(move || Curve::draw(name, (pid, host), period, stop))
         });
-        let mut views = Views::of(&[&wire, &sockets]);
-        let lived = live(&mut crowd, &mut views, long);
+        let mut views = Views::of(&agents.map(|(_, agent)| agent));
+        let lived = live(crowd, &mut views, long);
         stop.store(true, Ordering::Relaxed);
         let curves = pens.map(|pen| pen.join().map_err(|_| anyhow!("a pen died"))?);
         let curves: Vec<Curve> = curves.into_iter().collect::<Result<_>>()?;
@@ -99,38 +127,31 @@ fn an_hour_of_a_changing_graph_leaves_the_graph_true_and_memory_flat() -> Result
         let wrong = views.wrong;
         ensure!(wrong.is_empty(), "{}: {}", wrong.len(), wrong.join("\n"));
         Ok(curves)
-    })?;
-    for curve in &curves {
-        let last = curve.needs.last().context("nothing was drawn")?;
-        eprintln!("{}: {} births; at the end {last}", curve.name, crowd.born());
-        let Some(long) = long else { continue };
-        curve.is_level()?;
-        let growth = |part: f64| {
-            let growth = curve.growth(long.as_secs_f64() * part);
-            growth.context("too short for a slope")
-        };
-        let ((slope, end), (filling_slope, filling)) = (growth(LEVEL)?, growth(WARM_UP)?);
-        let text = format!(
-            "memory in the second half {:+.2} % by slope, {:+.2} % from begin to end; from minute {:.0} on \
-             {:+.2} and {:+.2} %; graph equal at every checkpoint",
-            slope * 100.0,
-            end * 100.0,
-            long.as_secs_f64() * WARM_UP / 60.0,
-            filling_slope * 100.0,
-            filling * 100.0,
-        );
-        soak::outcome(&format!("changing graph, {}", curve.name), &text)?;
-        ensure!(
-            slope <= GROWTH && end <= GROWTH && filling_slope <= FILLING && filling <= FILLING,
-            "{}: {text}",
-            curve.name
-        );
-    }
-    // More than 1000 topics are measured by no agent of the defaults, and it says so.
-    if long.is_some() {
-        let refused = wire.scrape()?.sum("ros2probe_topics_rejected_total", &[]);
-        ensure!(refused > 0.0, "2000 topics and none refused");
-    }
+    })
+}
+
+fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
+    curve.is_level()?;
+    let growth = |part: f64| {
+        let growth = curve.growth(long.as_secs_f64() * part);
+        growth.context("too short for a slope")
+    };
+    let ((slope, end), (filling_slope, filling)) = (growth(LEVEL)?, growth(WARM_UP)?);
+    let text = format!(
+        "memory in the second half {:+.2} % by slope, {:+.2} % from begin to end; from minute {:.0} on \
+         {:+.2} and {:+.2} %; graph equal at every checkpoint",
+        slope * 100.0,
+        end * 100.0,
+        long.as_secs_f64() * WARM_UP / 60.0,
+        filling_slope * 100.0,
+        filling * 100.0,
+    );
+    soak::outcome(&format!("changing graph, {}", curve.name), &text)?;
+    ensure!(
+        slope <= GROWTH && end <= GROWTH && filling_slope <= FILLING && filling <= FILLING,
+        "{}: {text}",
+        curve.name
+    );
     Ok(())
 }
 
@@ -180,7 +201,7 @@ fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() 
         );
         soak::outcome(&format!("SIGSTOP for {pause:?}"), &text)?;
     }
-    // Who really goes is missed in time.
+    // Participants that really leave expire in time.
     views.compare(&mut crowd)?;
     crowd.live(Duration::from_secs(2))?;
     views.compare(&mut crowd)?;
@@ -201,7 +222,7 @@ fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_
     introduce(&flood, &mut sender)?;
     talk(&mut real, &mut sender, [320; 100])?;
     robot.agent.settled_scrape("/real", 100)?;
-    // 2 ms of CPU in 100: less than it takes to look.
+    // 2 ms of CPU in 100: less than the agent needs.
     let brake = Brake::new(&robot.agent)?;
     let began = Instant::now();
     let span = Duration::from_secs(soak::long().map_or(3, |_| 30));
@@ -214,7 +235,7 @@ fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_
         }
         std::thread::sleep(Duration::from_millis(10));
     }
-    // And for a moment none at all, which is sure to be too little.
+    // A stopped agent reads no record at all.
     robot.agent.process.signal("STOP")?;
     for _ in 0..2000 {
         sender.carry(&flood.sample(1200))?;
@@ -231,7 +252,7 @@ fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_
     let lost = topic(&page, "ros2_topic_lost_messages_total", "/flood");
     let missed = dropped(&page);
     let sent = f64::from(flood.sent());
-    // What came after the last one that was seen nobody has missed yet.
+    // Samples after the last one seen are not counted as lost yet.
     ensure!(
         missed > 0.0 && counted < sent,
         "{counted} of {sent}, {missed} dropped"
@@ -423,7 +444,7 @@ fn few(leases: &'static [(u64, u64)]) -> Scale {
     }
 }
 
-/// An agent on the monitor, and the robot that it looks at.
+/// An agent on the monitor, and the robot that it observes.
 struct Robot<'a> {
     link: &'a Link,
     agent: Agent<'a>,
@@ -456,7 +477,7 @@ impl<'a> Robot<'a> {
         Ok(std::fs::read_to_string(self.directory.path().join("log"))?)
     }
 
-    /// How many participants are believed gone because of their leases.
+    /// Returns the number of participants that the agent removed at the end of their leases.
     fn expired(&self) -> Result<f64> {
         let labels = [("entity", "participant"), ("event", "expired")];
         Ok(self
@@ -518,44 +539,6 @@ impl Drop for Brake {
             eprintln!("cannot remove {}: {error}", self.0.display());
         }
     }
-}
-
-/// The machine's clock is wrong for as long as this lives.
-struct ClockStep {
-    right: Duration,
-    since: Instant,
-}
-
-impl ClockStep {
-    fn by(seconds: i64) -> Result<ClockStep> {
-        let right = SystemTime::now().duration_since(UNIX_EPOCH)?;
-        let set = ClockStep {
-            right,
-            since: Instant::now(),
-        };
-        let wrong = right.as_secs().saturating_add_signed(seconds);
-        set_clock(Duration::new(wrong, right.subsec_nanos()))?;
-        Ok(set)
-    }
-}
-
-impl Drop for ClockStep {
-    fn drop(&mut self) {
-        if let Err(error) = set_clock(self.right + self.since.elapsed()) {
-            eprintln!("the clock is still wrong: {error:#}");
-        }
-    }
-}
-
-fn set_clock(time: Duration) -> Result<()> {
-    let time = libc::timespec {
-        tv_sec: time.as_secs().try_into()?,
-        tv_nsec: time.subsec_nanos().into(),
-    };
-    // SAFETY: the kernel reads a timespec that outlives the call.
-    let result = unsafe { libc::clock_settime(libc::CLOCK_REALTIME, &raw const time) };
-    ensure!(result == 0, "{}", std::io::Error::last_os_error());
-    Ok(())
 }
 
 /// Lives through all phases and compares after each.

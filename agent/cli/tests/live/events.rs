@@ -1,5 +1,5 @@
-//! The demo robot's troubles reach a real OpenTelemetry receiver as events with names and
-//! attributes: who came, what was lost, who fell silent; and the sums agree with the counters.
+//! The demo robot's faults reach a real OpenTelemetry receiver as events with names and attributes:
+//! new participants, losses and silent publishers. The sums agree with the counters.
 
 use std::process::Command;
 use std::time::{Duration, Instant};

@@ -1,9 +1,9 @@
-//! What an operator's month brings besides robots: full disks, receivers that hang, scrapers that do
-//! not read, no descriptors, no memory, `kill -9`. The agent goes on seeing, says what is wrong, takes
-//! everything up again when it can, and leaves nothing behind. Larger numbers in `make soak`.
+//! Faults of an agent's host: full disks, receivers that hang, scrapers that do not read, no
+//! descriptors, no memory, `kill -9`. The agent continues to observe, reports the fault, recovers,
+//! and leaves nothing behind. `make soak` runs larger numbers.
 //!
-//! What a single part does is tested with that part: a recording on a full disk in `live/record`, a
-//! receiver that comes back in `otlp` and `live/otlp`, forged traffic in `live/hostile`.
+//! Faults of a single part are tested with that part: a recording on a full disk in `live/record`,
+//! a receiver that comes back in `otlp` and `live/otlp`, forged traffic in `live/hostile`.
 
 mod clients;
 mod descriptors;
@@ -37,7 +37,8 @@ const API_PORT: u16 = 17401;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// As participants do.
 const REPEAT: Duration = Duration::from_secs(3);
-/// What ending may take: 3 s for answers and the last round, 2 s for the last export, and a busy machine.
+/// Longest shutdown: 3 s for answers and the last round, 2 s for the last export, and a busy
+/// machine.
 const ENDING: Duration = Duration::from_secs(8);
 
 /// An agent on a host of its own, and a place for its files.
@@ -99,7 +100,7 @@ impl<'a> Scene<'a> {
         Ok(stream)
     }
 
-    /// Asks the API on a connection of its own.
+    /// Sends a request to the API on a new connection.
     fn ask(&self, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
         ask(&mut self.connect(API_PORT)?, method, path, body)
     }
@@ -127,7 +128,7 @@ fn launch(enter: &[String], configuration: &Path, errors: Stdio) -> Result<Proce
         Path::new("run"),
         Path::new("--config"),
         configuration,
-        // Recordings are asked for over loopback here.
+        // These tests request recordings over loopback.
         Path::new("--api-loopback"),
         Path::new("all"),
     ];

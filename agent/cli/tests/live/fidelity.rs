@@ -1,19 +1,19 @@
-//! What the agent says each subscriber lost, against the subscriber's own log: every lost sequence
-//! number and none else, each with the place where it died.
+//! Compares the losses that the agent reports for each subscriber with the subscriber's own log:
+//! exactly the lost sequence numbers, each with its cause.
 //!
 //! A best-effort stream of each stack and size passes through stretches, in each of which one thing
-//! is wrong: nothing; every n-th datagram dropped on the link, behind the publisher's socket; all IP
-//! fragments but the first of such datagrams; a subscriber that is stopped again and again, so that
-//! its receive buffer overflows. The publisher waits in between, so the place of death follows.
+//! is wrong: nothing; every n-th datagram dropped on the link, behind the publisher's socket; all
+//! IP fragments but the first of such datagrams; a subscriber that is stopped again and again, so
+//! that its receive buffer overflows. The publisher waits in between, so the cause is known.
 //!
-//! The log tells what the application was given, which is what its socket was given only where the
-//! middleware itself drops nothing. So readers' histories hold more than can pile up during a stop
-//! (depth 1000), receive buffers of point clouds hold more than one sample, and RustDDS, which
-//! takes the end of a stop for the end of its event loop, waits on (`robot/patience.rs`). What a
-//! subscriber lost before its first sample no observer can tell from late joining.
+//! The log holds what the application received. That equals what its socket received only if the
+//! middleware itself drops nothing. So readers' histories hold more than accumulates during a stop
+//! (depth 1000), and receive buffers of point clouds hold more than one sample. RustDDS takes the
+//! end of a stop for the end of its event loop, so it continues to wait (`robot/patience.rs`). An
+//! observer cannot distinguish a loss before the first sample from late joining.
 //!
-//! Reliable streams are seen where they are received only: what was dropped and came again, and a
-//! tail that never comes although HEARTBEATs tell of it.
+//! Reliable streams are observed on the receiving host only: dropped samples that are sent again,
+//! and a tail that HEARTBEATs announce and that never arrives.
 
 mod cell;
 mod experiment;

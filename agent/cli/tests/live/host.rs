@@ -75,7 +75,7 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
         let robot = Observed::start(&link.robot, &at_the_sockets_of(&link.robot))?;
         let monitor = Observed::start(&link.monitor, &at_the_sockets_of(&link.monitor))?;
         let (mut publisher, mut subscriber) = pair(&link.robot, &link.monitor, stack, &stream)?;
-        // Of a writer that is not known yet less than a point cloud is looked at.
+        // The agent reads less than a point cloud of an unknown writer.
         for observed in [&robot, &monitor] {
             observed.wait(|page| publishers(page, &stream.topic) == Some(1.0))?;
         }
@@ -141,7 +141,7 @@ fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
     the_doctor_finds_them(&host, &socket, subscriber.process.pid())
 }
 
-/// What `rp doctor` says of a host with an agent and two nodes.
+/// The report of `rp doctor` for a host with an agent and two nodes.
 fn the_doctor_finds_them(host: &Namespace, socket: &Path, subscriber: u32) -> Result<()> {
     let [program, arguments @ ..] = &host.outside();
     let output = Command::new(program)
@@ -184,7 +184,7 @@ fn a_mirrored_interface_shows_what_no_socket_receives_and_counts_nothing_twice()
     let configuration =
         format!("capture: {{source: host, cgroup: {cgroup}, mirror_interfaces: [eth*]}}\n");
     let observed = Observed::start(&link.monitor, &configuration)?;
-    // To a port that nobody has, as what a mirror port or a gateway passes on.
+    // A port without a socket, as for forwarded or mirrored traffic.
     let mut sender = Sender::between(&link.robot, &link.monitor)?;
     let mut talker = Talker::new(1, "/forwarded");
     introduce(&talker, &mut sender)?;
@@ -287,7 +287,7 @@ fn three_capabilities_are_enough_at_the_sockets_and_all_are_given_up() -> Result
     publisher.wait_sent(PATIENCE)?;
     let page = observed.wait(|page| gone(page, &stream.topic))?;
     assert_eq!(count(&page, "messages", &stream.topic), stream.count);
-    // Told without privilege which writers are of interest, the kernel metered most.
+    // The agent updates the interest map without privilege, so the kernel metered most samples.
     let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
     assert!(metered > 300.0, "{metered} metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
@@ -379,12 +379,12 @@ struct Observed<'a> {
 }
 
 impl<'a> Observed<'a> {
-    /// With everything watched unless the configuration says otherwise.
+    /// Watches everything unless the configuration lists watches.
     fn start(host: &'a Namespace, configuration: &str) -> Result<Observed<'a>> {
         Self::start_with(host, configuration, None)
     }
 
-    /// As a user who has these capabilities and nothing else.
+    /// Runs as a user with these capabilities only.
     fn start_with(
         host: &'a Namespace,
         configuration: &str,
@@ -442,7 +442,7 @@ impl<'a> Observed<'a> {
 /// A program that starts `rp` with these capabilities only.
 fn write_start(directory: &TempDir, capabilities: &str) -> Result<()> {
     let file = |name: &str| directory.path().join(name);
-    // The build directory need not be open to everybody.
+    // The unprivileged user may be unable to read the build directory.
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     let only: String = capabilities
         .split(',')

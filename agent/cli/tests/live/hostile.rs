@@ -1,5 +1,5 @@
-//! Somebody on the network who means harm, and an operator who gave too little privilege: the agent
-//! stays small, keeps counting what is real, and says what is wrong.
+//! Forged traffic, and an agent with few privileges. Memory stays bounded, real messages are counted
+//! exactly, and the agent reports what is wrong.
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
@@ -17,14 +17,14 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::local_agent;
 
-/// A port that nothing on the robot listens to: the storm is for the agent alone.
+/// A port without a socket on the robot: only the agent observes the storm.
 const NOBODY: u16 = 7399;
 const STORM: Duration = Duration::from_secs(6);
-/// What a storm may add to the agent's memory: with every table full, and several snapshots and
-/// pages of it under way, it stays within the unit's `MemoryMax`.
+/// Most bytes that a storm may add to the agent's memory. With every table full, and several
+/// snapshots and pages in flight, the agent stays within the unit's `MemoryMax`.
 const GROWTH: u64 = 72 << 20;
-/// Forgeries give way when they have been silent for 5 s; those that went on for longer do when their
-/// lease ends.
+/// Forged participants are removed after 5 s of silence, or when their lease ends if they sent for
+/// longer than that.
 const SILENCE: Duration = Duration::from_secs(6);
 /// Cyclone DDS repeats itself every 8 s.
 const RECOVERY: Duration = Duration::from_secs(30);
@@ -49,7 +49,7 @@ fn a_storm_of_torn_ip_fragments_leaves_memory_bounded_the_page_whole_and_a_real_
     let mut wire = Wire::new(&link.monitor, &link.robot, "eth0")?;
     wire.port = NOBODY;
     wire.shuffle = |packets| {
-        // Never the same ones missing, some twice, some over each other.
+        // Other fragments are missing each time; some overlap or are out of order.
         let lot = packets
             .iter()
             .fold(0, |sum, packet| sum ^ packet[5] ^ packet[7]) as usize;
@@ -109,7 +109,7 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| directory.path().join(name);
-    // The build directory need not be open to everybody.
+    // The unprivileged user may be unable to read the build directory.
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
     std::fs::write(file("ros2probe.yaml"), configuration)?;
@@ -136,15 +136,15 @@ fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()>
     let page = agent.settled_scrape("/unprivileged", 500)?;
     let counted = page.sum("ros2_topic_messages_total", &[("topic", "/unprivileged")]);
     assert_eq!(counted, 500.0, "{}", page.0);
-    // Once the writer is classified the filter meters it: it was told so without privilege.
+    // The filter meters a classified writer: the agent updates its map without further privileges.
     let metered = page.sum("ros2probe_filter_events_total", &[("event", "metered")]);
     assert!(metered > 400.0, "{metered} of 500 metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
     Ok(())
 }
 
-/// More participants than the agent has room for, each of which repeats itself every other second as
-/// a real one would; and a robot that is started meanwhile.
+/// Sends announcements of more participants than the table holds, each every other second as a real
+/// participant does, and starts a robot during the flood.
 fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
@@ -152,7 +152,7 @@ fn behind_a_flood(capture: impl Fn(&Link) -> String) -> Result<()> {
     let configuration = format!("watch: [/**, /real]\n{}", capture(&link));
     std::fs::write(&file, configuration)?;
     let agent = Agent::start(&link.robot, env!("CARGO_BIN_EXE_rp"), &file)?;
-    // At the sockets a datagram is seen where one receives it.
+    // The socket hook sees datagrams only if a socket receives them.
     let to = format!("{}:{NOBODY}", link.robot.address());
     let _receiver = link.robot.hold(|| Sender::new(&link.robot, &to, &to))?;
     let from = format!("{}:0", link.monitor.address());
@@ -211,7 +211,8 @@ impl Carrier for Paced {
     }
 }
 
-/// What must hold of an agent on the robot while a storm comes in, and after so long a silence.
+/// Runs a storm against an agent on the robot, and checks the agent during the storm and after a
+/// silence.
 fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>) -> Result<()> {
     let directory = tempfile::tempdir()?;
     let file = directory.path().join("ros2probe.yaml");
@@ -219,17 +220,38 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
     let log = directory.path().join("log");
     let rp = Path::new(env!("CARGO_BIN_EXE_rp"));
     let agent = Agent::start_logging(&link.robot, rp, &file, &log)?;
+    let (ended, _pair) = a_real_topic_survives(&agent, link, storm)?;
+    std::thread::sleep(silence.saturating_sub(ended.elapsed()));
+    newcomers_are_counted(&agent, link)?;
+    let log = std::fs::read_to_string(&log).context("the agent's log")?;
+    assert!(log.lines().count() < 20, "{log}");
+    Ok(())
+}
+
+/// Starts a subscriber on the monitor and its publisher on the robot, with these nodes.
+fn matched_pair(link: &Link, stream: &Stream, nodes: [&str; 2]) -> Result<[Peer; 2]> {
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, nodes[0])?;
+    let mut publisher = start(&link.robot, Role::Publisher, nodes[1])?;
+    subscriber.wait_matched()?;
+    publisher.wait_matched()?;
+    Ok([subscriber, publisher])
+}
+
+/// Runs the storm beside a real topic: memory stays bounded, the page whole and the count exact.
+/// Returns when the storm ended, and the topic's endpoints.
+fn a_real_topic_survives(
+    agent: &Agent<'_>,
+    link: &Link,
+    storm: impl FnOnce() -> Result<Storm>,
+) -> Result<(Instant, [Peer; 2])> {
     let before = Usage::of(agent.process.pid())?;
     let stream = Stream {
         topic: "/real".to_owned(),
         ..Stream::small(STORM.as_secs() * 200)
     };
-    let start =
-        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
-    let mut subscriber = start(&link.monitor, Role::Subscriber, "/listener")?;
-    let mut publisher = start(&link.robot, Role::Publisher, "/driver")?;
-    subscriber.wait_matched()?;
-    publisher.wait_matched()?;
+    let [subscriber, mut publisher] = matched_pair(link, &stream, ["/listener", "/driver"])?;
 
     publisher.go()?;
     let storm = storm()?;
@@ -261,7 +283,7 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
     assert!(growth < GROWTH, "{growth} bytes more");
     assert!(oldest < 10.0, "a page was {oldest} s old");
     let real = |name| page.sum(name, &[("topic", "/real")]);
-    // What an agent that was kept from the CPU could not take in, it says.
+    // An agent without enough CPU counts what it drops.
     let unseen = page.sum("ros2probe_capture_dropped_packets_total", &[])
         + page.sum("ros2probe_records_dropped_total", &[]);
     let missing = stream.count as f64 - real("ros2_topic_messages_total");
@@ -271,22 +293,18 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
         "{}",
         page.0
     );
+    Ok((ended, [subscriber, publisher]))
+}
 
-    // It is over: who comes now is seen, and what it sends is counted.
-    std::thread::sleep(silence.saturating_sub(ended.elapsed()));
+/// Nodes that start after the storm are discovered, and their messages are counted exactly.
+fn newcomers_are_counted(agent: &Agent<'_>, link: &Link) -> Result<()> {
     let stream = Stream {
         topic: "/after".to_owned(),
-        count: 200,
-        ..stream
+        ..Stream::small(200)
     };
     let came = Instant::now();
-    let start =
-        |host: &Namespace, role, node| Peer::start(host, Stack::Cyclone, role, &stream, &[node]);
-    let mut subscriber = start(&link.monitor, Role::Subscriber, "/late_listener")?;
-    let mut publisher = start(&link.robot, Role::Publisher, "/late_driver")?;
-    subscriber.wait_matched()?;
-    publisher.wait_matched()?;
     let both = ["/late_listener", "/late_driver"];
+    let [_subscriber, mut publisher] = matched_pair(link, &stream, both)?;
     loop {
         let page = agent.scrape()?;
         let nodes = page.labels_of("ros2_node_info", "ros_node");
@@ -306,8 +324,6 @@ fn weather(link: &Link, silence: Duration, storm: impl FnOnce() -> Result<Storm>
     let page = agent.settled_scrape("/after", 200)?;
     let after = page.sum("ros2_topic_messages_total", &[("topic", "/after")]);
     assert_eq!(after, 200.0, "{}", page.0);
-    let log = std::fs::read_to_string(&log).context("the agent's log")?;
-    assert!(log.lines().count() < 20, "{log}");
     Ok(())
 }
 

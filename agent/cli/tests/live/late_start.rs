@@ -1,5 +1,5 @@
-//! A robot that was there before the agent: what it said once is remembered through a restart of
-//! the agent, and can be asked for; until then what cannot be named is shown as it is.
+//! A robot that started before the agent. The agent restores what participants announced before its
+//! own restart, and `rp discover` requests the rest. Until then writers appear without names.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -11,18 +11,19 @@ use anyhow::{Context as _, Result};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::capture::{Capture, SETTLE};
+use ros2probe_testing::harness::event_log::EventLog;
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Names are said once: what the restarted agent does not know by then it never learns.
+/// Endpoints are announced once: a restarted agent knows a name by then, or never.
 const AT_ONCE: Duration = Duration::from_secs(5);
 /// Two announcements of each participant.
 const AFTERWARDS: Duration = Duration::from_secs(7);
-/// Seconds in which each announces itself once at least.
+/// Seconds in which each participant announces itself at least once.
 const LISTEN: &str = "5";
-/// Of Cyclone DDS, which otherwise announces itself every 8 s. Fast DDS does every 3 s.
+/// Makes Cyclone DDS announce itself every 3 s, as Fast DDS does, instead of every 8 s.
 const TALKATIVE: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterval></Discovery>";
 const NODES: [&str; 3] = ["/camera", "/listener", "/talker"];
 
@@ -63,7 +64,7 @@ fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
             count.is_some_and(|count| count >= least)
         }
     };
-    // That of nobody still fits.
+    // A state without participants still fits.
     wait(&agent, written("failed", 1.0), PATIENCE, "a failure")?;
     let known = |page: &Scrape| nodes(page).len() == NODES.len() && has_names(page);
     let page = wait(&agent, known, PATIENCE, "all names")?;
@@ -75,7 +76,7 @@ fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
         "{lines}"
     );
     fs::remove_file(state.join("something-else"))?;
-    // With the next change.
+    // The next change writes the state again.
     let stream = Stream::small(1);
     let host = &scene.link.robot;
     let _more = Peer::start(host, Stack::Cyclone, Role::Subscriber, &stream, &["/more"])?;
@@ -114,7 +115,7 @@ fn restarted_on_a_running_robot(stack: Stack) -> Result<()> {
     let robot = scene.robot(stack)?;
     let known = |page: &Scrape| nodes(page).len() == NODES.len() && has_names(page);
     let before = wait(&agent, known, PATIENCE, "all names")?;
-    // Written a few seconds after the last change at the latest, and so after a crash too.
+    // The agent writes its state at most a few seconds after a change, so a crash keeps it.
     std::thread::sleep(Duration::from_secs(4));
     agent.process.signal("KILL")?;
     drop(agent);
@@ -144,7 +145,7 @@ fn restarted_on_a_running_robot(stack: Stack) -> Result<()> {
         "the agent sent"
     );
 
-    // Who leaves while nobody looks is gone after one lease.
+    // A participant that leaves while the agent is stopped is removed after one lease.
     drop(robot);
     let agent = scene.agent()?;
     wait(&agent, known, AT_ONCE, "names of the dead")?;
@@ -163,24 +164,49 @@ fn asked(stack: Stack) -> Result<()> {
     let robot = scene.robot(stack)?;
     std::thread::sleep(Duration::from_secs(1));
     let agent = scene.agent()?;
+    let page = shows_an_unknown_writer(&agent, &robot)?;
+    a_dry_run_sends_nothing(&scene, &page)?;
+
+    let path = scene.file("asked.pcap");
+    let recording = Capture::start(&scene.link.monitor, &path)?;
+    let log_before = robot.log()?;
+    let printed = discovers_all_names(&scene, &agent)?;
+    std::thread::sleep(AFTERWARDS);
+    std::thread::sleep(SETTLE);
+    packets_are_those_printed(&scene, &recording.finish()?, &printed)?;
+    the_robot_is_undisturbed(&robot, &log_before)?;
+    let participants = |page: &Scrape| page.sum("ros2_participants", &[]) == 2.0;
+    wait(&agent, participants, AT_ONCE, "the two that were there")?;
+    Ok(())
+}
+
+/// Waits for the writer's rate and process, and returns that page. It holds no name yet.
+fn shows_an_unknown_writer(agent: &Agent<'_>, robot: &Robot) -> Result<Scrape> {
     let unknown = |page: &Scrape| {
         let rate = page.value("ros2_unknown_writer_rate_hertz", &[]);
         let processes = page.labels_of("ros2_unknown_writer_info", "process");
         let heard = page.sum("ros2_participants", &[]) == 2.0;
         heard && rate.is_some_and(|rate| (80.0..120.0).contains(&rate)) && processes.len() == 1
     };
-    let page = wait(&agent, unknown, PATIENCE, "an unknown writer with its rate")?;
-    let told = |label| page.labels_of("ros2_unknown_writer_info", label);
+    let page = wait(agent, unknown, PATIENCE, "an unknown writer with its rate")?;
+    let values = |label| page.labels_of("ros2_unknown_writer_info", label);
     let one = |text: &str| BTreeSet::from([text.to_owned()]);
-    assert_eq!(told("pid"), one(&robot.publisher.process.pid().to_string()));
-    assert!(told("process").iter().all(|name| !name.is_empty()));
+    assert_eq!(
+        values("pid"),
+        one(&robot.publisher.process.pid().to_string())
+    );
+    assert!(values("process").iter().all(|name| !name.is_empty()));
     assert!(
-        told("vendor").iter().all(|name| name.contains("DDS")),
+        values("vendor").iter().all(|name| name.contains("DDS")),
         "{}",
         page.0
     );
     assert!(nodes(&page).is_empty() && !has_names(&page));
+    Ok(page)
+}
 
+/// `rp discover --dry-run`, for all participants and for one.
+fn a_dry_run_sends_nothing(scene: &Scene, page: &Scrape) -> Result<()> {
     let recording = Capture::start(&scene.link.monitor, &scene.file("dry.pcap"))?;
     let output = scene.discover(&["--all", "--dry-run", "--interface", INTERFACE])?;
     let said = String::from_utf8(output.stdout)?;
@@ -201,13 +227,13 @@ fn asked(stack: Stack) -> Result<()> {
     let planned = planned.map(|line| line.trim().split(',').next().unwrap_or_default());
     assert_eq!(planned.collect::<Vec<_>>(), plan, "{said}");
     std::thread::sleep(SETTLE);
-    let monitor = scene.link.monitor.address();
-    let ours = format!("udp and src host {monitor}");
-    assert_eq!(count(&recording.finish()?, &ours)?, 0, "a dry run sent");
+    let sent = count(&recording.finish()?, &scene.packets_of_discover())?;
+    assert_eq!(sent, 0, "a dry run sent");
+    Ok(())
+}
 
-    let path = scene.file("asked.pcap");
-    let recording = Capture::start(&scene.link.monitor, &path)?;
-    let log_before = robot.log()?;
+/// `rp discover --all`: returns what it prints.
+fn discovers_all_names(scene: &Scene, agent: &Agent<'_>) -> Result<String> {
     let output = scene.discover(&["--all"])?;
     let said = String::from_utf8(output.stdout)?;
     println!("{said}");
@@ -220,58 +246,63 @@ fn asked(stack: Stack) -> Result<()> {
         "{said}"
     );
     let known = |page: &Scrape| nodes(page) == NODES.map(str::to_owned).into() && has_names(page);
-    let page = wait(&agent, known, AT_ONCE * 2, "all names after asking")?;
+    let page = wait(agent, known, AT_ONCE * 2, "all names after asking")?;
     assert_eq!(page.sum("ros2_unknown_writers", &[]), 0.0);
-    std::thread::sleep(AFTERWARDS);
-    std::thread::sleep(SETTLE);
+    Ok(said)
+}
 
-    // What was sent is what was said, to each its introduction first and its goodbye last.
-    let recording = recording.finish()?;
-    let sent = said
+/// Only the robot receives packets, as many as `rp discover` printed. Each conversation begins with
+/// the introduction and ends with the goodbye.
+fn packets_are_those_printed(scene: &Scene, recording: &Path, printed: &str) -> Result<()> {
+    let monitor = scene.link.monitor.address();
+    let ours = scene.packets_of_discover();
+    let sent = printed
         .lines()
         .filter_map(|line| line.trim().strip_prefix("sent "));
     let sent = sent.map(|line| line.split_once(' ').map_or("", |(count, _)| count).parse());
     let sent: Vec<usize> = sent.collect::<Result<_, _>>()?;
-    assert_eq!(sent.len(), 2, "{said}");
+    assert_eq!(sent.len(), 2, "{printed}");
     assert!(
         sent.iter().all(|packets| (4..=6).contains(packets)),
-        "{said}"
+        "{printed}"
     );
-    assert_eq!(count(&recording, &ours)?, sent.iter().sum::<usize>());
-    let to_nobody_else = format!("{ours} and not dst host {}", scene.link.robot.address());
-    assert_eq!(count(&recording, &to_nobody_else)?, 0);
+    assert_eq!(count(recording, &ours)?, sent.iter().sum::<usize>());
+    let to_others = format!("{ours} and not dst host {}", scene.link.robot.address());
+    assert_eq!(count(recording, &to_others)?, 0);
     let refusals = format!("icmp and host {monitor}");
     assert_eq!(
-        count(&recording, &refusals)?,
+        count(recording, &refusals)?,
         0,
         "a port was closed too early"
     );
-    let conversations = ports(&recording, &ours)?;
+    let conversations = ports(recording, &ours)?;
     assert_eq!(conversations.len(), 2);
     for port in conversations {
         let own = format!("{ours} and src port {port}");
-        let packets = payloads(&recording, &own)?;
+        let packets = payloads(recording, &own)?;
         let is = |packet: &str, mark: &str| packet.contains(mark);
         // PID_BUILTIN_ENDPOINT_SET; PID_STATUS_INFO of a goodbye.
         assert!(is(&packets[0], "5800040039000000"), "{packets:?}");
         let last = packets.last().context("no packet")?;
         assert!(is(last, "7100040000000003"), "{packets:?}");
         let answers = format!("udp and dst port {port}");
-        let times = times(&recording, &format!("{own} or {answers}"))?;
+        let times = times(recording, &format!("{own} or {answers}"))?;
         let life = times.last().unwrap_or(&0.0) - times.first().unwrap_or(&0.0);
         assert!(life < 2.0, "packets to a port that is gone, {life} s later");
     }
-    // Nobody on the robot has noticed.
+    Ok(())
+}
+
+/// Its logs show no other endpoints, and no sample is missing.
+fn the_robot_is_undisturbed(robot: &Robot, log_before: &[EventLog; 2]) -> Result<()> {
     let log_after = robot.log()?;
-    assert_eq!(endpoints(&log_before), endpoints(&log_after));
+    assert_eq!(endpoints(log_before), endpoints(&log_after));
     let received = log_after[1].sequences("sub");
     assert!(
         received.windows(2).all(|pair| pair[1] == pair[0] + 1),
         "{received:?}"
     );
     assert!(received.len() > log_before[1].sequences("sub").len() + 1000);
-    let participants = |page: &Scrape| page.sum("ros2_participants", &[]) == 2.0;
-    wait(&agent, participants, AT_ONCE, "the two that were there")?;
     Ok(())
 }
 
@@ -324,7 +355,7 @@ impl Scene {
         let stream = Stream {
             rate: 100.0,
             reliable: true,
-            // Whatever the domain.
+            // The agent observes every domain.
             domain: if stack == Stack::Fast { 3 } else { 0 },
             ..Stream::small(100_000)
         };
@@ -344,7 +375,12 @@ impl Scene {
         })
     }
 
-    /// `rp discover` on the other end of the link.
+    /// Filter for the packets that `rp discover` sends.
+    fn packets_of_discover(&self) -> String {
+        format!("udp and src host {}", self.link.monitor.address())
+    }
+
+    /// Runs `rp discover` on the other end of the link.
     fn discover(&self, arguments: &[&str]) -> Result<Output> {
         let words = self.link.monitor.on_network();
         let [enter, words @ ..] = &words[..] else {
@@ -363,12 +399,12 @@ impl Scene {
 }
 
 impl Robot {
-    fn log(&self) -> Result<[harness::event_log::EventLog; 2]> {
+    fn log(&self) -> Result<[EventLog; 2]> {
         Ok([self.publisher.log()?, self.subscriber.log()?])
     }
 }
 
-fn endpoints(logs: &[harness::event_log::EventLog]) -> Vec<String> {
+fn endpoints(logs: &[EventLog]) -> Vec<String> {
     let events = logs.iter().flat_map(|log| &log.0);
     let other = events.filter(|event| !matches!(event.ev.as_str(), "pub" | "sub"));
     other.map(|event| format!("{event:?}")).collect()
@@ -409,7 +445,7 @@ fn wait(
     }
 }
 
-/// What tcpdump prints of the packets of a recording that this filter lets through.
+/// Returns tcpdump's output for the packets of a recording that match this filter.
 fn read(recording: &Path, options: &str, filter: &str) -> Result<String> {
     let file = recording.display();
     harness::run(&format!("tcpdump -nn -tt {options} -r {file} {filter}"))

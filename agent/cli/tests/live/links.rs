@@ -297,7 +297,7 @@ fn a_network_namespace_whose_path_is_gone_for_a_while_is_missed_meanwhile() -> R
         wait_until("missed", || Ok(!is_ready()))?;
         let page = observed.agent.scrape()?;
         assert_eq!(page.value("ros2probe_ready", &[]), Some(0.0));
-        // The agent looks for events once a second: blindness that is shorter is none.
+        // The agent checks for events once a second: it does not report a shorter blindness.
         told("ros2probe.capture.blind", round)?;
         run(&format!(
             "mount --bind /proc/{}/ns/net {place}",

@@ -9,7 +9,7 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_model::discovery::hexadecimal;
 use ros2probe_model::trace::Message;
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
@@ -17,6 +17,7 @@ use ros2probe_testing::rotel::{Item, Rotel, exports};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 const MESSAGES: u64 = 1_200;
+const DROPPED: &str = "ros2probe_otlp_dropped_total";
 
 fn on(host: &Namespace) -> Command {
     let [enter, network] = host.outside();
@@ -25,7 +26,7 @@ fn on(host: &Namespace) -> Command {
     command
 }
 
-/// Traces every other message and pushes everything to `receiver`.
+/// Writes a configuration that traces every other message and pushes all signals to `receiver`.
 fn configuration(directory: &Path, host: &Namespace, receiver: &Rotel) -> Result<PathBuf> {
     let path = directory.join(format!("{}.yaml", host.name()));
     let yaml = format!(
@@ -39,7 +40,7 @@ fn configuration(directory: &Path, host: &Namespace, receiver: &Rotel) -> Result
     Ok(path)
 }
 
-/// The spans of this name, by sequence number.
+/// Returns the spans of this name by sequence number.
 fn spans(text: &str, name: &str) -> BTreeMap<u64, Item> {
     let items = exports(text).into_iter().flat_map(|export| export.items);
     let named = items.filter(|item| item.fields.get("Name").is_some_and(|found| found == name));
@@ -62,7 +63,7 @@ fn field(item: &Item, name: &str) -> Result<String> {
 fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    let at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);
+    let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);
     let mut at_monitor = Rotel::start(&mut on(&link.monitor), directory.path(), None);
     let mut agents = Vec::new();
     for (host, receiver) in [(&link.robot, &at_robot), (&link.monitor, &at_monitor)] {
@@ -84,34 +85,47 @@ fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() 
         topic: "/truth".to_owned(),
         ..Stream::small(MESSAGES)
     };
-    let mut subscriber = Peer::start(
-        &link.monitor,
-        Stack::Rust,
-        Role::Subscriber,
-        &stream,
-        &["/listener"],
-    )?;
-    let mut publisher = Peer::start(
-        &link.robot,
-        Stack::Rust,
-        Role::Publisher,
-        &stream,
-        &["/sensor"],
-    )?;
+    let start =
+        |host: &Namespace, role, node| Peer::start(host, Stack::Rust, role, &stream, &[node]);
+    let mut subscriber = start(&link.monitor, Role::Subscriber, "/listener")?;
+    let mut publisher = start(&link.robot, Role::Publisher, "/sensor")?;
     subscriber.wait_matched()?;
     publisher.wait_matched()?;
 
-    let mut at_robot = at_robot;
+    spans_of_all_kinds_come(&mut at_robot, &mut at_monitor)?;
+
+    // The receiver is stopped while the stream begins.
+    let address = at_robot.address;
+    drop(at_robot);
+    publisher.go()?;
+    agent.scrape_until("given up metrics", |page| {
+        page.sum(DROPPED, &[("signal", "metrics")]) > 0.0
+    })?;
+    let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), Some(address));
+    publisher.wait_sent(Duration::from_secs(60))?;
+    nothing_was_lost(&agent.settled_scrape("/truth", MESSAGES)?)?;
+
+    let writer = publisher
+        .log()?
+        .0
+        .iter()
+        .find_map(|event| event.guid.clone());
+    let writer = guid(&writer.context("the publisher's log lacks its GUID")?)?;
+    both_ends_report_the_same_traces(writer, &mut at_robot, &mut at_monitor)
+}
+
+/// The demo robot's own topics are traced on both hosts, a cloud with its fragments and times.
+fn spans_of_all_kinds_come(at_robot: &mut Rotel, at_monitor: &mut Rotel) -> Result<()> {
     for (receiver, names) in [
-        (&mut at_robot, &["send /points", "receive /cmd_vel"][..]),
+        (&mut *at_robot, &["send /points", "receive /cmd_vel"][..]),
         (
-            &mut at_monitor,
+            at_monitor,
             &["receive /points", "send /cmd_vel", "settle /cmd_vel"],
         ),
     ] {
-        let told = |text: &str, name: &&str| text.contains(&format!("Name           : {name}\n"));
+        let holds = |text: &str, name: &&str| text.contains(&format!("Name           : {name}\n"));
         let text = receiver.wait_for("all kinds of spans have come", |text| {
-            names.iter().all(|name| told(text, name))
+            names.iter().all(|name| holds(text, name))
                 && text.contains("-> Name: ros2.topic.messages\n")
         });
         ensure!(text.contains("ros2.participant.discovered"), "events, too");
@@ -127,32 +141,27 @@ fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() 
         own <= begin && begin < end && end - own < 5_000_000_000,
         "{cloud:?}"
     );
+    Ok(())
+}
 
-    // The receiver is away while the stream begins.
-    let address = at_robot.address;
-    drop(at_robot);
-    publisher.go()?;
-    let dropped = "ros2probe_otlp_dropped_total";
-    agent.scrape_until("given up metrics", |page| {
-        page.sum(dropped, &[("signal", "metrics")]) > 0.0
-    })?;
-    let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), Some(address));
-    publisher.wait_sent(Duration::from_secs(60))?;
-    let page = agent.settled_scrape("/truth", MESSAGES)?;
+/// Every message is counted and no span is dropped while the receiver is away.
+fn nothing_was_lost(page: &Scrape) -> Result<()> {
     let truth = [("topic", "/truth")];
     let counted = page.sum("ros2_topic_messages_total", &truth);
     ensure!(counted as u64 == MESSAGES, "{counted} counted");
     ensure!(page.sum("ros2_topic_lost_messages_total", &truth) < 0.5);
     ensure!(page.sum("ros2probe_records_dropped_total", &[]) < 0.5);
-    let traces = page.sum(dropped, &[("signal", "traces")]);
+    let traces = page.sum(DROPPED, &[("signal", "traces")]);
     ensure!(traces < 0.5, "{traces} spans dropped");
+    Ok(())
+}
 
-    let writer = publisher
-        .log()?
-        .0
-        .iter()
-        .find_map(|event| event.guid.clone());
-    let writer = guid(&writer.context("the publisher says its GUID")?)?;
+/// The sampled messages of `/truth`, and no others, have a span on each host, parent and child.
+fn both_ends_report_the_same_traces(
+    writer: Guid,
+    at_robot: &mut Rotel,
+    at_monitor: &mut Rotel,
+) -> Result<()> {
     let sampled: Vec<u64> = (1..=MESSAGES)
         .filter(|number| Message::identity(writer, *number) >> 55 & 1 == 1)
         .collect();
@@ -165,9 +174,11 @@ fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() 
         let spans = spans(text, name);
         sampled.iter().all(|number| spans.contains_key(number))
     };
-    let text = at_robot.wait_for("all sent are told", |text| all(text, "send /truth"));
+    let text = at_robot.wait_for("all sent are traced", |text| all(text, "send /truth"));
     let sent = spans(&text, "send /truth");
-    let text = at_monitor.wait_for("all received are told", |text| all(text, "receive /truth"));
+    let text = at_monitor.wait_for("all received are traced", |text| {
+        all(text, "receive /truth")
+    });
     let received = spans(&text, "receive /truth");
     ensure!(sent.len() == sampled.len() && received.len() == sampled.len());
     for (number, sent) in &sent {

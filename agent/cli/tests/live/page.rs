@@ -1,5 +1,5 @@
-//! The page beside a running robot: its stream, processes and messages, and what the demo relays to
-//! this machine.
+//! The page beside a running robot: its stream, processes and messages, and the addresses that the
+//! demo relays to this machine.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -19,7 +19,7 @@ use serde_json::Value;
 const PATIENCE: Duration = Duration::from_secs(60);
 const API: &str = "http://127.0.0.1:17401";
 
-/// The lines of a stream so far, asked for on the host for so many seconds.
+/// Reads a stream on the host for this many seconds, and returns its whole lines.
 fn lines(host: &Namespace, path: &str, seconds: u32) -> Result<Vec<Value>> {
     let [enter, words @ ..] = &host.on_network()[..] else {
         anyhow::bail!("no host");
@@ -58,11 +58,17 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
     })?;
     std::thread::sleep(Duration::from_secs(2));
 
-    let told = lines(&host, "/live", 5)?;
+    let name = the_stream_separates_structure_and_figures(&lines(&host, "/live", 5)?)?;
+    processes_are_listed(&host, &robots)?;
+    messages_are_decoded(&host, &name)
+}
+
+/// Returns the name of the topic with messages of type Imu.
+fn the_stream_separates_structure_and_figures(told: &[Value]) -> Result<String> {
     let first = told.first().context("no line")?;
     ensure!(first["open"]["source"] == "host", "{first}");
     let batches = told.iter().filter(|line| line.get("values").is_some());
-    let batches: Vec<_> = batches.map(|line| &line["values"]).collect();
+    let batches: Vec<&Value> = batches.map(|line| &line["values"]).collect();
     ensure!(
         (2..=7).contains(&batches.len()),
         "{} batches in 5 s",
@@ -87,7 +93,7 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
             .any(|row| row[5].is_u64() && row[7].is_string()),
         "{local:?}"
     );
-    // A busy machine keeps the robot itself from sending for seconds.
+    // On a busy machine the robot itself may send nothing for seconds.
     let sent = batches.iter().skip(1);
     let sent: u64 = sent.filter_map(|values| values["totals"][0].as_u64()).sum();
     ensure!(sent > 10, "{batches:?}");
@@ -96,8 +102,13 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
     let topic = topic
         .find(|row| row[5][0] == "sensor_msgs/msg/Imu")
         .context("no imu")?;
+    a_count_grows(&batches)?;
+    Ok(topic[2].as_str().context("no name")?.to_owned())
+}
+
+fn a_count_grows(batches: &[&Value]) -> Result<()> {
     let mut counts = BTreeMap::<_, BTreeSet<_>>::new();
-    for values in &batches {
+    for values in batches {
         for row in values["topics"].as_array().context("no rows")? {
             if let (Some(id), Some(count)) = (row[0].as_u64(), row[3].as_u64()) {
                 counts.entry(id).or_default().insert(count);
@@ -108,25 +119,36 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
         counts.values().any(|counts| counts.len() >= 2),
         "no count grows: {batches:?}"
     );
+    Ok(())
+}
 
-    let processes: Value = serde_json::from_str(&get(&host, &format!("{API}/processes"))?)?;
+fn processes_are_listed(host: &Namespace, robots: &[Process]) -> Result<()> {
+    let processes: Value = serde_json::from_str(&get(host, &format!("{API}/processes"))?)?;
     let ids: BTreeSet<_> = processes["processes"]
         .as_array()
         .context("no list")?
         .iter()
         .filter_map(|row| row["process_id"].as_u64())
         .collect();
-    for robot in &robots {
+    for robot in robots {
         ensure!(
             ids.contains(&u64::from(robot.pid())),
             "{} is not in {processes}",
             robot.pid()
         );
     }
+    Ok(())
+}
 
-    let name = topic[2].as_str().context("no name")?;
-    let path = format!("/topics/{}/messages", name.replace('/', "%2F"));
-    let told = lines(&host, &path, 3)?;
+/// The stream of a topic's messages begins with its type, and each message has its header's stamp.
+fn messages_are_decoded(host: &Namespace, topic: &str) -> Result<()> {
+    let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
+    // On a busy machine the robot itself may send nothing for seconds.
+    let mut told = Vec::new();
+    harness::wait_until("a stream with a message", || {
+        told = lines(host, &path, 3)?;
+        Ok(told.iter().any(|line| line.get("message").is_some()))
+    })?;
     let known = told.iter().find(|line| line.get("type").is_some());
     let known = known.with_context(|| format!("{told:?}"))?;
     ensure!(known["type"]["known"] == true, "{known}");
@@ -179,7 +201,7 @@ impl Demo {
         Ok(Self { child, lines })
     }
 
-    /// What follows `beginning` on a line that comes.
+    /// Waits for a line with this beginning, and returns the rest of it.
     fn line(&self, beginning: &str) -> Result<String> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -197,7 +219,7 @@ impl Demo {
 
 impl Drop for Demo {
     fn drop(&mut self) {
-        // In order, so that its namespaces go.
+        // SIGTERM, so that the demo removes its namespaces.
         let id = self.child.id().to_string();
         let _ = Command::new("kill").args(["-TERM", &id]).status();
         let _ = self.child.wait();

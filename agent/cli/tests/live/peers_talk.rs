@@ -1,5 +1,5 @@
-//! The test peers and the harness themselves: before anything is said about the agent, what the
-//! peers log must agree with what crossed the link.
+//! The test peers and the harness themselves: the peers' logs must agree with the packets on the
+//! link.
 
 use std::time::Duration;
 

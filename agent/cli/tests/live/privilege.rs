@@ -1,6 +1,6 @@
 //! An agent that is a user with the few capabilities of its source and nothing else: it sees all
-//! that this source can see, keeps only what it goes on needing, and says what it lacks for more.
-//! And one that root has started: it is root no longer, and serves nothing while it has any power.
+//! that this source can see, keeps only the privileges that it needs, and reports which ones it
+//! lacks. An agent that root starts changes its user, and serves nothing before.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::Permissions;
@@ -30,7 +30,7 @@ const BPF_ALONE: &str = "0000008000000000";
 /// `CAP_NET_ADMIN` alone, and with `CAP_BPF`.
 const NET_ADMIN_ALONE: &str = "0000000000001000";
 const NET_ADMIN_AND_BPF: &str = "0000008000001000";
-/// What the package's user and group are in the test.
+/// Stands for the package's user and group.
 const USER: u32 = 64_123;
 
 #[test]
@@ -156,7 +156,8 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
     installed(&host, &file)?;
     let log = file("log");
     let mut agent = Agent::start_logging(&host, file("start"), &file("ros2probe.yaml"), &log)?;
-    // What the thread at shared memory keeps depends on what root has here; the rest has nothing.
+    // The shared-memory thread keeps capabilities that depend on root's own here; other threads
+    // keep none.
     let main = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
     for line in [
         format!("Uid:\t{USER}\t{USER}\t{USER}\t{USER}"),
@@ -199,7 +200,7 @@ fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> 
 
 #[test]
 fn an_agent_that_cannot_get_rid_of_its_capabilities_serves_nothing() -> Result<()> {
-    // A kernel that says yes and does nothing, which only reading back can tell.
+    // A kernel that reports success and does nothing: only reading back shows it.
     let capset = BTreeMap::from([(libc::SYS_capset, Vec::new())]);
     let lie = SeccompFilter::new(
         capset,
@@ -305,7 +306,7 @@ fn answer(question: &[u8]) -> Option<Vec<u8>> {
     Some(answer)
 }
 
-/// An agent that is nobody and has these capabilities.
+/// Starts an agent as an unprivileged user with these capabilities.
 fn start<'a>(
     host: &'a Namespace,
     directory: &Path,
@@ -313,7 +314,7 @@ fn start<'a>(
     capture: &str,
 ) -> Result<Agent<'a>> {
     let file = |name: &str| -> PathBuf { directory.join(name) };
-    // The build directory need not be open to everybody.
+    // The unprivileged user may be unable to read the build directory.
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     let watch = "watch: [{topic: /imu, per_subscriber: true}]\n";
     std::fs::write(file("ros2probe.yaml"), format!("{watch}{capture}"))?;

@@ -13,7 +13,7 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::prometheus::{INSTALL, Prometheus};
 
-/// What rates are taken over.
+/// The window of rates.
 const WINDOW: Duration = Duration::from_secs(6);
 const PATIENCE: Duration = Duration::from_secs(40);
 

@@ -20,7 +20,7 @@ use ros2probe_testing::harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const RATE: f64 = 200.0;
-/// Of what is said and of what is true.
+/// Between the printed rate and the true one.
 const TOLERANCE: f64 = 0.1;
 
 /// One after the other: both keep the machine busy.
@@ -91,7 +91,7 @@ fn ten_clients_are_right_on_a_busy_machine_and_leave_nothing_behind() -> Result<
     Ok(())
 }
 
-/// Compares what was said with the publisher's log. Returns how many messages that holds.
+/// Compares the printed rate with the publisher's log. Returns how many messages the log holds.
 fn is_the_rate_sent(hz: &Client, publisher: &Peer, subscriber: &Peer) -> Result<usize> {
     let log = publisher.log()?.0;
     let sent: Vec<u64> = log
@@ -133,7 +133,7 @@ fn agent<'a>(host: &'a Namespace, directory: &Path) -> Result<(Agent<'a>, PathBu
     Ok((agent, socket))
 }
 
-/// Point clouds of 2.72 MB, 20 a second: 54 MB a second go from the agent to who echoes them.
+/// Point clouds of 2.72 MB, 20 a second: 54 MB a second go from the agent to `echo`.
 #[test]
 fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()> {
     const SIZE: usize = 2_720_000;
@@ -183,7 +183,7 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     ensure!(of_agent < AGENT, "the agent took {of_agent} bytes");
     ensure!(of_client < CLIENT, "the client took {of_client} bytes");
 
-    // Whoever is killed closes nothing by itself, and is not waited for.
+    // A killed client closes nothing itself, and the agent does not wait for it.
     echo.child.kill()?;
     echo.child.wait()?;
     let log = publisher.log()?.0;
@@ -205,8 +205,8 @@ fn echoing_point_clouds_takes_bounded_memory_and_changes_no_count() -> Result<()
     let_go(&agent, "/points", 50.0)
 }
 
-/// Nobody wants the topic any more: it goes on, and nobody counts. Had a client left its interest
-/// behind, somebody would.
+/// Checks that the topic continues and its count stays: an interest that a client left behind would
+/// increase it.
 fn let_go(agent: &Agent<'_>, topic: &str, least: f64) -> Result<()> {
     wait_until("the topic is let go", || {
         let counted = || -> Result<f64> {
@@ -308,7 +308,7 @@ impl Client {
         wait_until(&what, || Ok(self.printed().len() >= now + more))
     }
 
-    /// The number behind these words, as printed last; none before the first.
+    /// Returns the last printed number behind these words; `None` before the first.
     fn last(&self, words: &str) -> f64 {
         let printed = self.printed();
         let mut numbers = printed.iter().rev().filter_map(|line| {

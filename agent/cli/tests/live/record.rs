@@ -28,7 +28,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Two lidars of 13 MB/s each, and small topics.
 const CLOUD: usize = 644_000;
 const CLOUDS: u64 = 40;
-/// What fills a small disk.
+/// Bytes of a message of the stream that fills a small disk.
 const SCAN: usize = 64_000;
 const SMALL: u64 = 600;
 /// Between a message and its way into the file: a second, and what a busy machine needs besides.
@@ -222,8 +222,32 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
     imu.go()?;
 
     names_that_lead_elsewhere_are_refused(&robot)?;
+    a_client_pauses_resumes_splits_and_ends_a_recording(&robot)?;
 
-    // Every message of the time is in the bag, was let go by, or is counted as missing.
+    // The recording process is killed.
+    let mut client = Recorder::start(&robot, "killed", &["/imu"])?;
+    let killed = robot.directory.path().join("killed");
+    wait_until("it is in the file", || Ok(bytes(&killed) > 200_000))?;
+    client.process.signal("KILL")?;
+    let end = now();
+    client.process.wait(PATIENCE)?;
+    repaired(&killed, &imu, end)?;
+
+    snapshots_are_taken_of_silence_and_on_request(&robot, &mut imu)?;
+
+    // The agent is killed.
+    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
+    robot.ask("POST", "/recordings", &wanted)?;
+    let last = robot.bags().join("last");
+    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
+    robot.agent.process.signal("KILL")?;
+    let end = now();
+    robot.agent.process.wait(PATIENCE)?;
+    repaired(&last, &imu, end)
+}
+
+/// Each message of that time is in the bag, counted as paused, or counted as missing.
+fn a_client_pauses_resumes_splits_and_ends_a_recording(robot: &Robot<'_>) -> Result<()> {
     let wanted = json!({"name": "led", "topics": {"topics": ["/imu"]}});
     let (status, begun) = robot.ask("POST", "/recordings", &wanted)?;
     ensure!(status == 201 && begun["state"] == "recording", "{begun}");
@@ -267,32 +291,12 @@ fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<(
         "{info}"
     );
     let events = robot.events("ros2probe.recording.*")?;
-    let told: Vec<_> = events.iter().map(|event| &event["name"]).collect();
+    let names: Vec<_> = events.iter().map(|event| &event["name"]).collect();
     ensure!(
-        told == ["ros2probe.recording.started", "ros2probe.recording.ended"],
+        names == ["ros2probe.recording.started", "ros2probe.recording.ended"],
         "{events:?}"
     );
-
-    // Whoever records is killed.
-    let mut client = Recorder::start(&robot, "killed", &["/imu"])?;
-    let killed = robot.directory.path().join("killed");
-    wait_until("it is in the file", || Ok(bytes(&killed) > 200_000))?;
-    client.process.signal("KILL")?;
-    let end = now();
-    client.process.wait(PATIENCE)?;
-    repaired(&killed, &imu, end)?;
-
-    snapshots_are_taken_of_silence_and_on_request(&robot, &mut imu)?;
-
-    // The agent is killed.
-    let wanted = json!({"name": "last", "topics": {"topics": ["/imu"]}});
-    robot.ask("POST", "/recordings", &wanted)?;
-    let last = robot.bags().join("last");
-    wait_until("it is in the file", || Ok(bytes(&last) > 200_000))?;
-    robot.agent.process.signal("KILL")?;
-    let end = now();
-    robot.agent.process.wait(PATIENCE)?;
-    repaired(&last, &imu, end)
+    Ok(())
 }
 
 fn names_that_lead_elsewhere_are_refused(robot: &Robot<'_>) -> Result<()> {
@@ -308,7 +312,7 @@ fn names_that_lead_elsewhere_are_refused(robot: &Robot<'_>) -> Result<()> {
     Ok(())
 }
 
-/// What was before the silence is in a bag of its own; a request and a signal make one each.
+/// A silence writes a bag of the messages before it; a request and a signal write one each.
 fn snapshots_are_taken_of_silence_and_on_request(robot: &Robot<'_>, imu: &mut Peer) -> Result<()> {
     imu.process.signal("STOP")?;
     let written = |page: &Scrape| page.sum("ros2probe_snapshots_written_total", &[]);

@@ -1,6 +1,5 @@
-//! Samples with their bytes from a running agent: what real participants sent is what a client
-//! gets, whole, from any stack and at any source; and clients that stop, or die, hold nobody up.
-//! Needs root.
+//! Samples with their bytes from a running agent: a client receives exactly what real participants
+//! sent, from any stack and any source. Clients that stop or die do not delay others. Needs root.
 
 mod shared_memory;
 
@@ -32,7 +31,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 const QUIET: Duration = Duration::from_secs(6);
 /// As the peers announce it, ROS style.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
-/// Where the points begin, behind encapsulation, header, fields and sizes.
+/// Offset of the points, behind encapsulation, header, fields and sizes.
 const DATA: usize = 52;
 
 #[test]
@@ -58,7 +57,7 @@ fn payloads_on_the_wire_are_what_was_sent() -> Result<()> {
     payloads_are_what_was_sent(Stack::Cyclone, &[644_000], on_the_wire)
 }
 
-/// Nobody watches: what one stream of samples wants is enough.
+/// No watch is configured: the interest of one stream of samples suffices.
 fn payloads_are_what_was_sent(
     stack: Stack,
     sizes: &[usize],
@@ -133,7 +132,7 @@ fn payloads_are_what_was_sent(
     Ok(())
 }
 
-/// All of it where the machine has time, and what is missing was said.
+/// Checks that each sample is there or reported as missing.
 fn all_is_there_or_counted(
     observed: &Observed<'_>,
     received: usize,
@@ -170,12 +169,12 @@ const LOSSLESS: [&str; 5] = [
     "ros2probe_incomplete_datagrams_total",
 ];
 
-/// What the agent says that it left out.
+/// Messages that the agent reports as missing.
 fn dropped(page: &Scrape) -> f64 {
     LOSSLESS.iter().map(|name| page.sum(name, &[])).sum()
 }
 
-/// What the peers fill points with.
+/// The byte that the peers write at this position of the points.
 fn pattern(place: usize) -> u8 {
     let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
     low
@@ -213,7 +212,7 @@ fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines
     }
 }
 
-/// What a stream tells.
+/// An item of a stream.
 enum News {
     Sample(Sample, Vec<u8>),
     Missed(Missed),
@@ -221,7 +220,7 @@ enum News {
     Nothing,
 }
 
-/// The next sample with its payload, or that there is none; `None` at the end.
+/// Returns the next sample with its payload, or the next report of missing ones; `None` at the end.
 fn next(lines: &mut Lines<'_>) -> Result<Option<News>> {
     next_within(lines, PATIENCE)
 }
@@ -306,8 +305,8 @@ fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Resu
     Ok((publisher, subscriber))
 }
 
-/// Ten clients at once: one never reads, one is killed. What the others get is all there is, the
-/// interest of those that go is closed, and memory keeps its bounds.
+/// Ten clients at once: one never reads, one is killed. The others receive everything, the interest
+/// of closed clients ends, and memory stays bounded.
 #[test]
 fn readers_that_stop_or_die_hold_nobody_up() -> Result<()> {
     let host = Namespace::alone()?;
@@ -393,8 +392,8 @@ impl Drop for Reader {
     }
 }
 
-/// What `docs/benchmarks-parts.md` says of streams: `cargo test --release --test live samples:: -- --ignored
-/// --nocapture`.
+/// Measures the streams of `docs/benchmarks-parts.md`: `cargo test --release --test live samples::
+/// -- --ignored --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
 fn what_a_stream_of_point_clouds_costs() -> Result<()> {

@@ -1,9 +1,9 @@
 //! Fast DDS with its default transports on one host: user data, endpoints and node names go through
-//! shared memory, and nothing but participants shows on the network. The agent reads it, and nobody
-//! can tell.
+//! shared memory, and only participants show on the network. The agent reads it without a trace.
 //!
-//! Each host has a `/dev/shm` of its own, in a mount namespace as a container has it, which the agent
-//! reaches through `/proc`. The judges are the peers' logs, and what strace says of the agent.
+//! Each host has a `/dev/shm` of its own, in a mount namespace as a container has it, which the
+//! agent reaches through `/proc`. The references are the peers' logs, and the agent's system calls
+//! as strace prints them.
 
 mod files;
 
@@ -20,10 +20,9 @@ use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Of the samples that there were, those that were seen: what is asked for on a machine that does
-/// other things, too.
+/// Share of samples seen that a test requires, on a machine with other load.
 const COVERAGE: f64 = 0.1;
-/// How often a pair may meet before its names are known.
+/// Most attempts to start a pair before the agent knows its names.
 const MEETINGS: u32 = 12;
 
 #[test]
@@ -62,14 +61,14 @@ fn four_streams_in_shared_memory_are_counted_as_they_were_sent() -> Result<()> {
         page.sum("ros2_topic_messages_total", &[("topic", &stream.topic)])
     };
     let half = agent.scrape_until("as many messages as were sent first", |page| {
-        // What was sent before the first one that was seen, nobody can count.
+        // The messages before the first one that the agent saw cannot be counted.
         streams
             .iter()
             .all(|stream| count(page, stream) >= 0.9 * stream.stretch as f64)
     })?;
     let share = 100.0 * (cpu(&half) - before) / began.elapsed().as_secs_f64();
     println!("{share:.2} % of a CPU; {}", shared_memory_metrics(&half));
-    // Nothing more comes until it is told to.
+    // The publishers send no more until the next `go`.
     let half = agent.settled_scrape("/imu", 0)?;
     let began = Instant::now();
     for (publisher, _) in &mut pairs {
@@ -132,90 +131,20 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
     let host = Host::new(&link.robot)?;
     let directory = tempfile::tempdir()?;
     let agent = start_agent(&link.robot, directory.path())?;
-    let both = Stream {
-        count: 600,
-        stretch: 200,
-        peers: 2,
-        linger: 60.0,
-        ..shared()
-    };
-    let one = Stream {
-        peers: 1,
-        ..both.clone()
-    };
-    let cyclone = Stream {
-        topic: "/points".to_owned(),
-        shares_memory: false,
-        ..one.clone()
-    };
-    let far = Stream {
-        shares_memory: false,
-        ..one.clone()
-    };
-    let pairs = |page: &Scrape, topic, passage| {
-        page.sum(
-            "ros2_topic_pairs",
-            &[("topic", topic), ("passage", passage)],
-        )
-    };
-    let shows_all = |page: &Scrape| {
-        pairs(page, "/imu", "shared_memory") == 1.0
-            && pairs(page, "/imu", "network") == 1.0
-            && pairs(page, "/points", "network") == 1.0
-    };
-    let meet = || -> Result<Option<[Peer; 5]>> {
-        let mut peers = [
-            host.launch(Role::Publisher, &both)?,
-            host.launch_stack(Stack::Cyclone, Role::Publisher, &cyclone)?,
-            host.launch(Role::Subscriber, &one)?,
-            host.launch_stack(Stack::Cyclone, Role::Subscriber, &cyclone)?,
-            Peer::launch(
-                &link.monitor,
-                Stack::Fast,
-                Role::Subscriber,
-                &far,
-                &["/far"],
-            )?,
-        ];
-        for peer in &mut peers {
-            peer.wait_ready()?;
-        }
-        for peer in &mut peers {
-            peer.wait_matched()?;
-        }
-        let deadline = Instant::now() + Duration::from_secs(4);
-        while Instant::now() < deadline {
-            if shows_all(&agent.scrape()?) {
-                return Ok(Some(peers));
-            }
-            std::thread::sleep(Duration::from_millis(200));
-        }
-        for mut peer in peers {
-            peer.process.terminate()?;
-        }
-        std::thread::sleep(Duration::from_secs(1));
-        Ok(None)
-    };
-    let mut met = None;
-    for _ in 0..MEETINGS {
-        met = meet()?;
-        if met.is_some() {
-            break;
-        }
-    }
-    let [mut publisher, mut talker, ..] = met.context("endpoints were never all heard")?;
+    let streams = Streams::of_two_middlewares();
+    let [mut publisher, mut talker, ..] = streams.meet(&host, &link.monitor, &agent)?;
     for _ in 0..2 {
         publisher.go()?;
         talker.go()?;
         std::thread::sleep(Duration::from_secs(1));
     }
-    // What was sent before the first one that was seen, nobody can count.
+    // The messages before the first one that the agent saw cannot be counted.
     let before = agent.settled_scrape("/imu", 0)?;
     publisher.go()?;
     talker.go()?;
     publisher.wait_sent(PATIENCE)?;
     talker.wait_sent(PATIENCE)?;
-    let page = agent.settled_scrape("/points", one.count)?;
+    let page = agent.settled_scrape("/points", streams.one.count)?;
     let more = |topic| {
         let count = |page: &Scrape| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
         count(&page) - count(&before)
@@ -223,7 +152,7 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
     println!("{}", shared_memory_metrics(&page));
     assert_eq!(more("/imu"), 200.0, "{}", shared_memory_metrics(&page));
     assert_eq!(more("/points"), 200.0);
-    assert!(shows_all(&page), "{}", page.0);
+    assert!(shows_all_pairs(&page), "{}", page.0);
     for topic in ["/imu", "/points"] {
         assert_eq!(page.sum("ros2_topic_publishers", &[("topic", topic)]), 1.0);
     }
@@ -233,6 +162,89 @@ fn one_topic_has_its_sources_on_a_host_of_two_middlewares_and_with_a_remote_subs
     let lost = page.sum("ros2_topic_lost_messages_total", &[]);
     assert_eq!(lost, 0.0);
     Ok(())
+}
+
+/// Streams of a host of two middlewares with a remote subscriber.
+struct Streams {
+    /// Fast DDS to two subscribers, through shared memory and the network.
+    both: Stream,
+    /// The same for each of its subscribers.
+    one: Stream,
+    /// The remote subscriber's end.
+    far: Stream,
+    cyclone: Stream,
+}
+
+impl Streams {
+    fn of_two_middlewares() -> Streams {
+        let both = Stream {
+            count: 600,
+            stretch: 200,
+            peers: 2,
+            linger: 60.0,
+            ..shared()
+        };
+        let one = Stream {
+            peers: 1,
+            ..both.clone()
+        };
+        let cyclone = Stream {
+            topic: "/points".to_owned(),
+            shares_memory: false,
+            ..one.clone()
+        };
+        let far = Stream {
+            shares_memory: false,
+            ..one.clone()
+        };
+        Streams {
+            both,
+            one,
+            far,
+            cyclone,
+        }
+    }
+
+    /// Starts the peers, publishers first, again until the agent has heard all endpoints.
+    fn meet(&self, host: &Host<'_>, remote: &Namespace, agent: &Agent<'_>) -> Result<[Peer; 5]> {
+        for _ in 0..MEETINGS {
+            let mut peers = [
+                host.launch(Role::Publisher, &self.both)?,
+                host.launch_stack(Stack::Cyclone, Role::Publisher, &self.cyclone)?,
+                host.launch(Role::Subscriber, &self.one)?,
+                host.launch_stack(Stack::Cyclone, Role::Subscriber, &self.cyclone)?,
+                Peer::launch(remote, Stack::Fast, Role::Subscriber, &self.far, &["/far"])?,
+            ];
+            for peer in &mut peers {
+                peer.wait_ready()?;
+            }
+            for peer in &mut peers {
+                peer.wait_matched()?;
+            }
+            let deadline = Instant::now() + Duration::from_secs(4);
+            while Instant::now() < deadline {
+                if shows_all_pairs(&agent.scrape()?) {
+                    return Ok(peers);
+                }
+                std::thread::sleep(Duration::from_millis(200));
+            }
+            for mut peer in peers {
+                peer.process.terminate()?;
+            }
+            std::thread::sleep(Duration::from_secs(1));
+        }
+        bail!("endpoints were never all heard")
+    }
+}
+
+fn shows_all_pairs(page: &Scrape) -> bool {
+    let pairs = |topic, passage| {
+        let labels = [("topic", topic), ("passage", passage)];
+        page.sum("ros2_topic_pairs", &labels)
+    };
+    pairs("/imu", "shared_memory") == 1.0
+        && pairs("/imu", "network") == 1.0
+        && pairs("/points", "network") == 1.0
 }
 
 #[test]
@@ -276,7 +288,8 @@ fn an_agent_with_nothing_to_see_costs_next_to_nothing() -> Result<()> {
     Ok(())
 }
 
-/// What `docs/benchmarks-parts.md` says of names: `cargo test --test live shm:: -- --ignored --nocapture`.
+/// Measures the names of `docs/benchmarks-parts.md`: `cargo test --test live shm:: -- --ignored
+/// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and prints a figure"]
 fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
@@ -301,7 +314,8 @@ fn how_often_both_nodes_and_both_endpoints_are_known() -> Result<()> {
     Ok(())
 }
 
-/// What `docs/benchmarks-parts.md` says of the peers: `cargo test --test live shm:: -- --ignored --nocapture`.
+/// Measures the peers of `docs/benchmarks-parts.md`: `cargo test --test live shm:: -- --ignored
+/// --nocapture`.
 #[test]
 #[ignore = "takes two minutes and a quiet machine to mean anything"]
 fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
@@ -406,9 +420,9 @@ impl<'n> Host<'n> {
         pairs.pop().context("no pair")
     }
 
-    /// As [`Self::pair`] for each stream, until the agent knows all by name. Names are said once,
-    /// and the memory that they are said in is used again within a moment: a tap that finds no CPU
-    /// in that moment misses them.
+    /// As [`Self::pair`] for each stream, until the agent knows all by name. Names are announced
+    /// once, and their memory is reused within a moment: a tap without CPU time in that moment
+    /// misses them.
     fn known_pairs(&self, agent: &Agent<'_>, streams: &[Stream]) -> Result<Vec<(Peer, Peer)>> {
         for attempt in 1..=MEETINGS {
             let pairs: Result<Vec<_>> = streams.iter().map(|stream| self.pair(stream)).collect();
@@ -441,7 +455,7 @@ impl<'n> Host<'n> {
         Ok(names.filter(|name| name.contains("fastrtps_")).collect())
     }
 
-    /// Where it is from outside.
+    /// Returns its path from outside.
     fn shared_memory(&self) -> PathBuf {
         PathBuf::from(format!("/proc/{}/root/dev/shm", self.keeper.pid()))
     }
@@ -472,7 +486,7 @@ fn node_of(role: Role, stream: &Stream) -> String {
     }
 }
 
-/// Whether both nodes and both endpoints of the stream's topic are known.
+/// Returns whether the agent knows both nodes and both endpoints of the stream's topic.
 fn is_known(page: &Scrape, stream: &Stream) -> bool {
     let nodes = page.labels_of("ros2_node_info", "ros_node");
     let roles = [Role::Publisher, Role::Subscriber];
@@ -501,7 +515,7 @@ fn start_agent<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)
 }
 
-/// Lets the publisher send everything, and looks.
+/// Lets the publisher send everything, and returns the page.
 fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape> {
     // Names and endpoints have settled.
     std::thread::sleep(Duration::from_secs(1));
@@ -516,7 +530,7 @@ fn run(agent: &Agent<'_>, mut publisher: Peer, stream: &Stream) -> Result<Scrape
     agent.settled_scrape(&stream.topic, 0)
 }
 
-/// What the agent says of its look at shared memory.
+/// Returns the agent's metrics of shared memory.
 fn shared_memory_metrics(page: &Scrape) -> String {
     let lines = page.0.lines().filter(|line| {
         !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))

@@ -18,7 +18,8 @@ use ros2probe_testing::harness::wait_until;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 const SAMPLES: u64 = 600;
-/// As fast as it goes, into a ring with room for all of it: the agent may get no CPU meanwhile.
+/// Samples at full speed. The ring has room for all of them: the agent may get no CPU during the
+/// burst.
 const RING: u64 = 4 << 20;
 const BURST: u64 = 50_000;
 const FASTER_THAN_IT_GOES: f64 = 1e6;
@@ -70,7 +71,7 @@ fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
     publisher.go()?;
     let page = counted(&agent, "/burst", BURST)?;
     assert_eq!(page.sum("ros2_topic_lost_messages_total", &[]), 0.0);
-    // Shared memory was not looked at, and nothing was sampled.
+    // Shared memory was not polled, and no message was sampled.
     let read = [("event", "read")];
     assert_eq!(page.sum("ros2probe_shm_events_total", &read), 0.0);
     assert_eq!(page.sum("ros2_topic_sampled_messages_total", &[]), 0.0);
@@ -162,7 +163,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
     let health = get(&host.network, "http://127.0.0.1:17401/health")?;
     assert!(health.contains("the cgroup was made anew"), "{health}");
 
-    // Who is in the new one is seen by looking, and nobody is believed to have lost anything.
+    // Polling finds the participants of the new one, and no loss is reported.
     let stream = Stream {
         count: SAMPLES,
         linger: 60.0,
@@ -172,7 +173,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
         let page = agent.scrape()?;
         Ok(page.sum("ros2_topic_publishers", &[("topic", "/imu")]) == 1.0)
     };
-    // What is said once can be missed by looking: other nodes of the same names say it again.
+    // Polling may miss an announcement: other nodes of the same names repeat it.
     let (mut publisher, mut subscriber) = host.pair(&stream)?;
     let began = Instant::now();
     while !is_there()? {
@@ -190,7 +191,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
     let topic = [("topic", "/imu")];
     let counted = page.sum("ros2_topic_messages_total", &topic);
     let lost = page.sum("ros2_topic_lost_messages_total", &topic);
-    // The last ones may have been overwritten before a look.
+    // The last ones may have been overwritten before they were read.
     ensure!(
         (0.9..=1.0).contains(&(counted / SAMPLES as f64)) && lost == 0.0,
         "{counted} of {SAMPLES}, {lost} lost: {}",
@@ -291,7 +292,7 @@ fn start_agent_at<'a>(
     Agent::start(host, script, &configuration)
 }
 
-/// Whether a topic's writer and reader and both nodes are known: all is said in shared memory.
+/// Returns whether a topic's writer and reader and both nodes are known, all from shared memory.
 fn is_known(agent: &Agent<'_>, topic: &str) -> Result<bool> {
     let page = agent.scrape()?;
     let nodes = page.labels_of("ros2_node_info", "ros_node");
@@ -321,7 +322,7 @@ fn counted(agent: &Agent<'_>, topic: &str, count: u64) -> Result<Scrape> {
     Ok(page)
 }
 
-/// How many samples a subscriber received from this one on, once it is so many.
+/// Waits for this many samples from this one on at a subscriber, and returns their number.
 fn received(subscriber: &mut Peer, first: u64, count: u64) -> Result<u64> {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -352,7 +353,7 @@ fn mapped(process: u32, name: &str) -> Result<PathBuf> {
     Ok(PathBuf::from(path.with_context(|| format!("no {name}"))?))
 }
 
-/// What the agent says of shared memory.
+/// Returns the agent's metrics of shared memory.
 fn shared_memory_metrics(page: &Scrape) -> String {
     let lines = page.0.lines().filter(|line| {
         !line.starts_with('#') && (line.contains("_shm_") || line.contains("_sampled_"))

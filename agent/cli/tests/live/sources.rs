@@ -1,5 +1,5 @@
-//! The sources agree: a capture says the same whether it is replayed from the file or sent again
-//! between sockets, where the host source sees whole datagrams and the wire source frames.
+//! The sources agree: a capture gives the same counts whether it is replayed from the file or sent
+//! again between sockets. There the host source sees whole datagrams, and the wire source frames.
 //!
 //! Counted are messages, bytes and losses of each topic and of each writer that was never
 //! announced, and the lost sequence numbers of each writer. Times are not: they are those of the
@@ -29,7 +29,7 @@ use ros2probe_testing::harness::witness::{Testimony, Witness};
 
 /// Every topic, hidden ones too.
 const EVERYTHING: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
-/// Longer captures are left to whoever asks for them by `ROS2PROBE_FIXTURES`.
+/// Longer captures run only if `ROS2PROBE_FIXTURES` names them.
 const LONGEST: Duration = Duration::from_secs(60);
 /// Captures are sent in half their time: windows in which gaps may still be filled are long enough.
 const SPEED: u32 = 2;
@@ -105,7 +105,7 @@ impl<'a> Sending<'a> {
         }))
     }
 
-    /// Tells what was compared.
+    /// Compares the sources, and returns a summary.
     fn compare(&self) -> Result<String> {
         let path = self.cgroup.path().display();
         let at_sockets = format!("{EVERYTHING}capture: {{source: host, cgroup: {path}}}\n");
@@ -124,7 +124,7 @@ impl<'a> Sending<'a> {
     }
 }
 
-/// What all sources must agree on.
+/// The counts on which all sources must agree.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Counts {
     /// Messages, bytes and losses by DDS topic or GUID.
@@ -209,7 +209,7 @@ fn captures(root: &Path) -> Vec<PathBuf> {
         paths.sort();
         paths
     };
-    // What Zenoh sends is no RTPS.
+    // Zenoh does not send RTPS.
     let directories = children(root)
         .into_iter()
         .filter(|label| !label.ends_with("zenoh"))

@@ -1,8 +1,8 @@
 //! Observing leaves the robot exactly as it was: no participant, no endpoint, no packet, no socket
 //! of the network but the listeners, no multicast group, no promiscuous interface.
 //!
-//! The judges are recordings of the link that tshark reads, the kernel's own counters, and what
-//! `/proc` says about the sockets of every process.
+//! The references are recordings of the link that tshark reads, the kernel's own counters, and the
+//! sockets of every process in `/proc`.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -17,7 +17,7 @@ use ros2probe_testing::harness::dissection::{Content, Dissection, Frame};
 use ros2probe_testing::harness::network::{INTERFACE, Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 
-/// What kernels say for themselves: address resolution, multicast membership, IPv6 neighbours.
+/// The kernels' own traffic: address resolution, multicast membership, IPv6 neighbours.
 const KERNEL_PROTOCOLS: [&str; 3] = ["arp", "igmp", "icmpv6"];
 const PHASE: Duration = Duration::from_secs(2);
 /// LISTEN in `/proc/net/tcp`.
@@ -128,7 +128,7 @@ fn nodes_that_start_beside_the_agent_announce_what_they_announce_without_it() ->
 fn a_host_that_runs_only_the_agent_sends_nothing() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    // The kernel would look for IPv6 routers and neighbours.
+    // The kernel would search for IPv6 routers and neighbours.
     inside(
         &link.robot,
         &format!("sysctl -qw net.ipv6.conf.{INTERFACE}.disable_ipv6=1"),

@@ -1,5 +1,5 @@
-// Every view for everybody: axe finds nothing in either theme, nothing scrolls sideways at 360 px
-// and at 400 % zoom, and everything is reached by keys.
+// Accessibility of every view: axe finds nothing in either theme, nothing scrolls sideways at 360
+// px and at 400 % zoom, and everything is reached by keys.
 
 import assert from 'node:assert/strict';
 import { scenario, until } from './tab.mjs';

@@ -1,5 +1,5 @@
-// A tab nobody looks at: frozen for a minute by the browser, and hidden. It costs the agent nothing
-// while hidden, and shows the state of now when it is looked at again.
+// A tab in the background: frozen for a minute by the browser, and hidden. It costs the agent
+// nothing while hidden, and shows the current state when it is visible again.
 
 import assert from 'node:assert/strict';
 import { ask, scenario, until } from './tab.mjs';

@@ -1,5 +1,5 @@
-// What loopback does not grant asks for a token once: by the address that `rp page` prints, or
-// pasted. It leaves the address at once, stays in its tab, and is never part of an address again.
+// Where loopback lacks the rights, the page requires a token once: in the address that `rp page`
+// prints, or pasted. The page removes it from the address at once and keeps it in its tab only.
 // Arguments: address of an agent whose loopback grants `read`, address of one that wants a token.
 
 import assert from 'node:assert/strict';

@@ -41,7 +41,7 @@ fn problem(answer: &Answer) -> (u16, String) {
     (answer.status, code.replace("urn:ros2probe:problem:", ""))
 }
 
-/// Asks until the answer is as wanted.
+/// Repeats the request until the answer is as wanted.
 fn wait_for(agent: &LocalAgent, path: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -214,7 +214,8 @@ fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
     assert_eq!(document["openapi"], "3.1.0");
 }
 
-/// Starts `rp run` with this `api:` section and gives what it says instead of running.
+/// Starts `rp run` with this `api:` section and returns the error that it prints instead of
+/// running.
 fn refused(section: &str) -> String {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
@@ -331,7 +332,8 @@ fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
     let chunks = format!("4e20\r\n{long}\r\n0\r\n\r\n");
     assert_eq!(code(&chunked, &chunks), case(413, "body-too-large"));
 
-    // Who may open the file needs no token; the metrics listener changes nothing for anybody.
+    // A process that can open the socket file needs no token. The metrics listener grants no access
+    // to the API.
     let mode = std::fs::metadata(&socket).unwrap().permissions().mode();
     assert_eq!(mode & 0o777, 0o660);
     let stream = UnixStream::connect(&socket).unwrap();
@@ -340,7 +342,7 @@ fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
     let answer = agent.request("POST", "/watch/b", right);
     assert_eq!(answer.status, 404);
 
-    // A connection on which nothing is asked does not hold up the end.
+    // A connection without a request does not delay the end.
     let _idle = TcpStream::connect(agent.api).unwrap();
     agent.signal("-TERM");
     assert!(agent.wait().success());
@@ -388,7 +390,8 @@ fn what_the_book_prints_is_what_is_printed() {
             if counts && masked(said.trim_end()) == masked(&expected) {
                 break;
             }
-            // Only what changes nothing may be asked again, until the robot has come that far.
+            // Only a request without side effects can be repeated until the replay has reached that
+            // point.
             let may_repeat = !command.contains("-X") && Instant::now() < deadline;
             assert!(
                 may_repeat,

@@ -22,7 +22,7 @@ use serde_json::Value;
 
 const CONFIGURATION: &str = "watch: [{topic: '/**', retain: last}]\n";
 
-/// Asks with a typed body for a typed answer of this status.
+/// Sends a typed body, and returns a typed answer of this status.
 fn asked<T: DeserializeOwned + Serialize>(
     agent: &LocalAgent,
     method: &str,

@@ -1,5 +1,5 @@
-//! What the control API says of real robots: captures of real ROS 2 are replayed through the real
-//! binary up to a moment of which it is known what a real node believed.
+//! The control API on real robots. The real binary replays captures of ROS 2 up to a time at which
+//! the graph of a real node is known.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -29,7 +29,7 @@ use ros2probe_testing::truth::{self, GraphLine, Scenario};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde_json::Value;
 
-/// What a node believes is what was announced half a second ago.
+/// Nodes know announcements after half a second.
 const SETTLED: u64 = 500_000_000;
 
 /// A capture of which the agent has seen all up to a moment.
@@ -194,7 +194,7 @@ fn believed(name: &str, capture: &Path, line: &GraphLine) {
     drawn(&robot);
 }
 
-/// The graph holds together: every edge has its ends, every node that is told is there.
+/// The graph holds together: every edge has its ends, and every listed node exists.
 fn drawn(robot: &Robot) {
     let graph = robot.get("/graph?hidden=true");
     let vertices = graph["nodes"].as_array().unwrap();
@@ -485,7 +485,7 @@ fn read_all(robot: &Robot) {
 #[test]
 fn what_goes_through_shared_memory_is_not_called_silent() {
     let capture = capture_of("fastrtps-default/samehost-any");
-    // Before anybody says goodbye.
+    // The time before the first goodbye.
     let goodbye = 1_795_142_305_000_000_000;
     let robot = Robot::at(&capture, goodbye, "/**");
     let topic = robot.get("/topics/chatter");

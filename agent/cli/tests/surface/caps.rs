@@ -82,7 +82,7 @@ impl World {
         self.put(Message::from(guid.prefix).data(by, number, &payload));
     }
 
-    /// A participant says that it has so many nodes.
+    /// A participant announces this many nodes.
     fn nodes(&mut self, prefix: GuidPrefix, count: u32) {
         let names: Vec<_> = (0..count).map(|number| format!("n{number:0200}")).collect();
         let guid = Guid::new(prefix, entity(1, 3));

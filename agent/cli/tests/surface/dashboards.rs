@@ -1,5 +1,6 @@
-//! The shipped Grafana dashboards: files that Grafana's own types accept, every panel with a unit and
-//! words for it, no data source of somebody's, only metrics that exist, asked for as their type wants.
+//! The shipped Grafana dashboards: Grafana's own types accept the files, and every panel has a unit
+//! and a description. No data source is fixed, and queries use existing metrics as their type
+//! requires.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -183,8 +184,8 @@ fn grafana_s_types_accept_the_dashboards_and_nothing_that_is_wrong() -> Result<(
     for Dashboard { file, text, .. } in &dashboards {
         files.push((file.clone(), text.clone()));
     }
-    // That the types would notice: an unknown key, a word that is none of an enumeration's, an option
-    // of no panel of this type, a target without its expression.
+    // The types reject an unknown key, an unknown word of an enumeration, an option of another
+    // panel type, and a target without an expression.
     let text = &dashboards.first().context("no dashboards")?.text;
     let mistakes = [
         ("\"editable\"", "\"editible\""),
@@ -251,7 +252,8 @@ fn table_of_panels() -> Result<String> {
     Ok(table + "\n")
 }
 
-/// What the TypeScript compiler says of dashboards beside `agent/cli/tests/dashboard/types/dashboard.ts`.
+/// Returns the output of the TypeScript compiler for dashboards beside
+/// `agent/cli/tests/dashboard/types/dashboard.ts`.
 fn type_check(files: &[(String, String)]) -> Result<String> {
     const MISSING: &str = "the TypeScript compiler is missing: run `.ci/prerequisites.sh types`, \
                            which needs npm (`apt-get install npm`)";
@@ -259,7 +261,7 @@ fn type_check(files: &[(String, String)]) -> Result<String> {
     let compiler = tools.join("node_modules/typescript/bin/tsc");
     ensure!(compiler.exists(), MISSING);
     let compiler = compiler.canonicalize()?;
-    // Below what npm installed, where the compiler looks for Grafana's types.
+    // A directory below npm's, where the compiler finds Grafana's types.
     let directory = tempfile::tempdir_in(&tools)?;
     let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/dashboard/types");
     for file in ["dashboard.ts", "tsconfig.json"] {

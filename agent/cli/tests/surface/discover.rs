@@ -19,7 +19,7 @@ use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 const START: u64 = 5_000 * MILLISECOND;
 /// A conversation takes no longer, and a tick.
 const LIMIT: u64 = 3_100 * MILLISECOND;
-/// Where discovery and the rest of the participant are, in these tests.
+/// Addresses of discovery and of the participant's other endpoints in these tests.
 const METATRAFFIC: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7410);
 const DEFAULT: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(10, 99, 0, 1), 7411);
 
@@ -106,7 +106,7 @@ impl Recording {
     }
 }
 
-/// What holds of every conversation.
+/// Checks the rules of every conversation.
 fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, Outgoing)]) {
     let (sent, _) = session.cost();
     assert!(sent.packets <= MOST_PACKETS, "{} packets", sent.packets);
@@ -127,7 +127,7 @@ fn assert_is_polite(session: &Session, recording: &Recording, outgoing: &[(u64, 
             vec![METATRAFFIC, DEFAULT]
         };
         assert!(to.contains(&packet.to));
-        // INFO_DST: to nobody else, whoever else listens there.
+        // INFO_DST: other participants at that address ignore the message.
         assert_eq!(packet.bytes[24..36], recording.target.prefix.0);
     }
 }
@@ -195,7 +195,7 @@ fn silence_is_answered_with_one_more_introduction_and_a_goodbye() {
 #[test]
 fn a_participant_that_announces_without_end_costs_no_more_packets() {
     for recording in Recording::both() {
-        // HEARTBEATs of ever more samples, none of which ever comes.
+        // HEARTBEATs for ever more samples, without the samples.
         let heartbeat = |last: u32| {
             let mut bytes = [b"RTPS\x02\x03\x01\x10", &recording.target.prefix.0[..]].concat();
             for writer in [

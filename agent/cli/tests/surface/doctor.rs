@@ -1,4 +1,5 @@
-//! `rp doctor`: the real binary as root and as nobody, without an agent and with one on a replay.
+//! `rp doctor`: the real binary as root and as an unprivileged user, without an agent and with one
+//! on a replay.
 
 use std::fs::Permissions;
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
@@ -10,14 +11,14 @@ use crate::rp;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE};
 use serde_json::Value;
 
-/// Where nobody listens.
+/// A socket that does not exist.
 const NOWHERE: &str = "/nonexistent/api.sock";
 
 fn report(output: &Output) -> Value {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(said, "");
     let report: Value = serde_json::from_slice(&output.stdout).unwrap();
-    // What the exit code says is what the report says.
+    // The exit code agrees with the report.
     let is_problem = report["verdict"] == "problem";
     assert_eq!(
         output.status.code(),

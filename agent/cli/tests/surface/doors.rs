@@ -325,7 +325,7 @@ fn loopback_gives_what_is_configured_and_the_socket_everything() {
                 |answer: &Answer| refusal(answer).filter(|(code, _)| code == "needs-socket");
             let over_loopback = request(agent.api, method, path, "");
             let refused = needs_socket(&over_loopback);
-            // A path that is written otherwise is none at all.
+            // Another spelling of a path is not found.
             let is_granted = rank(needed) <= rank(level) || over_loopback.status == 404;
             assert_eq!(refused.is_none(), is_granted, "{level}: {method} {path}");
             if let Some((_, detail)) = refused {

@@ -1,5 +1,5 @@
-//! `GET /events` of the real binary: what a replayed robot does is told in order, with names and
-//! attributes, resumable, filtered, and without holding up the end.
+//! `GET /events` of the real binary: the events of a replay come in order, with names and
+//! attributes, resumable, filtered, and without delaying the end.
 
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
@@ -240,7 +240,7 @@ fn lost_messages_and_unfit_readers_are_told_with_who_and_what() {
     assert!(left_out >= 3, "{left_out} packets left out");
     let agent = replayed(&capture, &["--watch", "/chatter_be"]);
     let lost = kept(&agent, "&name=ros2.message.lost&topic=/chatter_*");
-    // Three samples in a row, told in one event unless a second ended between them.
+    // Three samples in a row are one event unless a second ended between them.
     let sum = |name: &str| -> u64 {
         let counts = lost.iter().map(|message| message.attribute(name));
         counts.map(|count| count.as_u64().unwrap()).sum()
@@ -262,7 +262,7 @@ fn lost_messages_and_unfit_readers_are_told_with_who_and_what() {
     );
     assert!(lost[0].attribute("ros_node").is_string(), "{lost:?}");
 
-    // Its other reader asks for more than it offers.
+    // Its other reader requests more than it offers.
     let unfit = kept(&agent, "&name=ros2.qos.*");
     assert_eq!(unfit[0].event, "ros2.qos.incompatible");
     assert_eq!(unfit[0].attribute("topic"), "/chatter_be");
@@ -358,7 +358,7 @@ fn a_replay_tells_every_endpoint_that_the_capture_announces_in_its_own_time() {
     let path = directory.path().join("announced.pcap");
     let mut capture = capture::Capture::new(capture::ETHERNET);
     capture.participant(START, 0, alice);
-    // 422 in 4 s: 200 a second are a storm, 106 are none.
+    // 422 in 4 s: 200 a second are a storm, 106 are not.
     for number in 0..422 {
         let time = START + number as u64 * SECOND / 106;
         let topic = format!("rt/topic{number}");

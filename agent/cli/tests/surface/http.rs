@@ -192,7 +192,7 @@ impl Prometheus {
         Self { child, address }
     }
 
-    /// Asks until the first sample of the answer is one that is wanted.
+    /// Repeats the query until the first sample of the answer is as wanted.
     fn wait_for(&self, query: &str, wanted: impl Fn(f64) -> bool) -> f64 {
         let deadline = Instant::now() + PATIENCE;
         let encoded: String = query.bytes().map(|byte| format!("%{byte:02X}")).collect();

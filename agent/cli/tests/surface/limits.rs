@@ -1,5 +1,5 @@
-//! Every cap of the configuration, reached: who was there is served as before, the next one is refused
-//! or makes room as the table says, that is counted, and there is room again afterwards.
+//! Every cap of the configuration, reached. Existing entries work as before; the next one is
+//! refused or evicts another as the table states, with a count. Afterwards there is room again.
 
 mod driven;
 mod table;
@@ -32,7 +32,7 @@ use tokio_util::sync::CancellationToken;
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
-/// How a cap stands: how much of it is used, how often it was reached.
+/// State of a cap: how much of it is used, and how often it was reached.
 fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
     let settings = ros2probe_daemon::settings_cell::Settings {
         limits,
@@ -131,7 +131,7 @@ fn participants_beyond_the_cap_are_left_out_until_one_goes() {
     }
     world.participant(prefix(3));
     assert_eq!(world.standing(Limit::Participants), (2, 1));
-    // Who was there goes on.
+    // Existing writers are counted as before.
     world.writer(writer(1, 1), 1, "rt/a");
     world.sample(writer(1, 1), 1);
     assert_eq!(world.snapshot().topics[0].publishers.len(), 1);
@@ -381,7 +381,7 @@ fn watches_beyond_the_cap_are_refused_to_clients_and_to_a_reload() {
     let detail = problem["detail"].as_str().unwrap();
     assert!(detail.contains("limits.watches"), "{detail}");
     wait_for(&agent, "watches", 3.0, 1.0);
-    // What there is may be changed.
+    // Existing watches can be changed.
     let changed = r#"{"max_silence_s": 5}"#;
     assert_eq!(ask(agent.api, "PUT", "/watch/c", changed).0, 200);
     assert_eq!(ask(agent.api, "POST", "/watch/a", "").0, 200);
@@ -458,7 +458,7 @@ fn clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone() {
     while status().status != 200 {
         assert!(Instant::now() < deadline, "no place was given back");
     }
-    // Connections on which nothing is asked make room.
+    // Connections without a request make room.
     let idle: Vec<_> = (0..8)
         .map(|_| TcpStream::connect(agent.address).unwrap())
         .collect();
@@ -551,7 +551,7 @@ fn an_agent_at_a_limit_says_so_on_readyz_on_the_page_in_health_and_to_rp_doctor(
     assert_eq!(found.unwrap()["verdict"], "problem", "{report:#}");
 }
 
-/// What `rp` says and how it ends.
+/// Returns the output of `rp` and its exit code.
 fn run_failing(arguments: &[&str]) -> (Option<i32>, String) {
     let output = rp().args(arguments).output().unwrap();
     let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -586,7 +586,7 @@ fn a_configuration_for_a_newer_rp_is_refused_in_one_line_by_check_start_and_relo
     let line = agent.wait_for_log("the configuration was not reloaded");
     assert!(line.contains("version: is 2"), "{line}");
     assert_eq!(ask(agent.api, "GET", "/watch/a", "").0, 200);
-    // One that says its version, and one that says none.
+    // One state with a version, and one without.
     for same in [format!("version: 1\n{before}"), before] {
         std::fs::write(&file, same).unwrap();
         assert_eq!(run_failing(&["check-config", path]).0, Some(0));

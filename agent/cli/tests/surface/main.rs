@@ -1,5 +1,5 @@
-//! What a user of the agent meets: API, metrics, configuration, command line, recordings and bags.
-//! `rp` replays captures on free ports of this host: no namespaces, no DDS participants.
+//! The agent's interfaces: API, metrics, configuration, command line, recordings and bags. `rp`
+//! replays captures on free ports of this host: no namespaces, no DDS participants.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

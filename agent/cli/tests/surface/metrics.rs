@@ -338,7 +338,7 @@ fn series_of_deliveries_are_capped_and_never_twice() {
                 process: Some("\"}\n\\".into()),
                 ..one.clone()
             };
-            // Two sockets that no label tells apart are one series.
+            // Two sockets with equal labels are one series.
             [delivery.clone(), delivery]
         })
         .collect();
@@ -514,7 +514,7 @@ fn both_formats_hold_the_same_samples() {
     assert!(open.contains("# TYPE ros2_topic_messages counter\n"));
     assert!(open.contains("# TYPE ros2_topic info\n"));
     assert!(open.contains("# UNIT ros2_topic_interarrival_seconds seconds\n"));
-    // What changes from scrape to scrape is left out.
+    // Values that change from scrape to scrape are left out.
     let samples = |page: &str| -> Vec<String> {
         let steady = |line: &&str| {
             ![

@@ -10,7 +10,7 @@ use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 
-/// What changes from one look to the next.
+/// Values that change from one reading to the next.
 fn changes(name: &str) -> bool {
     name.starts_with("process_")
         || name.starts_with("ros2probe_otlp_")
@@ -111,7 +111,7 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
     let page = page_series(&agent.get("/metrics").body);
     assert!(page.len() > 200, "{}", page.len());
 
-    // The requests of one second tell the final state; each begins with the same metric.
+    // The requests of one second hold the final state; each begins with the same metric.
     let complete = |text: &str| text.matches("-> Name: process.start_time").count();
     let seen = complete(&receiver.text());
     let text = receiver.wait_for("another export is complete", |text| {
@@ -201,7 +201,7 @@ fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
 /// An event: its name and what is known of it.
 type LoggedEvent = (String, BTreeMap<String, String>);
 
-/// What the event log keeps.
+/// The events of the log.
 fn logged_events(agent: &LocalAgent) -> Vec<LoggedEvent> {
     let kept = "/events?after=0&follow=false";
     let body = local_agent::request(agent.api, "GET", kept, "").body;
@@ -261,7 +261,7 @@ fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
     assert_eq!(exports[0].resource["robot.name"], "marvin");
     assert_eq!(exports[0].resource["service.name"], "ros2probe");
 
-    // What happens from now on follows, and what happens last is sent before the end.
+    // Later events follow, and the last ones are sent before the end.
     let added = local_agent::request(agent.api, "POST", "/watch/imu", "");
     assert_eq!(added.status, 201);
     receiver.wait_for("it has one more", |text| text.contains("watch: Str(/imu)"));

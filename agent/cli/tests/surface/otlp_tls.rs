@@ -1,4 +1,4 @@
-//! Exporting over TLS, in builds that have it; others say what to do.
+//! Exporting over TLS, in builds that have it; others print the remedy.
 
 use std::path::Path;
 

@@ -1,5 +1,5 @@
-//! What the real binary serves to the page: files, the stream of what changes, history,
-//! decoded messages, tokens, downloads. Captures of real robots are replayed.
+//! The answers of the real binary to the page, on replays of real robots: files, the stream of
+//! changes, history, decoded messages, tokens, downloads.
 
 mod history;
 mod messages;

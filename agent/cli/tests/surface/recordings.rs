@@ -1,4 +1,4 @@
-//! Bags that the agent writes, asked for over its API: begun, paused, split and ended; and the last
+//! Bags that the agent writes on request of the API: begun, paused, split and ended; and the last
 //! seconds before an expectation was violated.
 
 mod begin_and_end;
@@ -33,7 +33,7 @@ fn agent(directory: &Path, more: &str) -> LocalAgent {
 fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalAgent {
     let configuration = directory.join("ros2probe.yaml");
     let bags = directory.join("bags");
-    // How full the disk is matters where a test says so.
+    // The fill of the disk matters only in the tests that set it.
     let reserve = match more.contains("reserve_") {
         true => "",
         false => "  reserve_percent: 0\n  reserve_bytes: 0\n",
@@ -51,7 +51,7 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, more: &str) -> LocalA
     )
 }
 
-/// Asks for the recording until it is as wanted.
+/// Reads the recording until it is as wanted.
 fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -279,7 +279,7 @@ fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
     let events = local_agent::request(agent.api, "GET", "/events?after=0&follow=false", "").body;
     assert!(events.contains("ros2probe.snapshot.taken"), "{events}");
 
-    // What came since then, for a client that asks; at the same second names would collide.
+    // A request writes the messages since then. Names of the same second would collide.
     std::thread::sleep(Duration::from_millis(1100));
     let (status, written) = ask(agent.api, "POST", "/snapshots/incident", "");
     assert_eq!(status, 201, "{written}");
@@ -298,7 +298,7 @@ fn a_late_recording_has_what_was_sent_once_before_it_where_the_watchlist_asks_fo
     let more = "watch: [{topic: /tf_static, retain: last}]\n";
     let agent = agent_on(&capture, directory.path(), "10", more);
     agent.wait_for_metric("ros2probe_retained_bytes", |bytes| bytes > 50.0);
-    // It is sent once in the capture: whoever comes now is too late for it.
+    // The capture sends it once: a recording that begins now is too late for it.
     let body = r#"{"name": "late", "topics": {"topics": ["/tf_static", "/chatter"]}}"#;
     let (status, begun) = ask(agent.api, "POST", "/recordings", body);
     assert_eq!(status, 201, "{begun}");
@@ -342,7 +342,7 @@ fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
     assert!(said.contains("the agent has no place for recordings"));
 }
 
-/// What `rp bag convert` says of a capture, its exit code and the report in the bag.
+/// Returns the output of `rp bag convert` for a capture, its exit code and the report in the bag.
 fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, String, Value) {
     let mut command = rp();
     command
@@ -415,7 +415,7 @@ impl Recording {
         }
     }
 
-    /// Waits for a line that has `text`, and says how long that took.
+    /// Waits for a line with `text`, and returns how long that took.
     fn wait_for(&mut self, text: &str) -> Duration {
         let begun = Instant::now();
         loop {
@@ -436,7 +436,7 @@ impl Recording {
         assert!(sent.success());
     }
 
-    /// How it ended and after how long.
+    /// Returns its exit status and the time until its end.
     fn end(&mut self) -> (ExitStatus, Duration) {
         let begun = Instant::now();
         let status = loop {

@@ -28,7 +28,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 
-/// One line that says what to do, and exit code 1.
+/// Checks for one line with the remedy, and exit code 1.
 fn fails_with(output: &Output, part: &str) {
     let said = stderr(output);
     assert_eq!(output.status.code(), Some(1), "{said}");
@@ -125,7 +125,7 @@ fn answering(answer: &'static [u8]) -> String {
 #[test]
 fn who_cannot_be_asked_is_said_in_one_line() {
     let ask = |host: &str| run(&["topic", "list", "--host", host]);
-    // Nobody listens there once the listener is gone.
+    // The port is closed once the listener is dropped.
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
     fails_with(&ask(&closed.unwrap().to_string()), "connection refused");
     fails_with(

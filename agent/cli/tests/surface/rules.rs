@@ -1,5 +1,5 @@
-//! The shipped Prometheus rules: promtool understands them, they say what they should, and every
-//! metric they read exists. Every alert tells what to do, and is tested to fire and not to.
+//! The shipped Prometheus rules: promtool accepts them, their tests pass, and every metric they
+//! read exists. Every alert names the remedy, and is tested to fire and not to.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -158,7 +158,7 @@ fn every_metric_in_the_rules_and_their_tests_is_in_the_catalogue() -> Result<()>
             .filter(|line| !line.trim_start().starts_with('#'))
             .flat_map(|line| [line, "\n"])
             .collect();
-        // What holds a colon is recorded by a rule, and promtool's tests ask for it.
+        // A rule records each name with a colon, and promtool's tests cover it.
         let word = |c: char| !(c.is_ascii_alphanumeric() || matches!(c, '_' | ':'));
         for name in text.split(word) {
             let of_ours = ["ros2_", "ros2probe_"]

@@ -66,7 +66,7 @@ fn request(id: u64, depth: Depth) -> SampleRequest {
     }
 }
 
-/// What a capture says when everything is watched and, with a depth, everything wished for.
+/// Replays a capture with a watch for all topics and, with a depth, an interest in all samples.
 fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcome>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
@@ -93,7 +93,7 @@ fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcom
     take(&mut observer);
     let mut snapshot = observer.snapshot(feed.last());
     snapshot.tables.retain(|table| table.table != "payloads");
-    // It says that samples are wanted, and is no number.
+    // It marks that samples are wanted, and is not a number.
     for topic in &mut snapshot.topics {
         topic.is_read = false;
     }
@@ -188,7 +188,7 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
     assert!(messages >= 64, "{messages}");
 }
 
-/// What a subscriber of a capture logged.
+/// The log of a subscriber of a capture.
 #[derive(serde::Deserialize)]
 struct Logged {
     lost_between: Vec<u64>,
@@ -321,7 +321,7 @@ impl Robot {
     }
 }
 
-/// A payload in which every place can be told.
+/// A payload whose bytes differ by position.
 fn payload(size: usize) -> Vec<u8> {
     (0..size).map(|place| (place * 7 % 251) as u8).collect()
 }
@@ -448,7 +448,7 @@ fn what_finds_no_room_is_told_and_memory_stays_bounded() {
             .find(|table| table.table == "payloads");
         table.unwrap().size
     };
-    // Nobody takes what is given.
+    // No client takes the samples.
     for number in 1..=20 {
         robot.put(Message::from(ALICE).data(WRITER, number, &payload(10_000)));
         assert!(held(&robot) <= 100_000);

@@ -74,7 +74,7 @@ fn a_signal_ends_it_cleanly_and_so_does_control_c_when_the_agent_is_gone() {
     drop(agent);
     top.wait_for("AGENT GONE");
     top.wait_for("retrying");
-    // What was known is still there, and keys work.
+    // The last known values stay on the screen, and keys work.
     assert!(top.screen().contains(TOPIC), "{}", top.screen());
     top.press("?");
     top.wait_for("any key goes back");

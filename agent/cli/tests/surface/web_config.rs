@@ -8,7 +8,7 @@ use ros2probe_testing::local_agent;
 use ros2probe_testing::local_agent::LocalAgent;
 use tempfile::TempDir;
 
-/// A configuration beside a `web.yml` that says this.
+/// Writes a configuration and a `web.yml` with this content.
 struct Web {
     directory: TempDir,
 }
@@ -82,7 +82,7 @@ fn who_has_no_password_reads_nothing() {
     assert!(refused.headers.contains("www-authenticate: basic"));
 }
 
-/// What an agent says that does not start.
+/// Returns the error of an agent that does not start.
 fn refused(web: &Web) -> String {
     let output = rp()
         .args([
@@ -165,7 +165,7 @@ fn an_encrypted_listener_speaks_with_who_knows_its_certificate_and_with_nobody_e
     );
     let plain = format!("http://{}/metrics", agent.address);
     assert_eq!(status(&[&plain]), "000");
-    // Who does not know how to speak holds up nobody.
+    // A client without a TLS handshake does not delay others.
     let _silent = std::net::TcpStream::connect(agent.address).unwrap();
     assert_eq!(status(&["--cacert", &known, user[0], user[1], &url]), "200");
 }

@@ -268,35 +268,27 @@ fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
     assert_eq!(refused, missing);
 }
 
-#[test]
-fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
-    const SAMPLES: usize = 2_000;
-    let mut observed = Observed::with(&FilterSettings {
-        record_ring_bytes: 8 << 20,
-        ..FilterSettings::default()
-    });
-    let host = Namespace::alone().unwrap();
-    let receiver = observed.socket(&host, "127.0.0.1:7411");
-    let other = observed.socket(&host, "127.0.0.1:7500");
-    for socket in [&receiver, &other] {
-        set(socket, libc::SO_RCVBUF, 32 * 1024);
-    }
-    let talkers = [talker(10), talker(11)];
-    for (_, writer) in &talkers {
-        let verdict = Some(Verdict::Meter);
-        observed.filter.set_interest(*writer, verdict).unwrap();
-    }
-    let mut got = BTreeSet::new();
-    let mut sent = BTreeSet::new();
+/// Samples by writer.
+type Sent = BTreeSet<(Guid, u64)>;
+
+/// Sends this many samples of each talker from a thread of its own, with noise to port 7500 between
+/// them. Returns what was sent, and what the receiver read while it was sent.
+fn send_at_once(
+    host: &Namespace,
+    receiver: &UdpSocket,
+    talkers: [(forged::Talker, Guid); 2],
+    count: usize,
+) -> (Sent, Sent) {
+    let (mut sent, mut got) = (Sent::new(), Sent::new());
     std::thread::scope(|scope| {
-        let path = forged::path(&host);
-        let mut senders = Vec::new();
+        let path = forged::path(host);
+        let mut writers = Vec::new();
         for (mut talker, writer) in talkers {
             let noise = netns::within(&path, || UdpSocket::bind("127.0.0.1:0").unwrap()).unwrap();
-            let mut sender = forged::Sender::new(&host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
-            senders.push(scope.spawn(move || {
-                let mut sent = BTreeSet::new();
-                for _ in 0..SAMPLES {
+            let mut sender = forged::Sender::new(host, "127.0.0.1:0", "127.0.0.1:7411").unwrap();
+            writers.push(scope.spawn(move || {
+                let mut sent = Sent::new();
+                for _ in 0..count {
                     noise.send_to(&[7; 500], "127.0.0.1:7500").unwrap();
                     let message = talker.sample(1_000);
                     sent.extend(
@@ -309,7 +301,6 @@ fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
                 sent
             }));
         }
-        let writers: Vec<_> = senders;
         let mut buffer = vec![0; 65_536];
         let mut read = || {
             while let Ok(len) = receiver.recv(&mut buffer) {
@@ -332,6 +323,28 @@ fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
             sent.extend(writer.join().unwrap());
         }
     });
+    (sent, got)
+}
+
+#[test]
+fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
+    const SAMPLES: usize = 2_000;
+    let mut observed = Observed::with(&FilterSettings {
+        record_ring_bytes: 8 << 20,
+        ..FilterSettings::default()
+    });
+    let host = Namespace::alone().unwrap();
+    let receiver = observed.socket(&host, "127.0.0.1:7411");
+    let other = observed.socket(&host, "127.0.0.1:7500");
+    for socket in [&receiver, &other] {
+        set(socket, libc::SO_RCVBUF, 32 * 1024);
+    }
+    let talkers = [talker(10), talker(11)];
+    for (_, writer) in &talkers {
+        let verdict = Some(Verdict::Meter);
+        observed.filter.set_interest(*writer, verdict).unwrap();
+    }
+    let (sent, got) = send_at_once(&host, &receiver, talkers, SAMPLES);
     assert_eq!(sent.len(), 2 * SAMPLES);
     let missing: BTreeSet<_> = sent.difference(&got).copied().collect();
     assert!(missing.len() > 100 && got.len() > 100, "{}", missing.len());

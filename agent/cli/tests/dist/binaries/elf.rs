@@ -1,4 +1,4 @@
-//! As much of ELF as tells whether a program needs anything else (System V ABI, 64-bit,
+//! The part of ELF that shows whether a program needs other files (System V ABI, 64-bit,
 //! little-endian).
 
 use std::path::Path;
@@ -48,7 +48,7 @@ impl Elf {
         self.of_kind(PT_INTERP).next().is_some()
     }
 
-    /// How many shared libraries are needed.
+    /// Returns the number of shared libraries that the program needs.
     pub fn needed(&self) -> usize {
         let dynamic = self.of_kind(PT_DYNAMIC);
         let tags = dynamic

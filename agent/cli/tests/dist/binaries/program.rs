@@ -1,4 +1,4 @@
-//! Which binaries are looked at, and how they are run on this machine.
+//! The tested binaries, and how they run on this machine.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -28,7 +28,7 @@ pub fn all() -> Vec<PathBuf> {
     shipped.chain([own]).collect()
 }
 
-/// Where release binaries are, if it is them that are looked at.
+/// Returns the directory of the release binaries, if the tests cover those.
 pub fn directory() -> Option<PathBuf> {
     std::env::var_os("ROS2PROBE_DIST").map(PathBuf::from)
 }
@@ -80,7 +80,7 @@ impl Program {
         name.to_string_lossy().into_owned()
     }
 
-    /// Told apart also where both are for one architecture.
+    /// Returns a name that differs even if both are for one architecture.
     pub fn name(&self) -> String {
         let kind = self
             .path

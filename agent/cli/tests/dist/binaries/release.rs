@@ -1,4 +1,4 @@
-//! What `make dist` leaves, if it is that which is looked at (`ROS2PROBE_DIST`).
+//! Files that `make dist` leaves, if `ROS2PROBE_DIST` names its directory.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use serde_json::Value;
 use super::program::{self, Binary};
 use super::{crates, text};
 
-/// Panics where the tests look at an unoptimized build, of which none of this is true.
+/// Panics for an unoptimized build, which lacks these properties.
 fn released() -> PathBuf {
     program::directory().expect("ROS2PROBE_DIST names no release: run `make dist`")
 }
@@ -67,7 +67,8 @@ fn no_path_of_the_machine_that_built_it_is_in_a_binary() {
     }
 }
 
-/// What is wrong with a bill, says a reader that is not ours; nothing if it keeps to the schema.
+/// Returns the errors that another project's reader finds in a bill of materials; empty if it
+/// follows the schema.
 fn flaw(bill: &Path) -> String {
     let tools = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../target/tools");
     let python = tools.join("bills/bin/python");

@@ -94,7 +94,7 @@ fn architecture() -> &'static str {
     }
 }
 
-/// What a command says, which must succeed.
+/// Runs a command that must succeed, and returns its output.
 pub(crate) fn succeed(command: &mut Command) -> Result<String> {
     let output = command
         .output()
@@ -108,7 +108,7 @@ pub(crate) fn succeed(command: &mut Command) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Everything that was said.
+/// Returns all output.
 pub(crate) fn all(output: &Output) -> String {
     let stdout = String::from_utf8_lossy(&output.stdout);
     format!("{stdout}{}", String::from_utf8_lossy(&output.stderr))

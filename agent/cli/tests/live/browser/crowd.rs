@@ -59,7 +59,7 @@ pub(crate) fn capture(topics: usize, hostile: bool, seconds: u64) -> Vec<u8> {
             let name = format!("rt/{}", name(topic, hostile));
             let kind = type_name(topic, hostile);
             let writer = Guid::new(prefix, EntityId([0, 0, number, 3]));
-            // What the next participant of the ring listens to.
+            // The topic to which the next participant of the ring subscribes.
             let listener = self::prefix((robot + 1) % robots.len());
             let reader = Guid::new(listener, EntityId([0, 1, number, 4]));
             let (writers, readers) = (forge::SEDP_WRITERS, forge::SEDP_READERS);
@@ -132,7 +132,7 @@ fn name(topic: usize, hostile: bool) -> String {
     }
 }
 
-/// Whether the agent takes a name with this character in it.
+/// Returns whether the agent accepts a name with this character.
 fn is_shown(unit: char) -> bool {
     let turns = matches!(unit, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     !unit.is_control() && !turns && !matches!(unit, '"' | '\'' | '`' | '\\')

@@ -14,7 +14,7 @@ use serde_json::Value;
 /// Longest time for a scenario.
 const PATIENCE: Duration = Duration::from_secs(280);
 
-/// What a scenario may ask for.
+/// Actions that a scenario can request.
 pub(crate) type Answers<'a> = &'a mut dyn FnMut(&str) -> Result<Value>;
 
 /// Plays a scenario behind the words of a host; without words on this machine's network.
@@ -95,7 +95,7 @@ pub(crate) fn play_for(
     Ok(())
 }
 
-/// A scenario that asks for nothing.
+/// Plays a scenario without questions.
 pub(crate) fn watch(enter: &[String], name: &str, arguments: &[&str]) -> Result<()> {
     let mut nothing = |question: &str| bail!("no answer to {question}");
     play(enter, name, arguments, &mut nothing)

@@ -52,7 +52,7 @@ impl Place {
         agent.with_context(|| std::fs::read_to_string(&log).unwrap_or_default())
     }
 
-    /// What lets an agent record, however full the disk is.
+    /// Returns a configuration with which the agent records on a full disk too.
     pub(crate) fn recordings(&self) -> String {
         let bags = self.directory.path().join("bags");
         let bags = bags.display();
@@ -82,18 +82,19 @@ impl Place {
         Ok(process)
     }
 
-    /// What the control API answers.
+    /// Returns the answer of the control API.
     pub(crate) fn ask(&self, path: &str) -> Result<Value> {
         let answer = get(&self.host, &format!("http://127.0.0.1:17401{path}"))?;
         serde_json::from_str(&answer).context(answer)
     }
 
-    /// How much of a limit is in use.
+    /// Returns how much of a limit is in use.
     pub(crate) fn used(&self, limit: &str) -> Result<u64> {
         super::number(&self.ask("/health")?["limits"], "limit", limit, "used")
     }
 
-    /// Streams of the page that are open: those that find no room any more tell.
+    /// Returns the number of open streams of the page: the limit minus those that it can still
+    /// open.
     pub(crate) fn streams(&self) -> Result<usize> {
         let mut held = Vec::new();
         for _ in 0..STREAMS {

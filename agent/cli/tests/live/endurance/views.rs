@@ -2,10 +2,10 @@
 
 use super::*;
 
-/// What each agent says, and what it could not have seen.
+/// Answers of each agent, and the differences that dropped frames explain.
 pub(super) struct Views<'a> {
     pub(super) agents: Vec<&'a Agent<'a>>,
-    /// What was dropped and what was miscounted for it, by the last checkpoint.
+    /// Dropped frames and the differences of counts that they explain, by the last checkpoint.
     pub(super) excused: Vec<(f64, Tally, Vec<f64>)>,
     pub(super) since: Instant,
     pub(super) wrong: Vec<String>,
@@ -32,7 +32,7 @@ impl<'a> Views<'a> {
                 if crowd.is_grey() && !is_late {
                     continue;
                 }
-                // The crowd stays alive while the agent is asked.
+                // The crowd stays alive while the agent answers.
                 let (host, before) = (self.agents[index].host, crowd.graph());
                 let answer = std::thread::scope(|scope| -> Result<Answer> {
                     let asked = scope.spawn(|| Answer::of(host));
@@ -44,7 +44,8 @@ impl<'a> Views<'a> {
                 if crowd.graph() != before && !is_late {
                     continue;
                 }
-                // What the kernel had no room for nobody can know: it is said again, and counts differ.
+                // The content of dropped frames is unknown: endpoints are announced again, and
+                // counts differ.
                 let blind = dropped(&answer.page) > self.excused[index].0;
                 let difference = self.difference(index, crowd, &answer, blind || is_late);
                 let Some(difference) = difference else { break };
@@ -162,7 +163,7 @@ impl Answer {
     }
 }
 
-/// Everybody that the agent shows.
+/// Returns all participants and endpoints that the agent shows.
 pub(super) fn graph_of(host: &Namespace) -> Result<Graph> {
     let ask = |path: &str| -> Result<Value> {
         Ok(serde_json::from_str(&get(host, &format!("{API}{path}"))?)?)

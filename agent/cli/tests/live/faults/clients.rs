@@ -19,7 +19,7 @@ use ros2probe_testing::harness::network::Namespace;
 /// Neither takes longer to answer or to be refused.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Where the agent is reached, and with what.
+/// The agent's addresses, and the token.
 #[derive(Clone)]
 pub(super) struct Doors {
     network: PathBuf,
@@ -34,7 +34,7 @@ pub(super) struct Clients {
     threads: Vec<(JoinHandle<()>, Arc<AtomicU64>, &'static str)>,
 }
 
-/// Asks again and again, and keeps for how long an answer took.
+/// Sends requests repeatedly, and keeps the longest time until an answer.
 pub(super) struct Asker {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Answers>,
@@ -45,7 +45,7 @@ pub(super) struct Asker {
 pub(super) struct Answers {
     pub(super) count: u64,
     pub(super) longest: Duration,
-    /// What was answered otherwise than with 200.
+    /// Answers with another status than 200.
     pub(super) refused: Vec<String>,
 }
 
@@ -125,7 +125,7 @@ impl Clients {
         let counter = Arc::clone(&count);
         let thread = std::thread::spawn(move || {
             while !stop.load(Ordering::Relaxed) {
-                // Being refused, or cut off, ends none of them.
+                // A refused or closed connection ends no client.
                 if act(&doors).is_ok() {
                     counter.fetch_add(1, Ordering::Relaxed);
                 }
@@ -137,7 +137,7 @@ impl Clients {
 }
 
 impl Asker {
-    /// Sends `request` on a connection of its own each time, as often as `period` says.
+    /// Sends `request` once per `period`, each time on a new connection.
     pub(super) fn start(
         what: &'static str,
         period: Duration,

@@ -1,6 +1,8 @@
 //! No file descriptors left.
 
 use std::fs;
+use std::net::TcpStream;
+use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Result, ensure};
@@ -12,7 +14,7 @@ use ros2probe_testing::harness::soak::{long, outcome};
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::{run, wait_until};
 
-/// How many clients hold on to a connection that they do not use.
+/// Number of clients that keep an unused connection open.
 const CLIENTS: usize = 24;
 
 #[test]
@@ -35,11 +37,6 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     scene.node_is_known("/before")?;
     let mut metrics = scene.connect(METRICS_PORT)?;
     let mut api = scene.connect(API_PORT)?;
-    let page = |metrics: &mut _| -> Result<Scrape> {
-        Ok(Scrape(request(metrics, "GET", "/metrics", "")?.1))
-    };
-    let writes =
-        |page: &Scrape, outcome| page.sum("ros2probe_state_writes_total", &[("outcome", outcome)]);
     page(&mut metrics)?;
     ask(&mut api, "GET", "/health", "")?;
 
@@ -56,13 +53,7 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     let cpu = Usage::of(pid)?.since(&before).cpu;
     ensure!(cpu < span / 4, "{cpu:?} of CPU in {span:?}: it spins");
     counted.talk(320, 300)?;
-    let (status, refused) = ask(&mut api, "POST", "/recordings", r#"{"name": "none"}"#)?;
-    let detail = refused["detail"].as_str().unwrap_or_default().to_owned();
-    ensure!(
-        status == 507 && detail.contains("(os error 24)"),
-        "{status} {refused}"
-    );
-    ensure!(!bags.join("none").exists(), "an empty bag is left");
+    let detail = a_recording_is_refused(&mut api, &bags)?;
     let mut late = Counted::start(&link, 2, "meanwhile")?;
     wait_until("a state write that fails", || {
         Ok(writes(&page(&mut metrics)?, "failed") >= 1.0)
@@ -75,7 +66,7 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     })?;
     counted.check_page(&page(&mut metrics)?)?;
 
-    // They go, and the limit is what it was.
+    // The clients leave, and the limit is restored.
     drop(clients);
     run(&format!("prlimit --pid {pid} --nofile=1024:4096"))?;
     let written = writes(&page(&mut metrics)?, "written");
@@ -85,14 +76,7 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     })?;
     let text = fs::read_to_string(state.join("discovery.json"))?;
     ensure!(text.contains("/meanwhile"), "{text}");
-    let (status, begun) = scene.ask("POST", "/recordings", r#"{"name": "some"}"#)?;
-    ensure!(status == 201, "{status} {begun}");
-    late.talk(320, 50)?;
-    let (status, ended) = scene.ask("DELETE", "/recordings/some", "")?;
-    ensure!(
-        status == 200 && ended["report"]["messages"] == 50,
-        "{status} {ended}"
-    );
+    a_recording_works(&scene, &mut late)?;
     counted.check(&scene.agent)?;
     let took = scene.end()?;
     outcome(
@@ -102,4 +86,38 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
              writes fail and are counted; both work again with the limit; ended in {took:?}"
         ),
     )
+}
+
+/// Reads the metrics on a connection that is already open.
+fn page(metrics: &mut TcpStream) -> Result<Scrape> {
+    Ok(Scrape(request(metrics, "GET", "/metrics", "")?.1))
+}
+
+fn writes(page: &Scrape, outcome: &str) -> f64 {
+    page.sum("ros2probe_state_writes_total", &[("outcome", outcome)])
+}
+
+/// Returns the detail of the answer, which names the error.
+fn a_recording_is_refused(api: &mut TcpStream, bags: &Path) -> Result<String> {
+    let (status, refused) = ask(api, "POST", "/recordings", r#"{"name": "none"}"#)?;
+    let detail = refused["detail"].as_str().unwrap_or_default().to_owned();
+    ensure!(
+        status == 507 && detail.contains("(os error 24)"),
+        "{status} {refused}"
+    );
+    ensure!(!bags.join("none").exists(), "an empty bag is left");
+    Ok(detail)
+}
+
+/// A recording of 50 messages has all of them.
+fn a_recording_works(scene: &Scene<'_>, late: &mut Counted) -> Result<()> {
+    let (status, begun) = scene.ask("POST", "/recordings", r#"{"name": "some"}"#)?;
+    ensure!(status == 201, "{status} {begun}");
+    late.talk(320, 50)?;
+    let (status, ended) = scene.ask("DELETE", "/recordings/some", "")?;
+    ensure!(
+        status == 200 && ended["report"]["messages"] == 50,
+        "{status} {ended}"
+    );
+    Ok(())
 }

@@ -44,7 +44,7 @@ impl Disk<'_, '_> {
         Ok(())
     }
 
-    /// What is in a directory, `state` or `bags`.
+    /// Returns the files of a directory, `state` or `bags`.
     fn names(&self, directory: &str) -> Vec<String> {
         let entries = fs::read_dir(self.root.join(directory));
         let entries = entries.into_iter().flatten().flatten();
@@ -54,7 +54,7 @@ impl Disk<'_, '_> {
         names
     }
 
-    /// What the next agent would read: whole, and with these nodes.
+    /// Checks that the saved state is whole and has these nodes.
     fn state(&self, nodes: &[&str]) -> Result<()> {
         let text = fs::read_to_string(self.root.join("state/discovery.json"))?;
         serde_json::from_str::<Value>(&text).context("half a state")?;
@@ -159,7 +159,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     let kept = cut["report"]["messages"].as_u64().context("no count")?;
     ensure!(kept >= 100, "{cut}");
     readable(&disk.root.join("bags/cut"), kept)?;
-    // What it gave back is taken again.
+    // The freed space is used again.
     disk.fill()?;
     disk.refuses("no space left")?;
     let failed = disk.writes("failed")?;

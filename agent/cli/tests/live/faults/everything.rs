@@ -1,10 +1,11 @@
-//! Everything that is tried apart elsewhere, at once, in what the unit allows of memory and CPU:
-//! forged announcements of every kind, full tables, recordings, and clients that mean harm.
+//! All loads of the other tests at once, within the unit's memory and CPU: forged announcements of
+//! every kind, full tables, recordings, and hostile clients.
 
 use std::fs;
 use std::io::Write as _;
 use std::net::UdpSocket;
 use std::os::unix::net::UnixStream;
+use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
@@ -51,17 +52,8 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let group = Confined::to(&allowance)?;
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    let home = directory.path().display();
     let socket = directory.path().join("api.sock");
-    fs::create_dir(directory.path().join("state"))?;
-    fs::write(directory.path().join("token"), TOKEN)?;
-    let configuration = format!(
-        "watch: [/real, /cloud, {{topic: /**, per_subscriber: true}}]\nlog: warn\n\
-         state_directory: {home}/state\n\
-         recordings: {{directory: {home}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
-         api: {{listen: '0.0.0.0:17401', token_file: {home}/token, socket: {home}/api.sock}}\n{}",
-        capture(&link)
-    );
+    let configuration = configuration(directory.path(), &capture(&link))?;
     let enter = group.enter();
     let words = ["sh", "-c", &enter];
     let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
@@ -71,7 +63,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     scene.node_is_known("/driver")?;
     scene.node_is_known("/camera")?;
     let silent = recordings_and_silent_readers(&doors)?;
-    // What no socket waits for, the hook at the sockets does not see. It is never read.
+    // The socket hook sees datagrams only if a socket receives them. The test never reads it.
     let _sink = link.robot.hold(|| sink(&link.robot))??;
 
     let (before, throttled) = (Usage::of(scene.pid())?, group.throttled()?);
@@ -131,16 +123,30 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     )
 }
 
+/// Makes the state directory and the token of a configuration with every kind of client, and returns
+/// its text.
+fn configuration(directory: &Path, capture: &str) -> Result<String> {
+    fs::create_dir(directory.join("state"))?;
+    fs::write(directory.join("token"), TOKEN)?;
+    let home = directory.display();
+    Ok(format!(
+        "watch: [/real, /cloud, {{topic: /**, per_subscriber: true}}]\nlog: warn\n\
+         state_directory: {home}/state\n\
+         recordings: {{directory: {home}/bags, reserve_percent: 0, reserve_bytes: 0}}\n\
+         api: {{listen: '0.0.0.0:17401', token_file: {home}/token, socket: {home}/api.sock}}\n{capture}"
+    ))
+}
+
 /// The highest values of a span.
 struct Highest {
     /// Bytes that the group needed.
     peak: u64,
-    /// How much of these tables was used, of 1.
+    /// Used share of these tables, of 1.
     participants: f64,
     endpoints: f64,
 }
 
-/// Looks until all is sent, and once more.
+/// Reads the values until everything is sent, and once more.
 fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> Result<Highest> {
     let began = Instant::now();
     let mut peak = 0;
@@ -182,13 +188,14 @@ fn recordings_and_silent_readers(doors: &Doors) -> Result<Vec<std::net::TcpStrea
     Ok(silent)
 }
 
-/// How often each was answered and how long it took at most; none was refused or waited too long.
+/// Returns the number of answers of each client and its longest wait. Fails if an answer was refused
+/// or late.
 fn answers(askers: Vec<Asker>) -> Result<Vec<String>> {
     let mut answered = Vec::new();
     for asker in askers {
         let (what, answers) = asker.end()?;
         let refused = answers.refused.join("; ");
-        // An unoptimized agent may fall behind, and says so.
+        // An unoptimized agent may fall behind, and reports it.
         let may_refuse = long().is_none() && what == "/readyz";
         ensure!(
             (refused.is_empty() || may_refuse) && answers.count > 0,
@@ -228,7 +235,7 @@ fn storms(link: &Link) -> Result<[Storm; 4]> {
     ])
 }
 
-/// Patient, unlike a scraper.
+/// Reads the metrics without a scraper's timeout.
 fn page(doors: &Doors) -> Result<Scrape> {
     let head = "GET /metrics HTTP/1.1\r\nHost: localhost:17400";
     let answer = answer(doors.metrics()?, head)?;
@@ -236,14 +243,14 @@ fn page(doors: &Doors) -> Result<Scrape> {
     Ok(Scrape(answer))
 }
 
-/// How much of a table is used, of 1.
+/// Returns the used share of a table, of 1.
 fn filled(page: &Scrape, table: &str) -> f64 {
     let label = [("table", table)];
     page.sum("ros2probe_table_entries", &label) / page.sum("ros2probe_table_limit", &label)
 }
 
-/// Ends a recording: the messages of real topics in it. Each other one that was sent is counted with
-/// the reason, but for those that the agent counts as dropped before it could tell whose they are.
+/// Ends a recording, and returns its number of messages of real topics. The report counts each other
+/// sent message with the reason, except those dropped before the agent knew their topic.
 fn accounted(doors: &Doors, name: &str, real: &Real, is_all: bool) -> Result<u64> {
     let path = format!("/recordings/{name}");
     let (status, ended) = on_the_socket(doors, "DELETE", &path, "")?;
@@ -315,7 +322,7 @@ impl Real {
             .try_for_each(|(publisher, _)| publisher.wait_sent(SENT))
     }
 
-    /// By the publishers' own logs.
+    /// Returns the counts of the publishers' own logs.
     fn sent(&self) -> Result<Vec<(&'static str, u64)>> {
         let sent = self.publishers.iter().map(|(publisher, topic)| {
             let numbers = publisher.log()?.writer_numbers("pub")?;
@@ -324,7 +331,7 @@ impl Real {
         sent.collect()
     }
 
-    /// A page with all that is counted of them.
+    /// Returns a page with the final counts of each stream.
     fn settled(&self, scene: &Scene<'_>) -> Result<Scrape> {
         let mut page = None;
         for (topic, sent) in self.sent()? {
@@ -333,8 +340,8 @@ impl Real {
         page.context("no streams")
     }
 
-    /// Fails unless each message was counted, or the agent counts what it could not take; no loss is
-    /// one of the robot's.
+    /// Fails unless each message is counted or dropped by the agent with a count. The robot itself
+    /// loses no message.
     fn check(&self, page: &Scrape) -> Result<String> {
         let dropped = dropped(page);
         let mut said = Vec::new();
@@ -350,14 +357,14 @@ impl Real {
             );
             said.push(format!("{counted} of {sent} messages of {topic}"));
         }
-        let told = page.sum(
+        let events = page.sum(
             "ros2probe_events_total",
             &[("name", "ros2probe.capture.dropped")],
         );
         let datagrams = page.sum("ros2probe_dropped_datagrams_total", &[]);
         ensure!(
-            (told > 0.0) == (dropped + datagrams > 0.0),
-            "{dropped} records or frames and {datagrams} datagrams dropped, {told} events"
+            (events > 0.0) == (dropped + datagrams > 0.0),
+            "{dropped} records or frames and {datagrams} datagrams dropped, {events} events"
         );
         Ok(format!(
             "{} counted, {dropped} records or frames dropped",
@@ -366,8 +373,8 @@ impl Real {
     }
 }
 
-/// Those who mean no harm: a scraper, a service manager that asks whether it is ready, a client with
-/// the token and one on the socket.
+/// Starts the well-behaved clients: a scraper, a service manager that reads the readiness, a client
+/// with the token, and one on the socket.
 fn askers(doors: &Doors) -> Vec<Asker> {
     let period = Duration::from_millis(500);
     let scrape = |path: &'static str| {
@@ -395,14 +402,14 @@ fn askers(doors: &Doors) -> Vec<Asker> {
     ]
 }
 
-/// Asks on the unix socket.
+/// Sends a request on the Unix socket, and returns the status and the answer.
 fn on_the_socket(doors: &Doors, method: &str, path: &str, body: &str) -> Result<(u16, Value)> {
     let stream = UnixStream::connect(&doors.socket)?;
     stream.set_read_timeout(Some(Duration::from_secs(20)))?;
     ask(&mut { stream }, method, path, body)
 }
 
-/// Where the storm arrives.
+/// Binds the socket that receives the storm.
 fn sink(host: &Namespace) -> Result<UdpSocket> {
     let address = (host.address(), NOBODY);
     Ok(netns::within(&path(host), || UdpSocket::bind(address))??)

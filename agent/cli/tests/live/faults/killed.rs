@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -26,7 +26,7 @@ use ros2probe_testing::harness::wait_until;
 /// Repeats what another run did.
 const SEED: &str = "ROS2PROBE_SOAK_SEED";
 
-/// What the agent is doing when it is killed.
+/// The agent's activity when it is killed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum CaptureTime {
     Starting,
@@ -51,7 +51,7 @@ impl CaptureTime {
         CaptureTime::Watching,
     ];
 
-    /// How long that lasts.
+    /// Returns how long this activity lasts.
     const fn span(self, start: Duration) -> Duration {
         match self {
             CaptureTime::Starting => start,
@@ -65,7 +65,7 @@ impl CaptureTime {
     }
 }
 
-/// A robot that goes on, whoever looks at it: a node with a stream, and others that come.
+/// A robot that runs through all kills: a node with a stream, and others that join.
 struct Robot {
     stop: Arc<AtomicBool>,
     thread: JoinHandle<Result<()>>,
@@ -82,7 +82,7 @@ impl Robot {
             while !stopped.load(Ordering::Relaxed) {
                 counted.talk(320, 20)?;
                 if round % 20 == 0 {
-                    // Its SPDP; the rest is said once.
+                    // SPDP only: endpoints are announced once.
                     sender.carry(&counted.talker.participant())?;
                     // So that there is always something to keep.
                     let passer_by = Talker::new(1000 + round % 400, "/passing");
@@ -110,6 +110,42 @@ struct Places {
     runtime: PathBuf,
 }
 
+impl Places {
+    fn below(directory: &Path) -> Result<Places> {
+        let place = |name: &str| directory.join(name);
+        let places = Places {
+            configuration: place("ros2probe.yaml"),
+            state: place("state"),
+            bags: place("bags"),
+            runtime: place("run"),
+        };
+        for made in [&places.state, &places.runtime] {
+            fs::create_dir(made)?;
+        }
+        Ok(places)
+    }
+
+    /// A configuration with everything that attaches to the kernel or writes to the disk.
+    fn configuration_text(&self, link: &Link) -> String {
+        format!(
+            "capture: {{source: host, cgroup: {}, mirror_interfaces: [eth0], shm: {{exact: uprobe}}}}\n\
+             watch: [/**]\nlog: warn\nstate_directory: {}\napi: {{socket: {}/api.sock}}\nrecordings:\n  \
+             directory: {}\n  reserve_percent: 0\n  reserve_bytes: 0\n  snapshots: [{{name: incident, topics: [/counted_1], seconds: 2}}]\n",
+            link.robot.cgroup().display(),
+            self.state.display(),
+            self.runtime.display(),
+            self.bags.display()
+        )
+    }
+
+    /// Returns the number of bags without metadata: a kill interrupted their begin or end.
+    fn bags_without_metadata(&self) -> usize {
+        let bags = fs::read_dir(&self.bags).into_iter().flatten().flatten();
+        bags.filter(|bag| !bag.path().join("metadata.yaml").exists())
+            .count()
+    }
+}
+
 #[test]
 fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     let seed = std::env::var(SEED).ok().and_then(|text| text.parse().ok());
@@ -123,26 +159,9 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     let mut dice = Dice::new(seed);
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    let place = |name: &str| directory.path().join(name);
-    let places = Places {
-        configuration: place("ros2probe.yaml"),
-        state: place("state"),
-        bags: place("bags"),
-        runtime: place("run"),
-    };
-    for made in [&places.state, &places.runtime] {
-        fs::create_dir(made)?;
-    }
-    let configuration = format!(
-        "capture: {{source: host, cgroup: {}, mirror_interfaces: [eth0], shm: {{exact: uprobe}}}}\n\
-         watch: [/**]\nlog: warn\nstate_directory: {}\napi: {{socket: {}/api.sock}}\nrecordings:\n  \
-         directory: {}\n  reserve_percent: 0\n  reserve_bytes: 0\n  snapshots: [{{name: incident, topics: [/counted_1], seconds: 2}}]\n",
-        link.robot.cgroup().display(),
-        places.state.display(),
-        places.runtime.display(),
-        places.bags.display()
-    );
-    // The first one knows the robot, and how long a start takes.
+    let places = Places::below(directory.path())?;
+    let configuration = places.configuration_text(&link);
+    // The first agent saves the robot's names, and measures a start.
     let began = Instant::now();
     let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
     let start = began.elapsed();
@@ -181,15 +200,10 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
         );
     }
 
-    // The last one is whole, and ends in order.
+    // The last agent starts with the names, and ends on request.
     let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
     scene.node_is_known("/robot")?;
-    let mut broken = 0;
-    let bags = fs::read_dir(&places.bags).into_iter().flatten().flatten();
-    for bag in bags.map(|bag| bag.path()) {
-        // One that was killed while it made a bag has no metadata yet.
-        broken += usize::from(!bag.join("metadata.yaml").exists());
-    }
+    let broken = places.bags_without_metadata();
     scene.end()?;
     robot.end()?;
     ensure!(names(&places.runtime) == ["api.sock.lock"]);
@@ -206,8 +220,8 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     )
 }
 
-/// Lives until the moment has come, is killed, and leaves nothing in the kernel: how many objects it
-/// had there, and how long its start took.
+/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all gone
+/// by then, and the time that its start took.
 fn until(
     link: &Link,
     places: &Places,
@@ -226,7 +240,7 @@ fn until(
     let mut agent = Agent { process, host };
     agent.wait_ready(PATIENCE)?;
     let ready = began.elapsed();
-    // Known at once, from before.
+    // Names come from the saved state at once.
     let page = agent.scrape()?;
     let nodes = page.labels_of("ros2_node_info", "ros_node");
     ensure!(nodes.contains("/robot"), "names are lost: {nodes:?}");
@@ -255,10 +269,10 @@ fn until(
     Ok((kill(agent.process, link)?, Some(ready)))
 }
 
-/// Kills it, and waits until the kernel has nothing of it any more.
+/// Kills the process, and waits until the kernel has none of its objects.
 fn kill(mut process: Process, link: &Link) -> Result<usize> {
     let pid = process.pid();
-    // It stands still, so that what it holds is what it is killed with.
+    // A stopped process cannot create further objects before its end.
     process.signal("STOP")?;
     let stood = || -> Result<bool> {
         let status = fs::read_to_string(format!("/proc/{pid}/status"))?;
@@ -297,7 +311,7 @@ fn kill(mut process: Process, link: &Link) -> Result<usize> {
     Ok(objects.len())
 }
 
-/// What lies on the disk may be read by the next agent, and does not grow.
+/// Checks that the next agent can read the files, and that their number does not grow.
 fn clean(places: &Places) -> Result<()> {
     let text = fs::read_to_string(places.state.join("discovery.json"))?;
     serde_json::from_str::<Value>(&text).context("half a state")?;
@@ -319,7 +333,7 @@ fn clean(places: &Places) -> Result<()> {
     Ok(())
 }
 
-fn names(directory: &std::path::Path) -> Vec<String> {
+fn names(directory: &Path) -> Vec<String> {
     let entries = fs::read_dir(directory).into_iter().flatten().flatten();
     let names = entries.map(|entry| entry.file_name().to_string_lossy().into_owned());
     let mut names: Vec<_> = names.collect();

@@ -21,7 +21,7 @@ fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
     let mut counted = Counted::start(&link, 1, "talker")?;
     counted.talk(320, 100)?;
 
-    // An operator's loop that reloads what is wrong: each time it says so in many lines.
+    // A loop that reloads a wrong configuration: each reload logs many lines.
     let mistakes: String = (0..200).map(|key| format!("mistake_{key}: 1\n")).collect();
     let file = directory.path().join("ros2probe.yaml");
     std::fs::write(&file, format!("{right}{mistakes}"))?;
@@ -42,7 +42,7 @@ fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
     std::fs::write(&file, &right)?;
     let mut piece = vec![0; 1 << 16];
     let mut text = String::new();
-    // Somebody reads again: what was lost is told where it is missing.
+    // The pipe is read again: the log reports lost lines where they are missing.
     while !text.contains(" lines of the log were lost here\n") {
         scene.agent.process.signal("HUP")?;
         scene

@@ -14,14 +14,14 @@ use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::{long, outcome};
 
-/// What nobody on the robot listens to.
+/// A port without a socket on the robot.
 pub(super) const NOBODY: u16 = 7399;
 
 /// Leaves other tests some of the machine.
 pub(super) struct Breathing {
     sender: Sender,
     carried: u32,
-    /// How many between two rests.
+    /// Number of messages between two pauses.
     pace: u32,
     rest: Duration,
 }
@@ -79,7 +79,8 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     ensure!(peak < limit, "{peak} bytes with what sockets take");
     let took = scene.end()?;
 
-    // What was kept of it kills the next one neither at its start nor later.
+    // The saved state does not exhaust the memory of the next agent, neither at its start nor
+    // later.
     let state = fs::metadata(directory.path().join("state/discovery.json"))?.len();
     let scene = Scene::start(&link.robot, &directory, &configuration, &words)?;
     let restarted = group.needed()?;
@@ -114,7 +115,7 @@ fn storm(
     span: Duration,
     filled: f64,
 ) -> Result<(u64, u64)> {
-    // Whoever wants all messages and does not read them.
+    // Clients that request all messages and never read them.
     let mut readers = Vec::new();
     for _ in 0..12 {
         let mut stream = scene.connect(API_PORT)?;

@@ -19,13 +19,13 @@ use ros2probe_testing::harness::soak::{long, outcome};
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::wait_until;
 
-/// What all of it together may add to the agent's memory.
+/// Most bytes that all of them together may add to the agent's memory.
 const GROWTH: u64 = 24 << 20;
 /// Fewer than the listeners take.
 const SLOW: usize = 20;
 /// More than they take; the kernel's queue has room for the others.
 const CROWD: usize = 140;
-/// What they take, and some that the agent opens for itself.
+/// Their descriptors, and some of the agent's own.
 const PLACES: usize = 32 + 64 + 8;
 
 /// Listens where the agent exports to, and does what no receiver should.
@@ -166,7 +166,7 @@ fn a_crowd_of_scrapers_and_clients_is_bounded_and_goes_again() -> Result<()> {
             (API_PORT, "GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n"),
         ] {
             let mut stream = scene.connect(port)?;
-            // One that finds no place may be told so and closed.
+            // The agent may answer and close a connection beyond its limit.
             let _ = stream.write_all(request.as_bytes());
             crowd.push(stream);
         }

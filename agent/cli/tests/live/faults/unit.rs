@@ -1,4 +1,4 @@
-//! What the unit allows the agent, and control groups that hold a process to it.
+//! The unit's limits for the agent, and control groups that enforce them on a process.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -111,14 +111,14 @@ impl Confined {
         Ok(group)
     }
 
-    /// What a shell does to run the words behind it inside.
+    /// Returns a shell command that enters the group and runs its arguments there.
     pub(super) fn enter(&self) -> String {
         let groups = self.groups();
         let enter = groups.map(|path| format!("echo 0 >{}/cgroup.procs && ", path.display()));
         enter.chain(["exec \"$0\" \"$@\"".to_owned()]).collect()
     }
 
-    /// What cannot be taken back: neither the page cache nor what is mapped from files.
+    /// Returns the bytes that cannot be reclaimed: all but the page cache and mapped files.
     pub(super) fn needed(&self) -> Result<u64> {
         let number = |file: &str| -> Result<u64> { Ok(read(&self.memory, file)?.trim().parse()?) };
         if self.is_second {
@@ -172,7 +172,7 @@ pub(super) fn mebibytes(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 20)
 }
 
-/// Where control groups of this kind are mounted with this controller.
+/// Returns the mount point of control groups with this controller.
 fn mount(kind: &str, controller: &str) -> Result<Option<PathBuf>> {
     let mounts = fs::read_to_string("/proc/self/mounts")?;
     let path = mounts.lines().find_map(|line| {

@@ -1,4 +1,4 @@
-//! One stretch of a stream as one subscriber met it, and what the agent says of it.
+//! One stretch of a stream at one subscriber, and the losses that the agent reports for it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -17,7 +17,7 @@ pub(crate) struct Cell {
     pub(crate) reported: BTreeMap<u64, LossCause>,
     /// Causes that the trouble can have had.
     pub(crate) possible: BTreeSet<LossCause>,
-    /// Whether the trouble cannot fail to cost samples.
+    /// Whether the trouble is certain to drop samples.
     pub(crate) must_lose: bool,
 }
 

@@ -23,18 +23,19 @@ use ros2probe_testing::harness::witness::Witness;
 const PATIENCE: Duration = Duration::from_secs(90);
 /// Ports of the first participants of domain 0 that carry no samples.
 pub(crate) const DISCOVERY: &str = "7400, 7410, 7412, 7414, 7416";
-/// RustDDS sends 2125 datagrams a sample, to its own socket too: on a busy machine none has room.
+/// RustDDS sends 2125 datagrams a sample, to its own socket too: a smaller ring overflows on a busy
+/// machine.
 const RECORD_RING: u32 = 16 << 20;
 /// Gaps of best-effort streams are settled sooner.
 const SETTLED: Duration = Duration::from_secs(60);
-/// RustDDS sends somewhat later than it says, and announcements never cease.
+/// RustDDS sends somewhat later than it logs, and announcements never cease.
 const QUIET: Duration = Duration::from_millis(400);
 const PAUSE: Duration = Duration::from_millis(20);
 const ANNOUNCEMENTS: u64 = 10;
-/// How long the kernel of the subscribers' host waits for IP fragments, and somewhat more.
+/// The kernel's timeout for IP fragments on the subscribers' host, with a margin.
 const REASSEMBLY: Duration = Duration::from_millis(1500);
 
-/// What is wrong during one stretch of a stream.
+/// The fault during one stretch of a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Trouble {
     Nothing,
@@ -63,7 +64,7 @@ pub(crate) struct Experiment {
     pub(crate) troubles: Vec<Trouble>,
 }
 
-/// What was true while a trouble lasted.
+/// One stretch with its trouble, as it was observed.
 struct Span {
     trouble: Trouble,
     overflown: bool,
@@ -115,7 +116,7 @@ impl Size {
         }
     }
 
-    /// How long a subscriber stands still, and runs.
+    /// Returns for how long a subscriber is stopped, and then runs.
     const fn stop(self) -> (Duration, Duration) {
         match self {
             Size::B320 => (Duration::from_millis(800), Duration::from_millis(300)),
@@ -125,7 +126,7 @@ impl Size {
 }
 
 impl Trouble {
-    /// Whether it is in the way of this one of so many subscribers.
+    /// Returns whether it affects this one of so many subscribers.
     fn strikes(self, subscriber: usize, subscribers: usize) -> bool {
         match self {
             Trouble::Nothing => false,
@@ -180,25 +181,8 @@ impl Experiment {
             sent.numbers.len() as u64 == self.samples(),
             "not all was sent"
         );
-        // The sums first, while the peers are there; the lists settle once they have gone.
-        let mut doubts = Vec::new();
-        for truth in &received {
-            let missing = truth.missing(&sent.numbers).len() as u64;
-            let logged = (truth.numbers.len() as u64, missing);
-            let told = |seen: &Snapshot| {
-                let sums = sums(seen, &sent.guid, &truth.guid);
-                (sums.messages, sums.lost())
-            };
-            let agrees = |seen: &Snapshot| (told(seen) == logged).then_some(());
-            let agreed = witness.wait_for("what the log says", SETTLED, agrees);
-            let seen = witness.latest().context("no snapshot")?;
-            if agreed.is_err() {
-                doubts.push(format!(
-                    "received and lost {:?}, not {logged:?}",
-                    told(&seen)
-                ));
-            }
-        }
+        // The sums settle while the peers run, the lists once they have ended.
+        let doubts = sums_that_differ(&mut witness, &sent, &received)?;
         let seen = witness.latest().context("no snapshot")?;
         let topic = self.size.stream().topic;
         let page = agent.as_ref().map(|agent| agent.settled_scrape(&topic, 0));
@@ -218,26 +202,7 @@ impl Experiment {
             }
             let missing = truth.missing(&sent.numbers);
             for (span, due) in spans.iter().zip(1..) {
-                let numbers = (due - 1) * self.size.samples() + 1..=due * self.size.samples();
-                let trouble = span.trouble;
-                let strikes = trouble.strikes(subscriber, self.subscribers);
-                let mut possible = BTreeSet::new();
-                possible.extend(strikes.then_some(trouble.cause()));
-                possible.extend(span.overflown.then_some(LossCause::SocketBuffer));
-                cells.push(Cell {
-                    name: format!(
-                        "{:?} {:?} {trouble:?} subscriber {subscriber}",
-                        self.stack, self.size
-                    ),
-                    sent: numbers.clone().collect(),
-                    lost: missing.range(numbers.clone()).copied().collect(),
-                    reported: losses
-                        .range(numbers.clone())
-                        .map(|(at, why)| (*at, *why))
-                        .collect(),
-                    possible,
-                    must_lose: strikes,
-                });
+                cells.push(self.cell(subscriber, (span, due), &missing, &losses));
             }
             let beyond: Vec<_> = losses.range(self.samples() + 1..).collect();
             ensure!(beyond.is_empty(), "never sent: {beyond:?}");
@@ -249,7 +214,34 @@ impl Experiment {
         Ok(cells)
     }
 
-    /// The agent itself, whose page is to say the same, beside the witness.
+    /// The losses of a subscriber in the stretch that ends with `due` times the samples of one.
+    fn cell(
+        &self,
+        subscriber: usize,
+        (span, due): (&Span, u64),
+        missing: &BTreeSet<u64>,
+        losses: &BTreeMap<u64, LossCause>,
+    ) -> Cell {
+        let numbers = (due - 1) * self.size.samples() + 1..=due * self.size.samples();
+        let trouble = span.trouble;
+        let strikes = trouble.strikes(subscriber, self.subscribers);
+        let mut possible = BTreeSet::new();
+        possible.extend(strikes.then_some(trouble.cause()));
+        possible.extend(span.overflown.then_some(LossCause::SocketBuffer));
+        Cell {
+            name: format!(
+                "{:?} {:?} {trouble:?} subscriber {subscriber}",
+                self.stack, self.size
+            ),
+            sent: numbers.clone().collect(),
+            lost: missing.range(numbers.clone()).copied().collect(),
+            reported: losses.range(numbers).map(|(at, why)| (*at, *why)).collect(),
+            possible,
+            must_lose: strikes,
+        }
+    }
+
+    /// Starts the agent itself beside the witness; its page must show the same losses.
     fn agent<'a>(&self, link: &'a Link, directory: &Path) -> Result<Option<Agent<'a>>> {
         if self.subscribers < 2 {
             return Ok(None);
@@ -361,6 +353,33 @@ impl Experiment {
     }
 }
 
+/// Waits until the agent has counted what each subscriber logged, and returns where it differs.
+fn sums_that_differ(
+    witness: &mut Witness,
+    sent: &Truth,
+    received: &[Truth],
+) -> Result<Vec<String>> {
+    let mut doubts = Vec::new();
+    for truth in received {
+        let missing = truth.missing(&sent.numbers).len() as u64;
+        let logged = (truth.numbers.len() as u64, missing);
+        let counted = |seen: &Snapshot| {
+            let sums = sums(seen, &sent.guid, &truth.guid);
+            (sums.messages, sums.lost())
+        };
+        let agrees = |seen: &Snapshot| (counted(seen) == logged).then_some(());
+        let agreed = witness.wait_for("the counts of the log", SETTLED, agrees);
+        let seen = witness.latest().context("no snapshot")?;
+        if agreed.is_err() {
+            doubts.push(format!(
+                "received and lost {:?}, not {logged:?}",
+                counted(&seen)
+            ));
+        }
+    }
+    Ok(doubts)
+}
+
 struct Peers {
     publisher: Peer,
     subscribers: Vec<Peer>,
@@ -409,7 +428,7 @@ impl Peers {
     }
 }
 
-/// What a peer logged of its stream.
+/// A peer's log of its stream.
 pub(crate) struct Truth {
     pub(crate) guid: String,
     pub(crate) numbers: BTreeSet<u64>,
@@ -430,7 +449,7 @@ impl Truth {
         })
     }
 
-    /// The page of an agent says the same of this reader.
+    /// Checks that an agent's page has the same counts for this reader.
     fn ensure_on(&self, page: &Scrape, losses: &BTreeMap<u64, LossCause>) -> Result<()> {
         let prefix = self.guid.get(..24).context("a short GUID")?;
         let subscriber = format!("participant {prefix}.000001c1");
@@ -453,7 +472,7 @@ impl Truth {
         Ok(())
     }
 
-    /// What was sent after the first that came, and did not come.
+    /// Returns the numbers sent after the first one received that were not received.
     pub(crate) fn missing(&self, sent: &BTreeSet<u64>) -> BTreeSet<u64> {
         let first = self.numbers.first().copied().unwrap_or(u64::MAX);
         sent.range(first..)

@@ -1,5 +1,5 @@
-//! A reliable stream, seen only where it is received: what is lost on the link comes again, and
-//! what comes no more is known although nothing follows it.
+//! A reliable stream that the agent sees on the receiving host only: lost datagrams are sent again,
+//! and a tail without successors is still counted as lost.
 
 use std::time::Duration;
 
@@ -14,22 +14,22 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::witness::Witness;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Samples of which some are dropped, of seven seconds of them.
+/// Number of first samples of which some are dropped, in a stream of seven seconds.
 const WOUNDED: u64 = 100;
 const SAMPLES: u64 = 220;
-/// One in so many datagrams with samples is dropped.
+/// One of this many datagrams with samples is dropped.
 const NTH: u64 = 5;
 
-/// What the agent on the receiving side knew.
+/// What the agent on the receiving host counted.
 pub(crate) struct Repair {
     sent: Truth,
     received: Truth,
-    /// When everything had been repaired.
+    /// Sums after the repair.
     repaired: Delivered,
     dropped: u64,
-    /// When the tail was missing.
+    /// The reader's state while the tail is missing.
     waiting: AcknowledgementFacts,
-    /// Once the writer was gone.
+    /// Losses reported after the writer's end.
     lost: Vec<(u64, LossCause)>,
 }
 
@@ -40,42 +40,15 @@ impl Repair {
             "watch: [/**]\ncapture: {{source: host, cgroup: {}}}\n",
             link.monitor.cgroup().display()
         ))?;
-        let stream = Stream {
-            reliable: true,
-            depth: 1000,
-            rate: 30.0,
-            linger: 60.0,
-            ..Stream::small(SAMPLES)
-        };
-        let host = &link.monitor;
-        let mut subscriber = Peer::start(host, stack, Role::Subscriber, &stream, &["/listener"])?;
-        let host = &link.robot;
-        let mut publisher = Peer::start(host, stack, Role::Publisher, &stream, &["/talker"])?;
-        publisher.wait_matched()?;
-        subscriber.wait_matched()?;
-        witness.wait_for("the endpoints", PATIENCE, |seen| {
-            let mut topics = seen.topics.iter();
-            let topic = topics.find(|topic| topic.name == stream.topic)?;
-            let known = (topic.publishers.len(), topic.subscriptions.len());
-            (known == (1, 1)).then_some(())
-        })?;
-
-        publisher.go()?;
-        // RustDDS sends to a multicast address: whose socket that comes to is known a while later.
-        witness.wait_for("whom samples come to", PATIENCE, |seen| {
-            let mut deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
-            let known =
-                deliveries.any(|each| !each.readers.is_empty() && each.delivered.messages > 0);
-            known.then_some(())
-        })?;
-        // Also of those that go again, alone or several at once. A HEARTBEAT is shorter.
+        let (mut publisher, subscriber) = delivered_pair(&link, stack, &mut witness)?;
+        // Repaired samples match as well, alone or several at once. A HEARTBEAT is shorter.
         let samples = format!("udp length 380-65535 udp dport != {{ {DISCOVERY} }}");
         let loss = Loss::of_datagrams(&link.robot, &samples, NTH, Part::Whole)?;
         wait_until(|| Ok(publisher.log()?.sequences("pub").len() as u64 >= WOUNDED))?;
         let dropped = loss.counts()?.dropped;
         drop(loss);
-        // Fast DDS asks again within three seconds. Readers are given samples in order, so this one has
-        // all once it is given the latest.
+        // Fast DDS repeats its request within three seconds. A reader delivers samples in order, so it
+        // has all of them with the latest.
         wait_until(|| {
             let received = subscriber.log()?.sequences("sub").len();
             Ok(received + 2 > publisher.log()?.sequences("pub").len())
@@ -91,21 +64,21 @@ impl Repair {
             ..sent
         };
         let newest = *sent.numbers.last().context("nothing was sent")?;
-        // The HEARTBEAT that tells of the tail is seen some milliseconds before the ACKNACK it is
-        // answered with. Until that comes the last request stands, though all of that was received.
+        // The agent sees the HEARTBEAT for the tail some milliseconds before the ACKNACK that answers
+        // it. Until then the previous request stands, although the reader has received all of it.
         let waiting = witness.wait_for("what is missing", PATIENCE, |seen| {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
             let received = Truth::of(&subscriber, "sub").ok()?;
             let first = *received.missing(&sent.numbers).first()?;
-            let told = facts.acknowledged == first - 1 && facts.missing > 0;
-            (told && facts.acknowledged + facts.lag_samples == newest).then_some(facts)
+            let is_settled = facts.acknowledged == first - 1 && facts.missing > 0;
+            (is_settled && facts.acknowledged + facts.lag_samples == newest).then_some(facts)
         })?;
         let seen = witness.latest().context("no snapshot")?;
         let repaired = sums(&seen, &sent.guid, &reader);
         let received = Truth::of(&subscriber, "sub")?;
         publisher.process.signal("KILL")?;
         publisher.process.wait(PATIENCE)?;
-        // In its time: while the reader is there, what the writer said it has is awaited.
+        // The agent waits for announced samples as long as the reader exists.
         let testimony = witness.finish()?;
         testimony.ensure_complete()?;
         let lost = reported(
@@ -163,6 +136,38 @@ impl Repair {
         ensure!(*lost == expected, "{lost:?} are lost, not {missing:?}");
         Ok(())
     }
+}
+
+/// Starts a reliable stream, and waits until the agent knows which socket receives its samples.
+fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(Peer, Peer)> {
+    let stream = Stream {
+        reliable: true,
+        depth: 1000,
+        rate: 30.0,
+        linger: 60.0,
+        ..Stream::small(SAMPLES)
+    };
+    let host = &link.monitor;
+    let mut subscriber = Peer::start(host, stack, Role::Subscriber, &stream, &["/listener"])?;
+    let host = &link.robot;
+    let mut publisher = Peer::start(host, stack, Role::Publisher, &stream, &["/talker"])?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    witness.wait_for("the endpoints", PATIENCE, |seen| {
+        let mut topics = seen.topics.iter();
+        let topic = topics.find(|topic| topic.name == stream.topic)?;
+        let known = (topic.publishers.len(), topic.subscriptions.len());
+        (known == (1, 1)).then_some(())
+    })?;
+
+    publisher.go()?;
+    // RustDDS sends to a multicast address: the agent learns a while later which socket receives it.
+    witness.wait_for("the socket that receives samples", PATIENCE, |seen| {
+        let mut deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+        let known = deliveries.any(|each| !each.readers.is_empty() && each.delivered.messages > 0);
+        known.then_some(())
+    })?;
+    Ok((publisher, subscriber))
 }
 
 fn acknowledgement(seen: &Snapshot, writer: &str, reader: &str) -> Option<AcknowledgementFacts> {

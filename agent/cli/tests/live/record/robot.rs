@@ -82,7 +82,7 @@ impl<'a> Robot<'a> {
         Ok((publisher, subscriber))
     }
 
-    /// The status of an answer, and what it says.
+    /// Returns the status of an answer, and its body.
     pub(super) fn ask(&self, method: &str, path: &str, body: &Value) -> Result<(u16, Value)> {
         let text = self.curl(method, path, body)?;
         let (body, status) = text.rsplit_once('\n').context("no status")?;
@@ -178,7 +178,7 @@ pub(super) fn settled(
     Ok(page)
 }
 
-/// Where records of messages were lost, nobody knows of those.
+/// Returns whether no record was dropped: messages of dropped records are unknown.
 pub(super) fn is_exact(page: &Scrape) -> bool {
     let lost = page.sum("ros2probe_records_dropped_total", &[]);
     if lost > 0.0 {

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// What passes by shared memory is read in the process that sends it, whole.
+/// Messages in shared memory are read whole in the process that sends them.
 #[test]
 fn payloads_in_shared_memory_are_what_was_sent() -> Result<()> {
     let host = Host::new()?;
@@ -33,7 +33,7 @@ fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
     publisher.go()?;
     let (whole, missed) = given(&mut lines, &stream)?;
     println!("{whole} of {} whole, {missed} missed", stream.count);
-    // A machine that does other things, too, may look too late.
+    // A machine with other load may poll too late.
     ensure!(whole >= 6, "{whole} whole, {missed} missed");
     let topic = observed.topic("/points")?;
     ensure!(topic["passages"][0]["view"] == "close", "{topic}");
@@ -94,7 +94,8 @@ impl Host {
         })
     }
 
-    /// Breakpoints are in a file's pages, for all who map it: other tests' are not in this copy.
+    /// Breakpoints are in a file's pages, for all processes that map it: this copy has none of
+    /// other tests.
     fn with_its_own_fast_dds() -> Result<Self> {
         let mut host = Self::new()?;
         let library = Stack::Fast.library("libfastrtps.so")?;
@@ -114,8 +115,8 @@ impl Host {
         Observed::start(&self.network, &capture)
     }
 
-    /// As [`Self::pair`], until the agent knows their topic: it is said once in shared memory, and a
-    /// busy machine may look too late.
+    /// As [`Self::pair`], until the agent knows their topic: it is announced once in shared memory,
+    /// and a busy machine may poll too late.
     fn known_pair(&self, observed: &Observed<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
         for _ in 0..12 {
             let (mut publisher, mut subscriber) = self.pair(stream)?;
@@ -158,8 +159,8 @@ fn in_shared_memory(size: usize, count: u64) -> Stream {
     }
 }
 
-/// How many samples of a stream are given, each as it was sent, and how many are not, up to the last
-/// number or until nothing has come for a while.
+/// Returns how many samples of a stream arrived as they were sent, and how many are missing. Ends
+/// at the last number, or after a silence.
 fn given(lines: &mut Lines<'_>, stream: &Stream) -> Result<(u64, u64)> {
     let pattern: Vec<u8> = (8..stream.size).map(pattern).collect();
     let (mut whole, mut missed, mut last) = (0, 0, 0);

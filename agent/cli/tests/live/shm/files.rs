@@ -1,4 +1,4 @@
-//! What stands in the files of shared memory, and how they are opened.
+//! Content of the files in shared memory, and the system calls that open them.
 
 use super::*;
 
@@ -15,8 +15,42 @@ fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Res
     let (mut publisher, mut subscriber) = host.known_pair(&agent, &stream)?;
     let memory = host.shared_memory();
     let (ports, segments) = files_of(&memory)?;
-    let port = fs::read(memory.join(&ports[0]))?;
-    let number: u32 = ports[0].trim_start_matches("fastrtps_port").parse()?;
+    write_idle_and_broken_files(&memory, &ports[0])?;
+    publisher.go()?;
+    let open = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "port")]);
+    let idle = agent.scrape_until("128 more ports", |page| open(page) >= 130.0)?;
+    let began = messages(&idle);
+    agent.scrape_until("messages beside them", |page| {
+        messages(page) > began + 200.0
+    })?;
+    println!("{}", shared_memory_metrics(&agent.scrape()?));
+
+    replaced_and_removed_files_are_closed(&host, &agent, &ports, &segments[0])?;
+    // The peers cannot continue without their memory; the agent can.
+    for name in files_of(&memory)?.1 {
+        let file = fs::File::options().write(true).open(memory.join(name))?;
+        file.set_len(100)?;
+    }
+    std::thread::sleep(Duration::from_secs(1));
+    for peer in [&mut publisher, &mut subscriber] {
+        peer.process.signal("KILL")?;
+        peer.process.wait(PATIENCE)?;
+    }
+    host.remove_shared_memory()?;
+    wait_until("everything is let go", || {
+        Ok(host.files_open_in(&agent)?.is_empty())
+    })?;
+    a_new_pair_is_counted(&host, &agent, &stream)
+}
+
+fn messages(page: &Scrape) -> f64 {
+    page.sum("ros2_topic_messages_total", &[("topic", "/imu")])
+}
+
+/// Writes 128 ports that no process uses, copies of this one, and files that are no ports.
+fn write_idle_and_broken_files(memory: &Path, port_name: &str) -> Result<()> {
+    let port = fs::read(memory.join(port_name))?;
+    let number: u32 = port_name.trim_start_matches("fastrtps_port").parse()?;
     let at = port
         .windows(4)
         .position(|word| word == number.to_le_bytes())
@@ -38,22 +72,22 @@ fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Res
     ] {
         fs::write(memory.join(name), bytes)?;
     }
-    publisher.go()?;
-    let open = |page: &Scrape| page.sum("ros2probe_shm_open", &[("kind", "port")]);
-    let idle = agent.scrape_until("128 more ports", |page| open(page) >= 130.0)?;
-    let topic = [("topic", "/imu")];
-    let messages = |page: &Scrape| page.sum("ros2_topic_messages_total", &topic);
-    let began = messages(&idle);
-    agent.scrape_until("messages beside them", |page| {
-        messages(page) > began + 200.0
-    })?;
-    println!("{}", shared_memory_metrics(&agent.scrape()?));
+    Ok(())
+}
 
-    // A file of that name is somebody else's now, and the one that was open is let go.
+/// Replaces a segment by a file of another user, removes all ports but these, and waits until the
+/// agent has closed the deleted files.
+fn replaced_and_removed_files_are_closed(
+    host: &Host<'_>,
+    agent: &Agent<'_>,
+    ports: &[String],
+    segment: &str,
+) -> Result<()> {
+    let memory = host.shared_memory();
     let copy = memory.join("copy");
-    fs::write(&copy, fs::read(memory.join(&segments[0]))?)?;
+    fs::write(&copy, fs::read(memory.join(segment))?)?;
     std::os::unix::fs::chown(&copy, Some(65534), Some(65534))?;
-    fs::rename(&copy, memory.join(&segments[0]))?;
+    fs::rename(&copy, memory.join(segment))?;
     for name in files_of(&memory)?
         .0
         .iter()
@@ -63,27 +97,16 @@ fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Res
     }
     wait_until("what is gone is let go", || {
         Ok(host
-            .files_open_in(&agent)?
+            .files_open_in(agent)?
             .iter()
             .all(|name| !name.ends_with(" (deleted)")))
-    })?;
-    // The peers cannot go on without their memory; the agent can.
-    for name in files_of(&memory)?.1 {
-        let file = fs::File::options().write(true).open(memory.join(name))?;
-        file.set_len(100)?;
-    }
-    std::thread::sleep(Duration::from_secs(1));
-    for peer in [&mut publisher, &mut subscriber] {
-        peer.process.signal("KILL")?;
-        peer.process.wait(PATIENCE)?;
-    }
-    host.remove_shared_memory()?;
-    wait_until("everything is let go", || {
-        Ok(host.files_open_in(&agent)?.is_empty())
-    })?;
-    // Those that were killed are there until their leases end.
+    })
+}
+
+/// Tries several pairs: the killed participants stay in the graph until their leases end.
+fn a_new_pair_is_counted(host: &Host<'_>, agent: &Agent<'_>, stream: &Stream) -> Result<()> {
     for attempt in 1..=MEETINGS {
-        let (mut publisher, _subscriber) = host.pair(&stream)?;
+        let (mut publisher, _subscriber) = host.pair(stream)?;
         let before = messages(&agent.scrape()?);
         publisher.go()?;
         let deadline = Instant::now() + Duration::from_secs(5);
@@ -166,8 +189,8 @@ fn after_either_side_was_killed_everything_is_right_again_and_nothing_is_left_op
     Ok(())
 }
 
-/// Of killed processes the files stay, with what they sent last. An agent that starts then believes
-/// none of it.
+/// The files of killed processes stay, with their last messages. An agent that starts later counts
+/// none of them.
 #[test]
 fn files_of_killed_processes_make_no_node_and_no_unknown_writer() -> Result<()> {
     let network = Namespace::alone()?;
@@ -262,7 +285,7 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
             "fcntl" => line.contains("F_GETFD"),
             "pread64" | "inotify_add_watch" | "statx" | "fstat" | "newfstatat" | "getdents64"
             | "close" | "lseek" | "readlink" => true,
-            // What strace cut in two was looked at where it began.
+            // The second half of a call that strace cut in two; the first half is checked.
             _ => call.starts_with("<...") || call.trim().starts_with("<..."),
         };
         assert!(is_harmless, "{line}");

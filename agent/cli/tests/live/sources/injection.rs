@@ -71,12 +71,12 @@ impl Injection {
         Ok(Some(Self { datagrams, sockets }))
     }
 
-    /// How long it takes.
+    /// Returns the duration of the capture.
     pub(crate) fn duration(&self) -> Duration {
         self.datagrams.last().map_or(Duration::ZERO, |last| last.at)
     }
 
-    /// Sends all, so many times as fast as it was captured; tells how many.
+    /// Sends all packets, this many times as fast as captured. Returns their number.
     pub(crate) fn run(&self, speed: u32) -> Result<usize> {
         let began = Instant::now();
         let mut received = vec![0; usize::from(u16::MAX)];

@@ -1,5 +1,5 @@
-// Passes messages as Fast DDS does to its shared memory: to a function of the same name and
-// parameters, in one piece as 2.x does or, with -DLIST, in a list of buffers as 3.x does.
+// Passes messages as Fast DDS passes them to its shared memory: to a function of the same name and
+// parameters. 2.x passes one piece; 3.x, with -DLIST, a list of buffers.
 //
 // An input line has the lengths of the buffers, a colon, and the message in hexadecimal digits; or
 // `nowhere`, for a message at an unmapped address. Prints `handed` after each.

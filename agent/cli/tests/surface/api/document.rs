@@ -1,4 +1,4 @@
-//! The OpenAPI document: it says what the agent accepts and answers.
+//! The OpenAPI document: it describes what the agent accepts and answers.
 
 use super::*;
 
@@ -183,7 +183,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
     assert!(checked >= 30, "{checked}");
 }
 
-/// What is checked, the status at the bound, and the status beyond it.
+/// The checked value, the status at the bound, and the status beyond it.
 type Check<'a> = &'a mut dyn FnMut(&str, u16, u16);
 
 fn bounds_of_queries(agent: &LocalAgent, document: &Value, check: Check<'_>) {

@@ -105,7 +105,7 @@ fn a_client_does_not_overrule_the_configuration_and_reloads_do_not_undo_what_it_
     );
     assert_eq!(problem(&other), (409, "watch-given".to_owned()));
 
-    // What the configuration lists later is its own for as long as it does.
+    // A watch that the configuration lists later belongs to it as long as it is listed.
     write("watch: [/a, /c]");
     let reloaded = ask(&agent, "POST", "/-/reload", "", "");
     assert_eq!(reloaded.status, 200, "{}", reloaded.body);

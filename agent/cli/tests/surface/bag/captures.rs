@@ -59,8 +59,8 @@ fn check(scenarios: &[Scenario]) {
         let (complete, incomplete, gaps) = on_the_wire(scenario);
         let found = in_the_bag(&name, &bag);
         if name.contains("cli-observed") || name.contains("fastrtps-default/lifecycle") {
-            // They begin late, or announcements went through shared memory: what a writer sent
-            // before it was announced on the wire is of nobody.
+            // They begin late, or announcements went through shared memory: samples before the
+            // writer's announcement have no topic.
             let within = |(topic, count): (&String, &u64)| complete.get(topic) >= Some(count);
             assert!(found.iter().all(within), "{name}: {found:?} {complete:?}");
             continue;
@@ -162,8 +162,8 @@ fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
     counts
 }
 
-/// What the publisher sent: the byte at `i` of `data` is `i + n` in message n, which is the
-/// writer's n + 1.
+/// The published payload: the byte at `i` of `data` is `i + n` in message n, which is the writer's
+/// n + 1.
 fn assert_cloud(name: &str, sequence: u32, payload: &[u8]) {
     let length_of = |at: usize| {
         let length = payload.get(at..at + 4).unwrap().try_into().unwrap();

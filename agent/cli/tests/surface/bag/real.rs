@@ -1,4 +1,4 @@
-//! What real bags of Humble look like, and what is said of them.
+//! Real bags of Humble, and the output of `rp bag` for them.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};

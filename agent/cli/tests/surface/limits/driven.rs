@@ -1,4 +1,4 @@
-//! Which test drives each cap of docs/limits-*.md over.
+//! The test that exceeds each cap of docs/limits-*.md.
 
 /// Constant, its file, the test's file, and the test.
 pub const FIXED: &[[&str; 4]] = &[

@@ -1,4 +1,4 @@
-//! The table of limits: what the page, /health and docs/limits-*.md say of each cap.
+//! The table of limits: the page, /health and docs/limits-*.md agree about each cap.
 
 use super::*;
 

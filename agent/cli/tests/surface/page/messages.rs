@@ -82,7 +82,7 @@ fn messages_are_decoded_five_a_second_at_most() {
 
 #[test]
 fn topics_whose_messages_are_decoded_are_limited() {
-    // So slow that no stream ends by itself meanwhile.
+    // Slow enough that no stream ends by itself during the test.
     let capture = data("cyclonedds/lifecycle-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.2"]);
     agent.wait_for_log("ready");

@@ -181,7 +181,7 @@ fn a_client_that_does_not_read_costs_nothing_and_misses_no_change() {
     agent.wait_for_log("ready");
     let mut slow = Lines::open(agent.api, "/live", "").unwrap_or_else(|_| panic!());
     agent.wait_for_log("the capture has ended");
-    // What it knows after all that has come is what another one is told at once.
+    // A client that has applied all changes holds what a new client receives at once.
     let mut state = std::collections::BTreeMap::new();
     let mut graph = Value::Null;
     let until = Instant::now() + Duration::from_secs(3);

@@ -1,4 +1,4 @@
-//! How a recording of many topics begins and is interrupted.
+//! The begin and the interruption of a recording of many topics.
 
 use super::*;
 

@@ -66,7 +66,7 @@ fn what_the_original_echoed_is_echoed() {
         assert!(is_part, "{name}: {said}{}", stderr(&output));
         if recorded.code == 1 {
             assert_eq!(said, recorded.stdout, "{name}");
-            // Beside what the original says stands why nothing came.
+            // The reason for missing messages follows the original's output.
             let why = |line: &&str| !line.starts_with("rp: no message on ");
             let err = stderr(&output);
             let err: String = err.split_inclusive('\n').filter(why).collect();
@@ -160,7 +160,7 @@ fn what_cannot_be_echoed_is_said_in_one_line() {
     );
     assert_eq!(ask(&["--timeout", "0"]).status.code(), Some(2));
     assert_eq!(ask(&["-l", "-1"]).status.code(), Some(2));
-    // Another type than the writer's: nothing comes, and stderr says why.
+    // Another type than the writer's: no message comes, and stderr names the reason.
     let other = ask(&["std_msgs/msg/String"]);
     assert_eq!(
         (stdout(&other).as_str(), other.status.code()),

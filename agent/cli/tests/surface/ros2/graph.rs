@@ -112,7 +112,7 @@ fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
 }
 
-/// What the original prints of `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
+/// The original prints `/robot1/sensor_node` as `//r/o/b/o/t/1sensor_node`.
 #[test]
 fn the_nodes_of_an_action_bear_their_names() {
     let capture = own().join("graph.pcap.gz");
@@ -151,7 +151,7 @@ fn what_humble_has_not_is_said_as_jazzy_says_it() {
     );
     let found = said("/robot1/fibonacci\n");
     assert_eq!(ask(&format!("action find {}", fibonacci.trim())), found);
-    // Hidden, and asked for by the command's option as well as by the verb's.
+    // Hidden services are listed with the command's option as well as with the verb's.
     let hidden = "/robot1/fibonacci/_action/send_goal";
     assert_eq!(ask(&format!("service type {hidden}")).2, Some(1));
     let shown = ask(&format!("service --include-hidden-services type {hidden}"));

@@ -22,7 +22,7 @@ struct Tolerance {
     messages: f64,
 }
 
-/// A command of the original, and what it said.
+/// A command of the original, and its output.
 struct Recorded {
     name: String,
     arguments: Vec<String>,
@@ -153,8 +153,7 @@ fn what_cannot_be_measured_is_refused() {
     );
 }
 
-/// What the nodes themselves noted: rates are theirs to a thousandth, where the original is off by
-/// thirty.
+/// The nodes' own logs: rates agree with them to a thousandth; the original is off by thirty.
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
 fn rates_of_the_corpus_are_those_that_were_sent() {
@@ -191,7 +190,7 @@ impl Recorded {
     fn compare(&self, capture: &Path, tolerance: &Tolerance) {
         let (out, err) = self.replayed(capture, tolerance);
         let name = &self.name;
-        // Beside what the original says stands why nothing came.
+        // The reason for missing messages follows the original's output.
         let why = |line: &&str| {
             let reasons = ["rp: no message on ", "whose announcement was missed"];
             !reasons.iter().any(|reason| line.contains(reason))

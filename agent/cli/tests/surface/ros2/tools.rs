@@ -9,7 +9,7 @@ use super::{run, stderr, stdout};
 use crate::rp;
 use ros2probe_testing::local_agent::capture;
 
-/// What a tool says, unless it is not installed here.
+/// Returns a tool's output, or `None` if it is not installed.
 fn tool(name: &str, arguments: &[&str]) -> Option<Output> {
     let output = Command::new(name).args(arguments).output();
     match output {

@@ -11,7 +11,7 @@ fn a_sample_of_several_messages_in_shared_memory_is_given_whole() {
     for start in [1, 2, 3] {
         robot.receive(Message::from(ALICE).fragment(WRITER, 1, start, 1000, &large));
     }
-    // Looks at two ports may find them in another order, and twice.
+    // Polling two ports may find them in another order, and twice.
     for (number, start) in [(3, 1), (2, 1), (2, 3), (3, 2), (2, 1), (2, 2), (3, 3)] {
         robot.receive(Message::from(ALICE).fragment(WRITER, number, start, 1000, &large));
     }

@@ -13,7 +13,7 @@ pub(crate) struct Archive {
     pub(crate) files: BTreeMap<String, Entry>,
     /// Fields of its control file.
     pub(crate) control: BTreeMap<String, String>,
-    /// Modes of what else dpkg is told.
+    /// Modes of the other control files.
     pub(crate) scripts: BTreeMap<String, u32>,
     pub(crate) conffiles: String,
     /// Of the `ar` archive that a package is.
@@ -61,7 +61,7 @@ impl Archive {
         self.unpacked.path().join(path)
     }
 
-    /// As lintian asks `man`.
+    /// Runs `man` as lintian does.
     pub(crate) fn manual_is_readable(&self, page: &str) -> Result<()> {
         let mut man = Command::new("man");
         man.args(["--warnings", "-E", "UTF-8", "-l"]);
@@ -78,7 +78,7 @@ impl Archive {
         Ok(())
     }
 
-    /// Which would differ from build to build.
+    /// Checks for dates, which would differ from build to build.
     pub(crate) fn compressed_without_dates(&self) -> Result<()> {
         for path in self.files.keys().filter(|path| path.ends_with(".gz")) {
             let bytes = std::fs::read(self.path(path))?;

@@ -11,7 +11,7 @@ use super::all;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::{PREFIX, require, wait_until};
 
-/// What is the container's first process.
+/// The container's first process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Start {
     Systemd,
@@ -24,7 +24,7 @@ pub(crate) struct Debian {
     container: Child,
     /// Its first process.
     first: u32,
-    /// What it and its first process say.
+    /// Output of the container and of its first process.
     console: PathBuf,
     cgroup: Cgroup,
 }
@@ -94,7 +94,7 @@ impl Debian {
         Ok(host)
     }
 
-    /// What a script says, which must succeed.
+    /// Runs a script that must succeed, and returns its output.
     pub(crate) fn run(&self, script: &str) -> Result<String> {
         let output = self.attempt(script)?;
         ensure!(
@@ -106,7 +106,7 @@ impl Debian {
         Ok(String::from_utf8_lossy(&output.stdout).into_owned())
     }
 
-    /// How a script ends and what it says.
+    /// Runs a script, and returns its exit status and output.
     pub(crate) fn attempt(&self, script: &str) -> Result<Output> {
         let first = self.first.to_string();
         let mut command = Command::new("nsenter");
@@ -121,12 +121,12 @@ impl Debian {
         command.output().context("nsenter")
     }
 
-    /// What a script says, however it ends.
+    /// Runs a script, and returns its output whatever its exit status.
     pub(crate) fn text(&self, script: &str) -> Result<String> {
         Ok(all(&self.attempt(script)?))
     }
 
-    /// What a port of it answers.
+    /// Returns the answer of a port of the container.
     pub(crate) fn get(&self, port: u16, path: &str) -> Result<String> {
         self.run(&format!(
             "exec 3<>/dev/tcp/127.0.0.1/{port} && \
@@ -157,8 +157,8 @@ impl Drop for Debian {
     fn drop(&mut self) {
         let _ = self.container.kill();
         let _ = self.container.wait();
-        // Everybody inside, then the groups that were made for them: also in the hierarchy of
-        // version 1 where that is systemd's own.
+        // Kills all processes inside, then removes their groups, also in the hierarchy of version 1
+        // where systemd uses that.
         let _ = std::fs::write(self.cgroup.path().join("cgroup.kill"), "1");
         let own = self.cgroup.path().file_name().unwrap_or_default();
         let own = Path::new("/sys/fs/cgroup/systemd").join(own);
