@@ -1,4 +1,5 @@
-//! `rp discover` at the terminal: listen, say what will be sent, ask, say what came of it.
+//! `rp discover` on the terminal: lists participants, prints the planned packets, sends them and
+//! reports the answers.
 
 use std::io::{Write, stdout};
 use std::time::Duration;
@@ -12,7 +13,7 @@ use ros2probe_daemon::discover::{converse, local_participant};
 
 use crate::cli::Discover;
 
-/// The command.
+/// Runs `rp discover`.
 pub(crate) fn discover(options: &Discover) -> Result<()> {
     let mut out = stdout().lock();
     let (config, _) = configuration(options.config.as_deref())?;
@@ -78,7 +79,7 @@ fn describe(participant: &HeardParticipant) -> String {
     words
 }
 
-/// Asks one; whether it told everything.
+/// Sends requests to one participant. Returns whether every request was answered.
 fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
     let (local_participant, socket) = local_participant(target, domain_id)?;
     let mut session = Session::new(local_participant, *target, !options.no_nodes);
