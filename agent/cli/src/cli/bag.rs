@@ -77,7 +77,7 @@ enum Storage {
 }
 
 impl Bag {
-    /// With which code Ctrl-C ends it at once; a recording is completed first.
+    /// Exit code of an immediate end by Ctrl-C. `None` for a recording, which is completed first.
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
             Some(Verb::Record(_) | Verb::Convert(_)) => None,
@@ -132,7 +132,7 @@ impl Reindex {
         let report = reindex::reindex(&self.bag_path)?;
         let mut output = Output::new();
         for file in &report.files {
-            // The name of a file is anything but a slash.
+            // A file name can contain control characters.
             output.write(&format!("{}\n", visible(&file.to_string())))?;
         }
         let metadata = &report.metadata;
@@ -153,7 +153,7 @@ impl Reindex {
     }
 }
 
-/// A path that does not exist is a usage error, as in the original.
+/// Ends with a usage error if the path does not exist, as the original does.
 fn require(path: &std::path::Path, verb: &str) {
     if path.exists() {
         return;

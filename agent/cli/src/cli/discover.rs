@@ -1,4 +1,4 @@
-//! `rp discover`: whom to ask, and how.
+//! `rp discover`: options for the participants and the requests.
 
 use std::path::PathBuf;
 

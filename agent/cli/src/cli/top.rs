@@ -11,7 +11,7 @@ use ros2probe_daemon::agent::Speed;
 
 use super::{Output, UserError};
 
-/// Longest pause between two looks.
+/// Longest interval between two requests, in seconds.
 const MAX_INTERVAL: f64 = 3600.0;
 
 /// `rp top`.
