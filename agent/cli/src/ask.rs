@@ -42,10 +42,10 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
         }
     }
     if options.participant.is_some() && targets.is_empty() {
-        bail!("this participant was not heard or cannot be asked");
+        bail!("the participant was not heard, or cannot receive requests");
     }
     if !options.all && options.participant.is_none() {
-        writeln!(out, "to ask, name one with --participant, or --all")?;
+        writeln!(out, "to send requests, pass --participant PREFIX or --all")?;
         return Ok(());
     }
     let mut failed = 0;
@@ -55,7 +55,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     if failed > 0 {
         bail!(
-            "{failed} of {} participants answered only in part",
+            "{failed} of {} participants gave no or incomplete answers",
             targets.len()
         );
     }
@@ -98,7 +98,8 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     }
     // The plan is printed before anything is sent.
     out.flush()?;
-    let took = converse(&mut session, &socket).context("the goodbye may not have been sent")?;
+    let took = converse(&mut session, &socket)
+        .context("the conversation failed, perhaps before the goodbye")?;
     report(&session, took, out)
 }
 
@@ -138,11 +139,11 @@ fn report(session: &Session, took: Duration, out: &mut impl Write) -> Result<boo
     )?;
     let has_nodes = !session.expects_nodes() || nodes.is_some();
     if !session.was_answered() {
-        writeln!(out, "  it did not answer")?;
+        writeln!(out, "  no answer")?;
     } else if session.missing() > 0 {
-        writeln!(out, "  {} announcements did not come", session.missing())?;
+        writeln!(out, "  {} announcements did not arrive", session.missing())?;
     } else if !has_nodes {
-        writeln!(out, "  its list of nodes did not come")?;
+        writeln!(out, "  the list of nodes did not arrive")?;
     }
     Ok(session.was_answered() && session.missing() == 0 && has_nodes)
 }

@@ -136,7 +136,7 @@ impl Components<'_> {
             Err(refusal @ Refusal::NoDirectory)
                 if config.recordings.is_in(&config.state_directory) =>
             {
-                tracing::error!(%refusal, "no snapshots are kept");
+                tracing::error!(%refusal, "snapshots are disabled");
                 Snapshots::default()
             }
             started => started?,

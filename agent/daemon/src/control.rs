@@ -43,7 +43,7 @@ pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     if let Some(path) = token
         && fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
     {
-        tracing::warn!(path = %path.display(), "every user of this host can read the token");
+        tracing::warn!(path = %path.display(), "every user of this host can read the token file");
     }
     if let Some(address) = settings.listen {
         server.bind(address)?;

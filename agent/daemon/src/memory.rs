@@ -33,7 +33,7 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
             let reason = format!("{:#}", anyhow!(error));
             tracing::warn!(
                 reason,
-                "no state is kept: a restart loses names and added watches"
+                "state is not saved: a restart loses names and added watches"
             );
             None
         }

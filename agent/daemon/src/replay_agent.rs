@@ -295,12 +295,12 @@ fn faults(
         Err(RunError::Replay(PcapError::UnsupportedLink { .. })) => return lines,
         Err(RunError::Replay(error @ (PcapError::Truncated { .. } | PcapError::Read { .. }))) => {
             lines.push(format!(
-                "{capture} is incomplete: {error}; what follows is missing. Copy it again, or let \
+                "{capture} is incomplete: {error}; the rest is missing. Copy it again, or let \
                  tcpdump end by itself"
             ));
         }
         Err(RunError::Replay(error)) => lines.push(format!(
-            "{capture} cannot be read further: {error}; what follows is missing"
+            "{capture} cannot be read further: {error}; the rest is missing"
         )),
         Err(error) => lines.push(error.to_string()),
         Ok(()) => {}

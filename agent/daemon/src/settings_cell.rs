@@ -37,7 +37,7 @@ pub struct Reload {
 }
 
 impl Settings {
-    /// Settings of `config`, with the watches in force.
+    /// Settings of `config`.
     #[must_use]
     pub fn new(config: &Config) -> Self {
         Self {

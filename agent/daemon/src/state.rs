@@ -1,10 +1,10 @@
 //! State directory: the discovery state, saved for the next start. Watches of clients are saved in
 //! the same directory (`watches`).
 //!
-//! JSON files are replaced as a whole (new file, fsync, rename, fsync of the directory), so that a
-//! power failure leaves the old or the new one. A separate thread writes, so that the capture never
-//! waits. No failure here ends the agent: an unreadable file is moved aside, and a full disk is
-//! counted and logged once. Each agent needs its own directory.
+//! JSON files are replaced as a whole: new file, fsync, rename, fsync of the directory. A power
+//! failure therefore leaves the old or the new one. A separate thread writes, so that the capture
+//! never waits. No failure here ends the agent: an unreadable file is moved aside, and a full disk
+//! is counted and logged once. Each agent needs its own directory.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, BufWriter, Read as _, Write as _};
@@ -401,14 +401,14 @@ fn keep(directory: &StateDirectory, inbox: &Receiver<Memory>, done: &Done) {
             Ok(()) => {
                 done.writes.fetch_add(1, Ordering::Relaxed);
                 if failed_before {
-                    tracing::info!(path = %directory.path.display(), "state is written again");
+                    tracing::info!(path = %directory.path.display(), "state is saved again");
                 }
             }
             Err(error) => {
                 done.failures.fetch_add(1, Ordering::Relaxed);
                 if !failed_before {
                     let path = directory.path.display();
-                    tracing::error!(%path, %error, "state cannot be written: names would be lost with a restart");
+                    tracing::error!(%path, %error, "cannot save state: a restart would lose names");
                 }
             }
         }

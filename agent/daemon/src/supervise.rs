@@ -124,7 +124,7 @@ impl Supervisor {
                     answering = false;
                     let died = |_| Err(anyhow!("the thread that answers requests died"));
                     let ended = ended.unwrap_or_else(died);
-                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended")));
+                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended unexpectedly")));
                 }
                 ended = &mut worker.ended, if working => {
                     working = false;
@@ -299,7 +299,7 @@ impl Surfaces {
                 () = stop.cancelled() => {}
                 Some(ended) = serving.join_next() => {
                     ended??;
-                    return Err(anyhow!("a listener ended"));
+                    return Err(anyhow!("a listener ended unexpectedly"));
                 }
             }
             while serving.join_next().await.is_some() {}

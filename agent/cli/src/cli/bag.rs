@@ -53,7 +53,7 @@ struct Info {
     /// Read all messages and print the size of topics, services and actions
     #[arg(short, long)]
     verbose: bool,
-    /// Sort topics, services and actions by this
+    /// Sort order of topics, services and actions
     #[arg(long, value_enum, default_value_t)]
     sort: Sort,
     /// Distribution whose output to print [default: ROS_DISTRO, else jazzy]
@@ -127,7 +127,7 @@ impl Reindex {
         require(&self.bag_path, "reindex");
         if !self.bag_path.is_dir() {
             let path = self.bag_path.display();
-            return Err(UserError(format!("{path} is a file: give the bag's directory")).into());
+            return Err(UserError(format!("{path} is a file: pass the bag's directory")).into());
         }
         let report = reindex::reindex(&self.bag_path)?;
         let mut output = Output::new();

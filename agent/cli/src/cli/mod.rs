@@ -54,7 +54,7 @@ pub(crate) enum Command {
         #[arg(default_value = DEFAULT_CONFIG)]
         file: PathBuf,
     },
-    /// Ask running participants to repeat their announcements: the only command that sends
+    /// Request that participants repeat their announcements: the only command that sends
     Discover(Discover),
     /// Print completions for a shell
     Completions(reference::Completions),
@@ -153,7 +153,7 @@ mod tests {
         for (verb, names) in options {
             let mut words = verb.split(' ');
             let found = words.try_fold(&root, |command, word| command.find_subcommand(word));
-            let command = found.unwrap_or_else(|| panic!("there is no `rp {verb}`"));
+            let command = found.unwrap_or_else(|| panic!("no command `rp {verb}`"));
             for name in names {
                 let is_called = |argument: &clap::Arg| match name.strip_prefix("--") {
                     Some(long) => argument.get_long() == Some(long),

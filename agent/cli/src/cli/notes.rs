@@ -193,10 +193,12 @@ impl<'a> Notes<'a> {
             ReasonCode::Encrypted => {
                 "its publisher uses DDS security; its messages may be encrypted"
             }
-            ReasonCode::WatchRejected => "limits.topics topics are measured already: raise it",
+            ReasonCode::WatchRejected => {
+                "the limit on measured topics is reached: raise limits.topics"
+            }
             ReasonCode::SharedMemory if self.is_replay => {
-                "publisher and subscriber use shared memory, which a capture of the network does not \
-                 hold: record on the robot with `rp bag record`"
+                "publisher and subscriber use shared memory, which a capture of the network lacks: \
+                 record on the robot with `rp bag record`"
             }
             ReasonCode::DataSharing => {
                 "subscribers read the publisher's memory (data sharing), which cannot be observed: \

@@ -30,14 +30,13 @@ const SHORT: usize = 100;
 pub(crate) struct Hz {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest intervals
+    /// Number of newest intervals to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
     window: usize,
-    /// Count only messages for which this expression over `m`, the message, is true: as for
-    /// `rp topic echo`
+    /// Count only messages that match this expression over `m`, the message, as in `rp topic echo`
     #[arg(long, value_name = "EXPR")]
     filter: Option<String>,
-    /// Directory that has definitions as package/msg/Type.msg, for --filter; may be repeated
+    /// Directory with definitions (package/msg/Type.msg), for --filter; may be repeated
     #[arg(long, value_name = "DIR")]
     definitions: Vec<PathBuf>,
     /// Accepted without effect: messages are always timed by the clock of the capture
@@ -52,7 +51,7 @@ pub(crate) struct Hz {
 pub(crate) struct Bandwidth {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest messages
+    /// Number of newest messages to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = SHORT, value_parser = positive)]
     window: usize,
     #[command(flatten)]
@@ -64,7 +63,7 @@ pub(crate) struct Bandwidth {
 pub(crate) struct Delay {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest messages
+    /// Number of newest messages to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
     window: usize,
     #[command(flatten)]

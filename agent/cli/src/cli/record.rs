@@ -318,14 +318,11 @@ impl Record {
 
     fn options(&self) -> Result<Options> {
         if self.storage != "mcap" {
-            bail!(
-                "the storage `{}` is not written here: mcap is",
-                self.storage
-            );
+            bail!("unsupported storage `{}`: use mcap", self.storage);
         }
         let format = self.unused.serialization_format.as_deref();
         if let Some(format) = format.filter(|format| !matches!(*format, "" | "cdr")) {
-            bail!("the serialization format `{format}` is not written here: cdr is");
+            bail!("unsupported serialization format `{format}`: use cdr");
         }
         let mut storage = Storage::preset(&self.storage_preset_profile)?;
         if let Some(path) = &self.storage_config_file {

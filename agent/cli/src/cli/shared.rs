@@ -20,7 +20,7 @@ use super::{Output, UserError};
 /// Options of the original's own node, accepted for existing scripts.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Spinning {
-    /// Accepted without effect: nothing has to be waited for
+    /// Accepted without effect: answers need no waiting
     #[arg(long, value_name = "SPIN_TIME")]
     spin_time: Option<f64>,
     /// Accepted without effect
@@ -165,9 +165,9 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
         ),
     };
     Some(if is_replay {
-        format!("{what}: the capture does not hold their announcements")
+        format!("{what}: the capture lacks their announcements")
     } else {
-        format!("{what}: the agent started after them; `rp discover` has them announced again")
+        format!("{what}: the agent started after them; `rp discover` requests their announcements")
     })
 }
 

@@ -29,13 +29,13 @@ pub(crate) struct Top {
     /// Print one table as text and end; needs no terminal
     #[arg(long, visible_alias = "batch")]
     once: bool,
-    /// Sort by this
+    /// Column to sort by
     #[arg(long, value_enum, value_name = "COLUMN", default_value_t = Column::Name)]
     sort: Column,
     /// Reverse the order
     #[arg(long)]
     reverse: bool,
-    /// Show only topics with this in name, type or state
+    /// Show only topics with this text in name, type or state
     #[arg(
         long,
         value_name = "TEXT",

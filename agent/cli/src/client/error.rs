@@ -47,7 +47,7 @@ pub enum ClientError {
     },
     /// The agent requires a token, and the request had none or a wrong one.
     #[error("the agent at {place} {}", if *.offered { "does not accept this token" } else {
-        "wants its token: pass `--token-file FILE` or set ROS2PROBE_TOKEN_FILE" })]
+        "requires a token: pass `--token-file FILE` or set ROS2PROBE_TOKEN_FILE" })]
     Unauthorized {
         /// Socket path, or host and port.
         place: String,
@@ -85,7 +85,7 @@ pub enum ClientError {
     #[error("{0}")]
     Refused(Refusal),
     /// The path has characters that are invalid in a URL.
-    #[error("{path} cannot be requested")]
+    #[error("`{path}` is not a valid URL path")]
     Path {
         /// The path.
         path: String,

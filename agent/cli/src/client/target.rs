@@ -26,7 +26,7 @@ pub struct Target {
     /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,
-    /// Ask a capture (pcap or pcapng, may be gzipped) instead of an agent
+    /// Query a capture (pcap or pcapng, may be gzipped) instead of an agent
     #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
     pub replay: Option<PathBuf>,
     /// Start at this time of the capture: Unix seconds, or +S from its beginning
@@ -46,7 +46,7 @@ pub struct Target {
 
 /// A variable of the environment has an invalid value.
 #[derive(Debug, thiserror::Error)]
-#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN_ID}")]
+#[error("ROS_DOMAIN_ID is `{0}`, but must be a number from 0 to {MAX_DOMAIN_ID}")]
 pub struct InvalidEnvironment(String);
 
 impl Target {

@@ -45,7 +45,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
 #[must_use]
 pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
     let finding = if is_denied {
-        let sentence = "an agent is running, but this user may not query it";
+        let sentence = "an agent is running, but this user has no permission to query it";
         Finding::new(AREA, "reachable", Severity::Unknown, sentence)
             .seen(reason, "connect(2)")
             .remedy("sudo rp doctor    # or: sudo usermod -aG ros2probe $USER, and log in again")
@@ -190,7 +190,7 @@ fn limits(health: &Health) -> Vec<Finding> {
         let (severity, sentence) = match blinds {
             true => (
                 Severity::Problem,
-                format!("{sentence}; part of the robot may not be seen"),
+                format!("{sentence}; part of the robot may be invisible"),
             ),
             false => (Severity::Warning, sentence),
         };
@@ -216,8 +216,8 @@ fn limits(health: &Health) -> Vec<Finding> {
     .collect()
 }
 
-/// Findings for full tables without a key in the configuration. If the agent reports no limits, all
-/// full tables.
+/// Findings for full tables that are not among the limits the agent reports. Older agents report
+/// no limits.
 fn evictions(health: &Health) -> Vec<Finding> {
     let is_told = |table: &str| {
         let limit = limit(table);
@@ -228,7 +228,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     let mut findings: Vec<_> = full
         .map(|table| {
             let sentence = format!(
-                "its table of {} was full at {}: {} entries were evicted",
+                "the table of {} was full at {}: {} entries were evicted",
                 table.table, table.limit, table.evictions
             );
             let finding = Finding::new(AREA, "evictions", Severity::Warning, sentence).seen(

@@ -111,7 +111,7 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     );
     let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
-    Some(finding.remedy("sudo rp discover --all    # asks it for them: a few packets"))
+    Some(finding.remedy("sudo rp discover --all    # requests them: a few packets"))
 }
 
 /// Finding for participants that started before the agent and whose names are unknown.
@@ -163,7 +163,7 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
         format!("{}: {}", writers.len(), first.guid),
         "GET /participants",
     );
-    Some(finding.remedy("sudo rp discover --all    # asks their participants to repeat it"))
+    Some(finding.remedy("sudo rp discover --all    # requests the announcements"))
 }
 
 fn secured(participants: &[Participant<'_>]) -> Option<Finding> {

@@ -109,7 +109,7 @@ fn unprivileged(host: &HostState) -> Finding {
     match host.files.number::<u32>(UNPRIVILEGED) {
         Ok(0) => report(
             Severity::Note,
-            "any user may load BPF programs; the agent does not need this",
+            "any user can load BPF programs; the agent does not need this",
         )
         .seen("0", UNPRIVILEGED)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
@@ -129,7 +129,7 @@ fn lockdown(host: &HostState) -> Option<Finding> {
     let (severity, sentence) = match mode.as_str() {
         "confidentiality" => (
             Severity::Warning,
-            "the kernel is locked down for confidentiality: BPF programs may not read its \
+            "the kernel is locked down for confidentiality: BPF programs cannot read its \
              memory, so socket owners and causes of loss are unknown",
         ),
         "none" => (Severity::Ok, "the kernel is not locked down"),

@@ -53,14 +53,14 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         Finding::new(AREA, "capabilities", severity, sentence).seen(&held, "CapEff, this process")
     };
     match privilege::missing(host.capabilities, settings) {
-        None => report(Severity::Ok, "this shell may capture".to_owned()),
+        None => report(Severity::Ok, "this shell can capture".to_owned()),
         Some(_) if is_running => report(
             Severity::Ok,
-            "this shell may not capture; the running agent does".to_owned(),
+            "this shell lacks the capabilities to capture; the running agent has them".to_owned(),
         ),
         Some(missing) => report(
             Severity::Note,
-            format!("this shell may not capture: it lacks {}", missing.needs()),
+            format!("this shell cannot capture: it lacks {}", missing.needs()),
         )
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
@@ -102,7 +102,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     if !looks || !contained || has("CAP_SYS_PTRACE") {
         return None;
     }
-    let sentence = "ROS runs in containers here, but the agent may not read their shared memory";
+    let sentence = "ROS runs in containers here, but the agent cannot read their shared memory";
     let finding = Finding::new(AREA, "containers", Severity::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
     Some(finding.elsewhere(

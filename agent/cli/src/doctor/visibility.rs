@@ -236,14 +236,14 @@ mod tests {
         let mut able = Ability::ALL.to_vec();
         able.retain(|each| *each != Ability::ReassemblyLosses);
         let mut visibility = host(&able);
-        let reason = "the kernel does not tell".to_owned();
+        let reason = "the kernel has no tracepoint".to_owned();
         visibility.reasons = vec![(Ability::ReassemblyLosses, reason)];
         let findings = check(&visibility);
         let found = find(&findings, "reassembly_losses").unwrap();
         assert_eq!(found.severity, Severity::Warning);
         assert_eq!(
             found.sentence,
-            "not messages lost in IP reassembly: the kernel does not tell"
+            "not messages lost in IP reassembly: the kernel has no tracepoint"
         );
     }
 

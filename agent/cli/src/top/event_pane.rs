@@ -78,7 +78,7 @@ impl EventPane {
     pub fn lag(&mut self, lagged: &Lagged) {
         let text = match lagged.missed {
             Some(missed) => format!("-------- {missed} events are missing here"),
-            None => "-------- the agent was started again".to_owned(),
+            None => "-------- the agent has restarted".to_owned(),
         };
         self.push(Line {
             is_warning: true,

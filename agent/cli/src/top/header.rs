@@ -89,7 +89,7 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
 fn agent(app: &App) -> String {
     let state = match (&app.health, &app.gone) {
         (_, Some(_)) => "AGENT GONE".to_owned(),
-        (None, None) => "asking the agent".to_owned(),
+        (None, None) => "waiting for the agent".to_owned(),
         (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
         (Some((health, _)), None) => {
             let source = match health.source.as_ref() {

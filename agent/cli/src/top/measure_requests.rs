@@ -84,7 +84,7 @@ impl MeasureRequests {
     /// Creates a watch that measures a topic permanently. Returns the status line.
     pub(super) fn keep(&mut self, key: &Key, name: &str) -> String {
         if let Some(MeasureRequest::Watch(_)) = self.all.get(key) {
-            return format!("{name}: is kept already; w removes the watch");
+            return format!("{name}: already has a watch; w removes it");
         }
         let path = format!("/watch{}?domain_id={}", encoded(name), key.domain_id);
         if !name.starts_with('/') {

@@ -147,7 +147,7 @@ fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> 
         .map(|(_, new)| *new)
         .find(has);
     if let Some(new) = renamed {
-        return format!("unknown key; it is called `{new}`");
+        return format!("unknown key; its name is `{new}`");
     }
     let near = known
         .clone()

@@ -94,15 +94,11 @@ impl Node {
                 }
                 Event::SequenceEnd | Event::MappingEnd => open.pop().map(Open::close),
                 Event::Alias(_) => {
-                    mistakes.add(
-                        at,
-                        "",
-                        "aliases are not supported here: write the value out",
-                    );
+                    mistakes.add(at, "", "aliases are not supported: repeat the value");
                     break;
                 }
                 Event::DocumentStart(_) if root.is_some() => {
-                    mistakes.add(at, "", "only one document is read");
+                    mistakes.add(at, "", "the file has several documents: keep one");
                     break;
                 }
                 _ => None,

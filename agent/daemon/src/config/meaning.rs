@@ -155,10 +155,16 @@ impl Reader {
         for (index, shape) in shapes.into_iter().enumerate() {
             let key = format!("recordings.snapshots[{index}]");
             if snapshots.iter().any(|other| other.name == shape.name) {
-                self.wrong(&format!("{key}.name"), "is another snapshot's already");
+                self.wrong(
+                    &format!("{key}.name"),
+                    "is already the name of another snapshot",
+                );
             }
             if shape.topics.is_empty() {
-                self.wrong(&format!("{key}.topics"), "names no topic");
+                self.wrong(
+                    &format!("{key}.topics"),
+                    "is empty: list at least one topic",
+                );
             }
             snapshots.push(SnapshotSettings {
                 name: shape.name,
@@ -249,7 +255,7 @@ impl Reader {
         let open = listen.filter(|address| !address.ip().is_loopback());
         if let (Some(address), None) = (open, &shape.token_file) {
             let message = format!(
-                "is {address}, which others can reach: that needs `token_file` too, or use \
+                "is {address}, which other hosts can reach: set `token_file`, or use \
                  127.0.0.1"
             );
             self.wrong("api.listen", message);
@@ -315,12 +321,12 @@ impl Reader {
         for key in &of_wire {
             let message = match (settings.source, of_host.first()) {
                 (SourceChoice::Host, _) => {
-                    "selects frames on a wire, which `source: host` does not look at; use \
+                    "selects interfaces, which `source: host` does not capture; use \
                      mirror_interfaces or `source: wire`"
                         .to_owned()
                 }
                 (SourceChoice::Auto, Some(other)) => {
-                    format!("makes the wire the source, for which {other} has no meaning")
+                    format!("selects `source: wire`, to which {other} does not apply")
                 }
                 _ => continue,
             };
@@ -328,7 +334,7 @@ impl Reader {
         }
         if settings.source == SourceChoice::Wire {
             for key in of_host {
-                let message = "has no meaning for `source: wire`";
+                let message = "does not apply to `source: wire`";
                 self.wrong(&format!("capture.{key}"), message);
             }
         }

@@ -46,7 +46,7 @@ pub enum Refusal {
 #[derive(Debug, thiserror::Error)]
 pub enum DiscoverError {
     /// The socket cannot be opened.
-    #[error("cannot open a socket towards {target}")]
+    #[error("cannot open a socket for {target}")]
     Open {
         /// Address of the participant.
         target: SocketAddrV4,
@@ -57,7 +57,7 @@ pub enum DiscoverError {
     #[error("cannot read random numbers")]
     Random(#[source] io::Error),
     /// A packet cannot be sent or received.
-    #[error("cannot talk to {target}")]
+    #[error("cannot exchange packets with {target}")]
     Talk {
         /// Address of the participant.
         target: SocketAddrV4,
@@ -99,7 +99,7 @@ impl Refusal {
     #[must_use]
     pub const fn reason(self) -> &'static str {
         match self {
-            Self::Secured => "announces security: not asked",
+            Self::Secured => "uses DDS security: receives no requests",
             Self::NoAddress => "announces no IPv4 address for discovery",
             Self::Asking => "is another rp discover",
         }

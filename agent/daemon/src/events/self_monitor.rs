@@ -78,7 +78,7 @@ impl SourceMonitor {
             Ok(()) => {
                 let saw = self.saw.replace(now).filter(|_| is_anew);
                 if self.blind_since.is_none() && saw.is_some() {
-                    let reason = "the cgroup was removed and made anew".to_owned();
+                    let reason = "the cgroup was removed and recreated".to_owned();
                     events.push(AgentEvent::Blind { reason });
                 }
                 if let Some(since) = self.blind_since.take().or(saw) {
@@ -153,7 +153,7 @@ mod tests {
         let mut sight = SourceMonitor::default();
         assert_eq!(sight.check(&Ok(()), 0, start), []);
         let events = sight.check(&Ok(()), 1, second(2));
-        let reason = "the cgroup was removed and made anew".to_owned();
+        let reason = "the cgroup was removed and recreated".to_owned();
         let seeing = |blind_seconds| AgentEvent::Seeing { blind_seconds };
         assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
         assert_eq!(sight.check(&Ok(()), 1, second(4)), []);

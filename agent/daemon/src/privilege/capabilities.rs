@@ -49,7 +49,7 @@ pub struct Unprivileged(());
 #[derive(Debug, thiserror::Error)]
 pub enum CapabilitiesRemain {
     /// Capabilities are left in a set.
-    #[error("refusing to serve: {left} left in the {set} set after all were given up")]
+    #[error("refusing to serve: {left} left in the {set} set after dropping all capabilities")]
     Capabilities {
         /// Names of the capabilities.
         left: String,
@@ -57,10 +57,10 @@ pub enum CapabilitiesRemain {
         set: &'static str,
     },
     /// An executed program could gain capabilities.
-    #[error("refusing to serve: no_new_privs is not set after it was")]
+    #[error("refusing to serve: no_new_privs is not set")]
     MayGain,
     /// A set cannot be read.
-    #[error("refusing to serve: cannot read which capabilities are left")]
+    #[error("refusing to serve: cannot read the remaining capabilities")]
     Unreadable(#[source] Errno),
     /// `no_new_privs` cannot be read.
     #[error("refusing to serve: cannot read no_new_privs")]
@@ -122,8 +122,8 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySe
     }
 }
 
-/// Drops all capabilities except `kept` from every set of the calling thread. The bounding set is
-/// reduced if permitted; otherwise the thread can gain nothing from it.
+/// Drops all capabilities of the calling thread except `kept`, and clears its bounding set if
+/// permitted. Without that permission, the thread can gain nothing from the bounding set.
 pub(super) fn keep(kept: CapabilitySet) -> Result<(), DropError> {
     let sets = capabilities(None)?;
     if sets.effective.contains(CapabilitySet::SETPCAP) {

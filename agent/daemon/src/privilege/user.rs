@@ -42,11 +42,11 @@ pub fn become_own_user() -> Identity {
     let needed = [CapabilitySet::SETUID, CapabilitySet::SETGID];
     if let Some(missing) = needed.into_iter().find(|one| !effective.contains(*one)) {
         let missing = capability_names(missing).concat();
-        return Identity::Root(format!("becoming the user {NAME} takes {missing}"));
+        return Identity::Root(format!("switching to user {NAME} needs {missing}"));
     }
     match become_user(user, group) {
         Ok(()) => Identity::Own,
-        Err(error) => Identity::Root(format!("cannot become the user {NAME}: {error}")),
+        Err(error) => Identity::Root(format!("cannot switch to user {NAME}: {error}")),
     }
 }
 

@@ -45,7 +45,7 @@ pub struct Filter {
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// No topic can ever match.
-    #[error("name topics, or request all of them or those that match a regular expression")]
+    #[error("no topics selected: name topics, pass a regular expression, or select all")]
     Nothing,
     /// A list is too long.
     #[error("more than {MAX_NAMES} names")]

@@ -521,7 +521,7 @@ impl<'a> Recorder<'a> {
         })))
     }
 
-    /// Writes a topic's description again if a new writer offers a different QoS.
+    /// Writes a topic's description again if a writer is new, or its offered QoS has changed.
     fn describe_again(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
         let (Some(offered), Some(TopicDecision::Recorded(taken))) =
             (&topic.offered, self.topics.get_mut(&*topic.name))

@@ -135,7 +135,7 @@ pub struct Status {
 pub enum Refusal {
     /// No directory is available.
     #[error(
-        "the agent has no place for recordings: set `recordings.directory`, or record with \
+        "the agent has no directory for recordings: set `recordings.directory`, or record with \
          `rp bag record`"
     )]
     NoDirectory,
@@ -249,8 +249,8 @@ impl Recordings {
         Ok(recording)
     }
 
-    /// Adds the known topics of the subscription to the bag, at most as many as can be measured, so
-    /// that thousands of announced topics cannot fill a bag.
+    /// Adds the known topics of the subscription to the bag, at most as many as can be measured.
+    /// Thousands of announced topics thus cannot fill a bag.
     fn declare(
         &self,
         recorder: &mut Recorder<'_>,
@@ -528,7 +528,7 @@ fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Definition of a type for a bag. `None` if there is none, or its hash differs.
+/// Definition of a type for a bag. `None` if no definition has this name and hash.
 pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
     let found = library.find(name, hash).ok()?;
     let (encoding, text) = found.schema_text();

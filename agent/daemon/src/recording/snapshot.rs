@@ -109,7 +109,7 @@ impl Snapshots {
             let work = move || keeper.work(subscription, &waiting, &ordered, &stopping);
             let thread = std::thread::Builder::new().name("snapshot".to_owned());
             let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
-                reason: format!("no thread for the snapshot: {error}"),
+                reason: format!("cannot start the snapshot's thread: {error}"),
             })?;
             list.push(Snapshot {
                 settings: settings.clone(),
@@ -131,7 +131,7 @@ impl Snapshots {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
         if snapshot.clients.try_send(answer).is_err() {
-            return Some(Err("too many clients wait for it".to_owned()));
+            return Some(Err("too many clients wait for this snapshot".to_owned()));
         }
         let written = written.await;
         Some(written.unwrap_or_else(|_| Err("the agent is shutting down".to_owned())))
@@ -151,7 +151,10 @@ impl Snapshots {
             let thread = snapshot.thread.lock();
             let thread = thread.unwrap_or_else(PoisonError::into_inner).take();
             if thread.is_some_and(|thread| thread.join().is_err()) {
-                tracing::error!(snapshot = snapshot.settings.name, "its thread failed");
+                tracing::error!(
+                    snapshot = snapshot.settings.name,
+                    "the snapshot's thread failed"
+                );
             }
         }
     }
@@ -247,9 +250,7 @@ impl SnapshotTask {
         };
         let used = self.used();
         if used >= DISK {
-            let reason = format!(
-                "the snapshots there take {used} bytes already, of {DISK} they may: remove some"
-            );
+            let reason = format!("bags of this snapshot use {used} of {DISK} bytes: remove some");
             return (name, Err(reason));
         }
         let write = || -> Result<WrittenBag, Refusal> {

@@ -47,10 +47,10 @@ const SET_BACK: u64 = 1_000_000_000;
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The host's interfaces can no longer be captured.
-    #[error("capturing ended")]
+    #[error("the capture failed")]
     Capture(#[from] CaptureError),
     /// The rest of a capture cannot be read; packets before it are published.
-    #[error("the capture was replayed up to a fault")]
+    #[error("the rest of the capture is unreadable")]
     Replay(#[source] PcapError),
 }
 

@@ -271,7 +271,7 @@ impl Replay {
                     tracing::warn!(
                         link_type,
                         packets,
-                        "packets of an unsupported link type left out"
+                        "packets of an unsupported link type skipped"
                     );
                 }
                 self.is_readable()

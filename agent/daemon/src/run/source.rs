@@ -64,7 +64,11 @@ impl Source {
         }
         for (ability, able) in tracepoint_abilities(live).into_iter().flatten() {
             if let Err(reason) = able {
-                tracing::warn!(ability = ability.label(), reason, "not available here");
+                tracing::warn!(
+                    ability = ability.label(),
+                    reason,
+                    "ability not available on this kernel"
+                );
             }
         }
         let able = abilities(live);
@@ -77,7 +81,7 @@ impl Source {
             cgroup = live.host().map(|host| host.cgroup().display().to_string()),
             sees = words(sees).join(", "),
             blind = words(blind).join(", "),
-            "looking"
+            "observing"
         );
     }
 

@@ -306,7 +306,7 @@ impl Channel {
         {}
     }
 
-    /// Evicts an entry. Returns `false` if there is none left.
+    /// Evicts an entry. Returns `false` if the queue has no more samples.
     fn drop_one(&self, queue: &mut Queue) -> bool {
         let Some(item) = queue.waiting.sacrifice() else {
             return false;

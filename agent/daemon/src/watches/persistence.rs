@@ -132,7 +132,7 @@ impl TryFrom<Line> for Watch {
             .domain_id
             .filter(|domain_id| *domain_id > DomainId::MAX.0)
         {
-            return Err(format!("there is no domain {domain_id}"));
+            return Err(format!("invalid domain {domain_id}"));
         }
         let expectations = Expectations {
             min_rate_hz: line.min_rate_hz,
@@ -237,10 +237,10 @@ impl Mailbox {
             let path = directory.path().display();
             match written {
                 Ok(()) if failed_before => {
-                    tracing::info!(%path, "added watches are written again");
+                    tracing::info!(%path, "added watches are saved again");
                 }
                 Err(error) if !failed_before => {
-                    tracing::error!(%path, %error, "added watches cannot be written: a restart would lose them");
+                    tracing::error!(%path, %error, "cannot save added watches: a restart would lose them");
                 }
                 Ok(()) | Err(_) => {}
             }

@@ -54,7 +54,7 @@ impl<'a> RecordingOutput<'a> {
                 self.clear();
                 log(
                     "INFO",
-                    "Completing the bag; Ctrl-C again to skip what takes long",
+                    "Completing the bag; Ctrl-C again to skip slow steps",
                 );
             }
             Activity::Compressing { done, of } => {
@@ -174,7 +174,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
         let error = format!("{:#}", anyhow!(error.to_string()));
         log(
             "ERROR",
-            &format!("{error}: the recording ends here, what came before is whole"),
+            &format!("{error}: the recording ends here; earlier messages are complete"),
         );
     }
     if let Some(summary) = &ended.summary {
@@ -186,7 +186,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
     if is_complete {
         log("INFO", "Recording stopped");
     } else {
-        let text = "Recording stopped; not everything that was sent is in the bag, see above";
+        let text = "Recording stopped; some sent messages are not in the bag, see above";
         log("WARN", text);
     }
     let is_unreadable = outcome.fault.is_some() && ended.report.messages == 0;

@@ -77,14 +77,14 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                 1 if phase.cancel() => {
                     log(
                         "INFO",
-                        "Interrupted before the recording began; no bag was made",
+                        "Interrupted before the recording began; no bag was created",
                     );
                     std::process::exit(INTERRUPTED.into());
                 }
                 1 => Command::Stop,
                 2 => Command::Hurry,
                 _ => {
-                    let text = "Interrupted; `rp bag reindex` makes the bag whole";
+                    let text = "Interrupted; `rp bag reindex` completes the bag";
                     log("ERROR", text);
                     std::process::exit(INTERRUPTED.into());
                 }

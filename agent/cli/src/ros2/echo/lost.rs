@@ -10,8 +10,8 @@ pub struct Lost {
 }
 
 impl Lost {
-    /// Records messages that will not arrive. Returns the original's text if they were lost, which
-    /// may begin without a space and end without a line break.
+    /// Records messages that will not arrive. Returns the original's text, or nothing if they were
+    /// on the wire. As in the original, no line break precedes `---`.
     pub fn missed(&mut self, missed: &Missed) -> String {
         match missed.reason {
             MissedReason::Incomplete | MissedReason::Lost => {}

@@ -41,8 +41,8 @@ impl Ages {
         }
     }
 
-    /// Adds a message. The first message is not counted. Nor is one earlier than the first, which
-    /// shows that the clock was set back.
+    /// Adds a message. The first message is not counted. One earlier than the first restarts the
+    /// measurement, since the clock was set back.
     pub fn arrived(&mut self, time: i64, stamp: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
