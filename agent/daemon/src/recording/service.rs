@@ -286,7 +286,7 @@ impl Recordings {
         let thread = std::thread::Builder::new().name("recording".to_owned());
         thread.spawn(work).map_err(|error| {
             let _ = std::fs::remove_dir_all(&recording.directory);
-            let reason = format!("no thread for it: {error}");
+            let reason = format!("cannot start the recording's thread: {error}");
             self.events.record(AgentEvent::RecordingEnded {
                 recording: recording.name.clone(),
                 messages: 0,
