@@ -40,7 +40,7 @@ demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (n
 test: ## format, spelling, lints, kernel object, and all tests with real DDS participants (needs root)
 	@.ci/prerequisites.sh test
 	cargo fmt --all --check
-	typos
+	$(TARGET)/tools/typos/bin/typos
 	cargo clippy --workspace --all-targets -- -D warnings
 	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh --check
 	@$(MAKE) --no-print-directory page

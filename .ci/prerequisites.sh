@@ -236,11 +236,16 @@ nextest() {
     cargo install cargo-nextest --version 0.9.151 --locked --debug --no-default-features --features default-no-update
 }
 
-# Checks the spelling of all files, with the exceptions in _typos.toml.
+# Checks the spelling of all files, with the exceptions in _typos.toml: the crate typos-cli, which
+# PyPI has built.
 spelling() {
-    [ "$(typos --version 2>/dev/null)" = "typos-cli 1.52.0" ] && return
-    say "installing typos-cli 1.52.0"
-    cargo install typos-cli --version 1.52.0 --locked --debug
+    local place=$tools/typos version=1.52.0
+    [ "$("$place/bin/typos" --version 2>/dev/null)" = "typos-cli $version" ] && return
+    packages python3 python3-venv
+    say "installing typos $version from PyPI into target/tools/typos"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check "typos==$version"
 }
 
 # No package source has ROS 2 Humble for Debian 12: an archive with its own script installs it.
