@@ -490,7 +490,8 @@ impl LiveSource {
         {
             exact.drain(clocks, observer);
             observer.input(Input::ProbesDetached);
-            let reason = "the cgroup was made anew: restart to see its messages one by one";
+            let reason =
+                "the cgroup was recreated: restart the agent to capture each of its messages";
             tracing::warn!(reason, "shared memory is sampled");
             self.without_exact = Some(reason.to_owned());
         }

@@ -1,4 +1,5 @@
-//! `rp discover` at the terminal: listen, say what will be sent, ask, say what came of it.
+//! `rp discover` on the terminal: lists participants, prints the planned packets, sends them and
+//! reports the answers.
 
 use std::io::{Write, stdout};
 use std::time::Duration;
@@ -12,7 +13,7 @@ use ros2probe_daemon::discover::{converse, local_participant};
 
 use crate::cli::Discover;
 
-/// The command.
+/// Runs `rp discover`.
 pub(crate) fn discover(options: &Discover) -> Result<()> {
     let mut out = stdout().lock();
     let (config, _) = configuration(options.config.as_deref())?;
@@ -41,10 +42,10 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
         }
     }
     if options.participant.is_some() && targets.is_empty() {
-        bail!("this participant was not heard or cannot be asked");
+        bail!("the participant was not heard, or cannot receive requests");
     }
     if !options.all && options.participant.is_none() {
-        writeln!(out, "to ask, name one with --participant, or --all")?;
+        writeln!(out, "to send requests, pass --participant PREFIX or --all")?;
         return Ok(());
     }
     let mut failed = 0;
@@ -54,7 +55,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     if failed > 0 {
         bail!(
-            "{failed} of {} participants answered only in part",
+            "{failed} of {} participants gave no or incomplete answers",
             targets.len()
         );
     }
@@ -78,7 +79,7 @@ fn describe(participant: &HeardParticipant) -> String {
     words
 }
 
-/// Asks one; whether it told everything.
+/// Sends requests to one participant. Returns whether every request was answered.
 fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write) -> Result<bool> {
     let (local_participant, socket) = local_participant(target, domain_id)?;
     let mut session = Session::new(local_participant, *target, !options.no_nodes);
@@ -97,7 +98,8 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     }
     // The plan is printed before anything is sent.
     out.flush()?;
-    let took = converse(&mut session, &socket).context("the goodbye may not have been sent")?;
+    let took = converse(&mut session, &socket)
+        .context("the conversation failed, perhaps before the goodbye")?;
     report(&session, took, out)
 }
 
@@ -137,11 +139,11 @@ fn report(session: &Session, took: Duration, out: &mut impl Write) -> Result<boo
     )?;
     let has_nodes = !session.expects_nodes() || nodes.is_some();
     if !session.was_answered() {
-        writeln!(out, "  it did not answer")?;
+        writeln!(out, "  no answer")?;
     } else if session.missing() > 0 {
-        writeln!(out, "  {} announcements did not come", session.missing())?;
+        writeln!(out, "  {} announcements did not arrive", session.missing())?;
     } else if !has_nodes {
-        writeln!(out, "  its list of nodes did not come")?;
+        writeln!(out, "  the list of nodes did not arrive")?;
     }
     Ok(session.was_answered() && session.missing() == 0 && has_nodes)
 }

@@ -1,7 +1,7 @@
-//! `rp`: asks an agent, and prints what it answers as `ros2` does.
+//! `rp`: queries an agent and prints its answers in the format of `ros2`.
 //!
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
-//! - [`ros2`] makes the text of `ros2 topic`, `ros2 node`, `ros2 bag info` and others from answers.
+//! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).

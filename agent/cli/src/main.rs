@@ -22,7 +22,7 @@ use cli::{Arguments, Command, UserError};
 /// `EX_NOPERM` and `EX_CONFIG` of sysexits.h.
 const NO_PERMISSION: u8 = 77;
 const BAD_CONFIG: u8 = 78;
-/// What a shell sees of a process that `SIGPIPE` ended.
+/// Exit code that a shell reports for a process that `SIGPIPE` ended.
 const BROKEN_PIPE: u8 = 141;
 
 fn main() -> ExitCode {
@@ -40,8 +40,8 @@ fn main() -> ExitCode {
         if cli::is_broken_pipe(&error) {
             return ExitCode::from(BROKEN_PIPE);
         }
-        // If stderr is closed, the exit code still reports the failure.
-        // Errors quote files, names and answers.
+        // If stderr is closed, the exit code still reports the failure. Errors quote files, names
+        // and answers, so control characters are escaped.
         let _ = writeln!(std::io::stderr(), "{}", visible_lines(&message(&error)));
         exit_code(&error)
     })
@@ -57,7 +57,8 @@ fn check_config(file: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The error with its causes, once. Mistakes of a configuration are one line each, as they are.
+/// Text of an error with its causes. Mistakes of a configuration are printed as they are, one a
+/// line.
 fn message(error: &anyhow::Error) -> String {
     match error.downcast_ref::<ConfigError>() {
         Some(mistakes @ ConfigError::Invalid { .. }) => mistakes.to_string(),

@@ -1,4 +1,4 @@
-//! The life of an agent in order, and the composition root of live agents and replays.
+//! Lifecycle of an agent, and the composition root of live agents and replays.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -35,21 +35,21 @@ use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, memory};
 
-/// Configuration that is read when no other is named and it exists.
+/// Default configuration file.
 pub const DEFAULT_CONFIG: &str = "/etc/ros2probe/ros2probe.yaml";
 
-/// What the command line asks of an agent.
+/// Options of the command line.
 #[derive(Debug, Default)]
 pub struct Options {
-    /// Configuration file; `None` = [`DEFAULT_CONFIG`] if it exists.
+    /// Configuration file. `None` means [`DEFAULT_CONFIG`] if it exists.
     pub config: Option<PathBuf>,
     /// Capture to replay instead of observing this host.
     pub replay: Option<PathBuf>,
-    /// Speed of the replay; `None` = as captured, or as fast as possible for a report.
+    /// Speed of the replay. `None` means as captured, or as fast as possible for a report.
     pub speed: Option<Speed>,
-    /// Prints the metrics on stdout at the end of the capture and ends.
+    /// Whether to print the metrics on stdout at the end of the capture and exit.
     pub report: bool,
-    /// Topics and globs to measure besides those of the configuration.
+    /// Topics and globs to measure in addition to the configured ones.
     pub watch: Vec<Watch>,
     /// Metrics listener instead of the configured one.
     pub metrics: Option<Listen>,
@@ -63,48 +63,49 @@ pub struct Options {
 #[derive(Clone, Copy, Debug)]
 pub struct Listen(pub Option<SocketAddr>);
 
-/// What an agent is made of.
+/// Parts of an agent.
 pub struct Components<'a> {
-    /// Limits, recordings and whether the page is served.
+    /// Configuration of limits, recordings and the page.
     pub config: &'a Config,
-    /// Where datagrams come from.
+    /// Source of datagrams.
     pub source: Source,
-    /// The model, restored if it knew something before.
+    /// The model, with restored state if available.
     pub observer: Observer,
-    /// What metrics are made of.
+    /// Inputs of the metrics.
     pub sources: MetricSources,
-    /// Spans of sampled messages that wait for being exported.
+    /// Spans of sampled messages that wait for export.
     pub spans: Arc<SpanQueue>,
-    /// What is watched.
+    /// Watched topics.
     pub watches: Arc<Watches>,
-    /// Writes down what discovery knows.
+    /// Writer of the discovery state.
     pub keeper: Option<StateWriter>,
-    /// Directory of recordings; `None` = recordings are refused.
+    /// Directory of recordings. `None` means that recordings are refused.
     pub recordings: Option<PathBuf>,
-    /// Finds definitions of messages.
+    /// Definitions of messages.
     pub library: Library,
-    /// For how long figures of topics are kept; zero = not at all.
+    /// Time span of the figures kept for topics; zero means none.
     pub history: Duration,
     /// Addresses at which the page is served.
     pub addresses: Vec<SocketAddr>,
-    /// Ends the working thread and all streams.
+    /// Token that stops the working thread and all streams.
     pub stop: CancellationToken,
 }
 
 /// An agent that is ready to run.
 pub struct AssembledAgent {
-    /// The loop of the working thread.
+    /// Loop of the working thread.
     pub run: Run,
-    /// What the API answers from.
+    /// Context of the API.
     pub context: api::Context,
-    /// Reloads that clients ask for.
+    /// Reloads requested by clients.
     pub reloads: Reloads,
 }
 
 impl Components<'_> {
-    /// Connects the parts. Starts the threads of configured snapshots, and no other.
+    /// Connects the parts. Starts only the threads of configured snapshots.
     ///
     /// # Errors
+    ///
     /// Returns [`Refusal`] if a snapshot cannot be kept.
     pub fn assemble(self) -> Result<AssembledAgent, Refusal> {
         let Self {
@@ -112,7 +113,7 @@ impl Components<'_> {
         } = self;
         let caps = Caps {
             subscriptions: config.limits.subscriptions,
-            // The other half is for samples that are being assembled.
+            // The other half is for samples in assembly.
             bytes: config.limits.payload_bytes / 2,
         };
         let subscriptions =
@@ -131,11 +132,11 @@ impl Components<'_> {
             library: Arc::clone(&library),
         }));
         let snapshots = match Snapshots::start(&config.recordings.snapshots, &recordings) {
-            // A disk that is missing today is no reason to observe nothing.
+            // A missing disk must not prevent observation.
             Err(refusal @ Refusal::NoDirectory)
                 if config.recordings.is_in(&config.state_directory) =>
             {
-                tracing::error!(%refusal, "no snapshots are kept");
+                tracing::error!(%refusal, "snapshots are disabled");
                 Snapshots::default()
             }
             started => started?,
@@ -186,7 +187,8 @@ impl Components<'_> {
 /// Runs an agent until a signal, a failure or the end of a report.
 ///
 /// # Errors
-/// Returns the reason why it did not start or could not go on.
+///
+/// Returns the reason why the agent could not start or had to stop.
 pub fn run(options: Options) -> Result<()> {
     let (configured, file) = configuration(options.config.as_deref())?;
     let config = overridden(&configured, &options);
@@ -198,7 +200,7 @@ pub fn run(options: Options) -> Result<()> {
     sources.lost_lines = log.lost_lines();
     let watches = watches(&config, options.watch, &sources)?;
     let (server, mut control) = listeners(&config, &sources)?;
-    // A replay is a person's own command, which reads and writes that person's files.
+    // A replay runs as the user of the command line and accesses that user's files.
     if matches!(source, Source::Live(_)) {
         announce(privilege::become_own_user());
     }
@@ -267,7 +269,7 @@ pub fn run(options: Options) -> Result<()> {
     Ok(())
 }
 
-/// The configuration with what the command line overrides.
+/// The configuration with the overrides of the command line.
 fn overridden(configured: &Config, options: &Options) -> Config {
     let mut config = configured.clone();
     if let Some(listen) = options.metrics {
@@ -284,13 +286,13 @@ fn overridden(configured: &Config, options: &Options) -> Config {
     config
 }
 
-/// What is exported, by the configuration and the environment.
+/// Settings of exports, from the configuration and the environment.
 fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
     let variable = |name: &str| std::env::var(name).ok();
     otlp::Settings::resolve(&config.otlp, &variable, &Host::read())
 }
 
-/// The watches of the configuration and of the command line.
+/// Watches of the configuration and of the command line.
 fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Result<Arc<Watches>> {
     let watches = Watches::new(
         Arc::clone(&sources.limits),
@@ -303,7 +305,7 @@ fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Resul
     Ok(Arc::new(watches.context("the watchlist is unusable")?))
 }
 
-/// How long figures are kept: only clients of the API read them.
+/// Time span of figures. Zero if no API listener exists, since only its clients read them.
 fn history(config: &Config, control: &api::Server) -> Duration {
     match control.is_empty() {
         true => Duration::ZERO,
@@ -311,7 +313,7 @@ fn history(config: &Config, control: &api::Server) -> Duration {
     }
 }
 
-/// Where the page is served.
+/// Addresses at which the page is served.
 fn page_addresses(config: &Config, control: &api::Server) -> Vec<SocketAddr> {
     match config.api.page {
         PageChoice::On => control.addresses().collect(),
@@ -331,7 +333,7 @@ fn worker(source: &mut Source) -> Result<Worker> {
     Worker::start(role).context("cannot start the working thread")
 }
 
-/// Runs until a signal, a failure or the end of a report, and completes what is written.
+/// Runs until a signal, a failure or the end of a report, then completes open files.
 fn supervise(
     supervisor: Supervisor,
     surfaces: Surfaces,
@@ -356,17 +358,17 @@ fn supervise(
     ended
 }
 
-/// The state directory, and what the agent before this one left in it.
+/// State directory with the state of the previous agent.
 struct KeptState {
     directory: Option<Arc<StateDirectory>>,
     known: Option<Memory>,
-    /// What is known may be written over what is there, and so may the watches.
+    /// Whether discovery state and watches may be overwritten.
     keeps_known: bool,
     keeps_watches: bool,
 }
 
 impl KeptState {
-    /// Reads the state of a live agent; restores its watches.
+    /// Reads the state of a live agent and restores its watches.
     fn open(source: &Source, config: &Config, watches: &Watches) -> Self {
         let directory = match source {
             Source::Live(_) => memory::open(&config.state_directory),
@@ -389,7 +391,7 @@ impl KeptState {
         self.directory.as_deref()
     }
 
-    /// Gives the model what was known.
+    /// Restores the discovery state into the model.
     fn restore(&mut self, observer: &mut Observer, source: &Source) {
         if let (Some(known), Source::Live(live)) = (self.known.take(), source) {
             observer.input(Input::Restored {
@@ -397,12 +399,12 @@ impl KeptState {
                 now: live.clock(),
             });
             drop(known);
-            // Reading it takes several times what stays of it.
+            // Decoding needs several times the memory of the decoded state.
             give_back_memory();
         }
     }
 
-    /// Starts the threads that write watches and what is known.
+    /// Starts the threads that write watches and discovery state.
     fn keep(self, watches: &Watches) -> std::io::Result<Option<StateWriter>> {
         let Some(directory) = self.directory else {
             return Ok(None);
@@ -417,10 +419,11 @@ impl KeptState {
     }
 }
 
-/// Reads the configuration, and returns it with its file. Without `file`, a missing
-/// [`DEFAULT_CONFIG`] gives the defaults.
+/// Reads the configuration, and returns it with the path of its file. Without `file` and
+/// [`DEFAULT_CONFIG`], returns the defaults.
 ///
 /// # Errors
+///
 /// Returns [`ConfigError`] if the file cannot be read or has mistakes.
 pub fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>), ConfigError> {
     let default = Path::new(DEFAULT_CONFIG);
@@ -433,7 +436,7 @@ pub fn configuration(file: Option<&Path>) -> Result<(Config, Option<PathBuf>), C
     }
 }
 
-/// Binds the listeners that are opened before privileges are given up.
+/// Binds the listeners that need the initial privileges.
 fn listeners(config: &Config, sources: &MetricSources) -> Result<(Option<Server>, api::Server)> {
     let web_config = config.metrics.web_config.as_deref();
     let bind = |address| Server::bind(address, web_config, sources.clone());
@@ -441,7 +444,7 @@ fn listeners(config: &Config, sources: &MetricSources) -> Result<(Option<Server>
     Ok((server, control::open(&config.api)?))
 }
 
-/// Gives up the privileges of this thread, and reads back that none is left.
+/// Drops the privileges of this thread, and verifies that none is left.
 fn give_up() -> Result<Unprivileged> {
     privilege::confine(Role::Service)?;
     let powerless = Unprivileged::verify()?;

@@ -1,5 +1,5 @@
-//! What the agent knows about itself at one moment: filled by the capture thread, read by the
-//! surfaces. Plain numbers, collected where they are counted.
+//! Facts about the agent itself at one moment. The capture thread fills them in, and the surfaces
+//! read them. They are plain numbers, collected from their counters.
 
 use std::time::Instant;
 
@@ -9,138 +9,138 @@ use crate::privilege::{self, Sandbox};
 use crate::state::StateFacts;
 use ros2probe_model::dispatch::MissedReason;
 
-/// One moment of the agent.
+/// State of the agent at one moment.
 #[derive(Clone, Debug)]
 pub struct AgentFacts {
-    /// Where packets come from.
+    /// Kind of the packet source.
     pub source: SourceKind,
-    /// Why it is not the one that sees more; `None` where it is, or where it was asked for.
+    /// Reason why the source with more visibility is not used. `None` if it is used, or if the
+    /// configuration selects this one.
     pub source_reason: Option<String>,
-    /// What the source can see, each ability once; what is not listed it cannot.
+    /// Abilities of the source, each at most once.
     pub abilities: Vec<Ability>,
-    /// Why it cannot see what it otherwise could, in words; not of every ability it lacks.
+    /// Reasons for missing abilities, as text. Not every missing ability has one.
     pub blind: Vec<(Ability, String)>,
-    /// What it looks at and is gone, in words: nothing is seen there.
+    /// Observed object that no longer exists, as text; traffic there is invisible.
     pub gone: Option<String>,
-    /// How often the control group that it looks at was made anew.
+    /// Number of times the host hook was attached again to a recreated control group.
     pub attached_anew: u64,
-    /// When this was filled in.
+    /// Time at which these facts were collected.
     pub at: Instant,
-    /// When the source last came back from waiting for packets, with or without any.
+    /// Time of the source's last return from a wait, with or without packets.
     pub capture_progress: Instant,
-    /// A replay has reached its end.
+    /// Whether a replay has reached its end.
     pub finished: bool,
-    /// When the capture that is replayed begins, in its own time.
+    /// Start of the replayed capture, in its own time.
     pub capture_begin: Option<Timestamp>,
-    /// Which part of the capture's file was read, 0 to 1; `None` if that is unknown.
+    /// Fraction of the capture's file that was read, 0 to 1. `None` if unknown.
     pub replayed: Option<f64>,
-    /// Packets of a capture whose link layer cannot be read, by the layer's number.
+    /// Packets of a capture with an unsupported link layer, by link-layer number.
     pub unsupported_packets: Vec<(u16, u64)>,
-    /// Per interface, or per network namespace where the kernel counts no finer.
+    /// Counters per interface, or per network namespace if the kernel has no finer ones.
     pub interfaces: Vec<InterfaceFacts>,
-    /// The kernel filter's counters of events, complete and in a fixed order.
+    /// Event counters of the kernel filter, all of them in a fixed order.
     pub filter_events: Vec<(&'static str, u64)>,
-    /// Bytes that reached user space: packets and records.
+    /// Bytes copied to user space: packets and records.
     pub copied_bytes: u64,
     /// Records lost because the record ring was full.
     pub records_dropped: u64,
-    /// Captured datagrams of the host's sockets of which a piece was lost for want of room.
+    /// Captured datagrams of the host's sockets that lost a piece because the ring was full.
     pub pieces_dropped: u64,
-    /// Frames and datagrams that the kernel programs could not look at: their working memory was
-    /// in use.
+    /// Frames and datagrams that the kernel programs could not process, because their working
+    /// memory was in use.
     pub contended: u64,
-    /// Fragmented datagrams that were begun and never became complete.
+    /// Fragmented datagrams that never became complete.
     pub incomplete_datagrams: u64,
-    /// Bytes held to put IP fragments together.
+    /// Bytes held for reassembly of IP fragments.
     pub reassembly_bytes: u64,
-    /// Bytes held to put captured datagrams together that come from the sockets in pieces.
+    /// Bytes held for reassembly of captured datagrams that arrive from the sockets in pieces.
     pub pieces_bytes: u64,
-    /// Datagrams of which fragments were missing and that were given up for want of room.
+    /// Incomplete datagrams evicted from reassembly to make room.
     pub reassembly_evicted: u64,
-    /// Changes of interest for which the kernel filter had no room.
+    /// Updates of topics of interest that did not fit into the kernel filter's maps.
     pub refused_updates: u64,
-    /// What became of the state for the next start; `None` = none is kept.
+    /// Result of saving the state. `None` if no state is saved.
     pub state: Option<StateFacts>,
-    /// The look at shared memory, where there is one.
+    /// Facts about reading shared memory. `None` if it is not read.
     pub shared_memory: Option<SharedMemoryFacts>,
-    /// Libraries whose processes' messages into shared memory are to be seen one by one, if that was
-    /// asked for.
+    /// Libraries with uprobes for exact capture of shared memory. Empty if exact mode is off.
     pub exact: Vec<ExactFacts>,
-    /// Who gets messages one by one.
+    /// Facts about subscriptions.
     pub subscriptions: SubscriptionFacts,
-    /// What keeps the agent from system calls that it does not make.
+    /// Filter of system calls in force.
     pub sandbox: Sandbox,
 }
 
-/// One library of exact mode.
+/// State of exact capture for one library.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct ExactFacts {
-    /// Its path as its processes see it; empty = this is about all of them.
+    /// Path of the library as seen by its processes. Empty for facts about all libraries.
     pub library: String,
-    /// Why messages are not seen, `None` where they are.
+    /// Reason for the failure. `None` while messages are captured.
     pub refused: Option<String>,
 }
 
-/// The look at shared memory.
+/// Facts about reading shared memory.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SharedMemoryFacts {
-    /// What is open, by kind.
+    /// Open objects by kind.
     pub open: Vec<(&'static str, u64)>,
-    /// What was met, by event, complete and in a fixed order.
+    /// Events by kind, all of them in a fixed order.
     pub events: Vec<(&'static str, u64)>,
-    /// CPU time it took.
+    /// CPU time used, in seconds.
     pub cpu_seconds: f64,
-    /// Looks so far.
+    /// Number of polls.
     pub looks: u64,
 }
 
-/// Where packets come from.
+/// Kind of a packet source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SourceKind {
-    /// Datagrams at this host's sockets.
+    /// Datagrams at the sockets of this host.
     Host,
-    /// Frames on this host's interfaces.
+    /// Frames on the interfaces of this host.
     Wire,
     /// A capture file.
     Replay,
 }
 
-/// What a source may be able to see.
+/// Ability of a source.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Ability {
-    /// What each subscriber received, also where several share a destination.
+    /// Messages received by each subscriber, also if several share a destination.
     Subscribers,
-    /// Messages leaving this host.
+    /// Messages sent by this host.
     Sent,
-    /// Which messages died in the full buffer of a subscriber's socket.
+    /// Messages lost in the full receive buffer of a subscriber's socket.
     SocketLosses,
-    /// Which messages died in IP reassembly.
+    /// Messages lost in IP reassembly.
     ReassemblyLosses,
     /// Process and control group of sockets.
     Owners,
-    /// Sockets in every network namespace: all containers.
+    /// Sockets in every network namespace, which includes all containers.
     Containers,
     /// Traffic that no local socket sends or receives.
     Forwarded,
-    /// Messages between processes of this host through shared memory, sampled.
+    /// Messages in shared memory between processes of this host, sampled.
     SharedMemory,
-    /// Each of them, in every process that sends there.
+    /// Every message in shared memory, from all processes.
     SharedMemoryExact,
 }
 
 /// Counters of one interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InterfaceFacts {
-    /// Name; with the namespace in front where it is not the agent's own.
+    /// Name, preceded by the namespace unless it is the agent's own.
     pub name: String,
-    /// Packets that the filter let through, where they are counted so.
+    /// Packets that passed the filter. `None` if there is no such counter.
     pub packets: Option<u64>,
-    /// Packets lost because the ring was full, where they are counted so.
+    /// Packets lost because the ring was full. `None` if there is no such counter.
     pub dropped: Option<u64>,
 }
 
 impl AgentFacts {
-    /// Nothing has happened yet.
+    /// Initial facts of a source.
     #[must_use]
     pub fn new(source: SourceKind, at: Instant) -> Self {
         Self {
@@ -187,7 +187,7 @@ impl SourceKind {
         }
     }
 
-    /// What every source of this kind can see; the kernel and the configuration may allow more.
+    /// Abilities of every source of this kind. The kernel and the configuration may add more.
     #[must_use]
     pub const fn abilities(self) -> &'static [Ability] {
         match self {
@@ -199,7 +199,7 @@ impl SourceKind {
 }
 
 impl Ability {
-    /// All of them.
+    /// All abilities.
     pub const ALL: [Self; 9] = [
         Self::Subscribers,
         Self::Sent,
@@ -232,18 +232,18 @@ impl Ability {
 /// Figures of all subscriptions.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SubscriptionFacts {
-    /// Open ones.
+    /// Open subscriptions.
     pub open: usize,
-    /// Refused ones so far.
+    /// Refused subscriptions since the start.
     pub refused: u64,
-    /// Samples put into queues so far, for each reader.
+    /// Samples put into queues since the start, per reader.
     pub given: u64,
-    /// Samples not given so far, for each reader, in the order of [`MissedReason::ALL`].
+    /// Samples not delivered since the start, per reader, in the order of [`MissedReason::ALL`].
     pub missed: [u64; MissedReason::ALL.len()],
-    /// Of those, samples that had to go because all queues together were full.
+    /// Those of them evicted because all queues together were full.
     pub crowded_out: u64,
     /// Bytes that wait in queues.
     pub queued_bytes: usize,
-    /// Bytes of messages that are retained.
+    /// Bytes of retained messages.
     pub retained_bytes: usize,
 }

@@ -1,5 +1,5 @@
-//! Where the control API listens, as the configuration, the command line and the service manager
-//! say.
+//! Selects the listeners of the control API from the configuration, the command line and the
+//! service manager.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt as _;
@@ -11,14 +11,14 @@ use anyhow::Result;
 
 use crate::agent::Listen;
 
-/// Where the package and the service manager put it.
+/// Runtime directory of the package and of the service manager.
 const DEFAULT: &str = "/run/ros2probe";
-/// Set by the service manager: directories, separated by colons.
+/// Variable of the service manager: directories, separated by colons.
 const VARIABLE: &str = "RUNTIME_DIRECTORY";
 const SOCKET: &str = "api.sock";
 
-/// What the command line says goes before what the configuration says. A report is over before
-/// anybody could ask.
+/// Applies the command line to the configuration. With a report, there is no listener, since it
+/// ends before a client could connect.
 pub(crate) fn choose(
     settings: &mut ApiSettings,
     asked: Option<Listen>,
@@ -36,14 +36,14 @@ pub(crate) fn choose(
     }
 }
 
-/// Binds the address that is asked for, and reads the token.
+/// Binds the configured address, and reads the token.
 pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     let token = settings.token_file.as_deref();
     let mut server = Server::new(token, settings.loopback)?;
     if let Some(path) = token
         && fs::metadata(path).is_ok_and(|file| file.permissions().mode() & 0o004 != 0)
     {
-        tracing::warn!(path = %path.display(), "every user of this host can read the token");
+        tracing::warn!(path = %path.display(), "every user of this host can read the token file");
     }
     if let Some(address) = settings.listen {
         server.bind(address)?;
@@ -51,7 +51,7 @@ pub(crate) fn open(settings: &ApiSettings) -> Result<Server> {
     Ok(server)
 }
 
-/// Binds the socket that is asked for, which makes files.
+/// Binds the configured unix socket, which creates files.
 pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result<()> {
     match &settings.socket {
         SocketChoice::Off => {}
@@ -68,7 +68,7 @@ pub(crate) fn open_socket(server: &mut Server, settings: &ApiSettings) -> Result
     Ok(())
 }
 
-/// The socket of this agent, where there is a directory for it.
+/// Path of the agent's socket. `None` without a directory for it.
 fn socket() -> Option<PathBuf> {
     let named = std::env::var_os(VARIABLE).filter(|paths| !paths.is_empty());
     if let Some(paths) = named {

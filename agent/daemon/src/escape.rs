@@ -1,16 +1,16 @@
-//! Text from outside on its way to a terminal: names and messages are anybody's, and a terminal
-//! obeys what it is shown.
+//! Escapes untrusted text for a terminal. Names and messages come from the network, and a terminal
+//! interprets control sequences.
 
 use std::borrow::Cow;
 
-/// Control characters, and those that show nothing of their own, as escapes: two names that look the
-/// same are the same.
+/// Escapes control characters and invisible characters, so that two names that look the same are
+/// the same.
 #[must_use]
 pub fn visible(text: &str) -> Cow<'_, str> {
     escaped(text, commands)
 }
 
-/// Likewise of text that has lines: their ends and tabs stay.
+/// As [`visible`], but keeps line ends and tabs.
 #[must_use]
 pub fn visible_lines(text: &str) -> Cow<'_, str> {
     escaped(text, |each| commands(each) && !matches!(each, '\n' | '\t'))
@@ -40,9 +40,10 @@ fn commands(each: char) -> bool {
     each.is_control() || is_unseen(each)
 }
 
-/// Characters that show nothing, turn the direction of what follows or end a line: those of the
-/// categories Cf, Zl and Zp, and the default ignorable ones (Unicode 16, DerivedCoreProperties.txt)
-/// but the variation selectors U+FE00 to U+FE0F, which belong to emoji.
+/// Returns whether the character is invisible, changes the text direction or ends a line. These are
+/// the categories Cf, Zl and Zp, and the default ignorable characters (Unicode 16,
+/// DerivedCoreProperties.txt). The variation selectors U+FE00 to U+FE0F are excluded, since they
+/// belong to emoji.
 const fn is_unseen(each: char) -> bool {
     matches!(
         each,

@@ -1,13 +1,15 @@
-//! The log of events: the last ones, numbered, for any number of readers that come and go.
+//! Log of events: the last ones, numbered, for any number of readers.
 //!
-//! A writer is never held up: it appends under a lock that readers hold only to copy references.
-//! A reader keeps its own position; what was overwritten before it came is counted and told to it,
-//! never passed over in silence. Storms are cut here: so many events of one name in a second, the
-//! rest in one number. The seconds of what happened to the robot are those of the source's clock, so
-//! that a capture gives the same events at any speed.
+//! Writers never wait for readers: they append under a lock that readers hold only to copy
+//! references. Each reader keeps its own position; overwritten events are counted and reported to
+//! it.
 //!
-//! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
-//! restart an old position is not taken for a new one.
+//! Bursts are limited: only so many events of one name are kept per second, and the rest is one
+//! count. Seconds of robot events are those of the source's clock, so a capture gives the same
+//! events at any speed.
+//!
+//! A number belongs to one run of the agent. An event id also names the run, so that a position
+//! from before a restart is not mistaken for a new one.
 
 mod record;
 mod self_monitor;
@@ -29,9 +31,9 @@ use ros2probe_model::event::{Class, Taken};
 pub use self_monitor::{DropMonitor, SourceMonitor};
 pub use table::{Definition, EVENTS, Severity, markdown};
 
-/// Events kept.
+/// Most events kept.
 const KEPT: usize = 4096;
-/// Events of one name in a second.
+/// Most events of one name per second.
 const MOST: u32 = 200;
 
 /// The last events.
@@ -44,36 +46,36 @@ pub struct EventLog {
     overtaken: [AtomicU64; Reader::ALL.len()],
 }
 
-/// One run of the agent, by the microsecond in which it began.
+/// One run of the agent, identified by its start time in microseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Run(u64);
 
-/// Who reads.
+/// Reader of events.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reader {
     /// A stream of the API.
     Stream,
-    /// The sender of log records.
+    /// The exporter of log records.
     Otlp,
 }
 
-/// A position in some run's events.
+/// Position in the events of some run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Position {
-    /// Behind the event of this number in this run.
+    /// After the event of this number in this run.
     After(u64),
-    /// In another run, or where this one never was.
+    /// In another run, or beyond the events of this one.
     Unknown,
 }
 
-/// What a reader gets.
+/// Events for a reader.
 #[derive(Debug, Default)]
 pub struct Batch {
-    /// Events that were overwritten before they could be read.
+    /// Number of events overwritten before they were read.
     pub lagged: u64,
-    /// What follows them.
+    /// Events after those.
     pub records: Vec<Record>,
-    /// The number to go on behind.
+    /// Number of the last event, after which to continue.
     pub last: u64,
 }
 
@@ -83,14 +85,14 @@ struct Log {
     /// Number of the latest event.
     last: u64,
     recorded: BTreeMap<&'static str, u64>,
-    /// Of the robot, in seconds of the source's clock.
+    /// Counts of robot events, in seconds of the source's clock.
     robot: Storm,
-    /// Of the agent, in seconds of its life.
+    /// Counts of agent events, in seconds since its start.
     agent: Storm,
     suppressed: u64,
 }
 
-/// Events of one whole second.
+/// Counts of events within one second.
 #[derive(Debug, Default)]
 struct Storm {
     second: u64,
@@ -113,7 +115,7 @@ impl Default for EventLog {
 }
 
 impl EventLog {
-    /// Empty, of a run that begins now.
+    /// Creates an empty log for a run that begins now.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -125,8 +127,8 @@ impl EventLog {
         }
     }
 
-    /// Records what the model noticed until `clock`, the source's. Called with nothing too, so that a
-    /// storm's end is recorded.
+    /// Records the model's events until `clock`, the source's time. An empty call records the end
+    /// of a burst.
     pub fn add(&self, taken: Taken, clock: Timestamp) {
         let mut log = self.log();
         let before = log.last;
@@ -137,7 +139,7 @@ impl EventLog {
         for (class, count) in taken.overflow {
             log.hold_back(group(class), count);
         }
-        // What is settled late happened up to a second ago.
+        // Events are settled up to a second after they happen.
         log.turn_robot((clock.0 / SECOND).saturating_sub(1));
         let is_news = log.last > before;
         drop(log);
@@ -146,7 +148,7 @@ impl EventLog {
         }
     }
 
-    /// Nothing more will come: records what is still held back.
+    /// Records suppressed events that are still pending, at the end of a source.
     pub fn settle(&self) {
         let mut log = self.log();
         log.record_suppressed();
@@ -154,12 +156,12 @@ impl EventLog {
         self.news.notify_waiters();
     }
 
-    /// Records what happened to the agent just now.
+    /// Records an event of the agent at the current time.
     pub fn record(&self, event: AgentEvent) {
         self.record_at(event, Instant::now());
     }
 
-    /// Events behind this number, oldest first, not more than so many.
+    /// Events after the number `behind`, oldest first, at most `most`.
     #[must_use]
     pub fn read(&self, behind: u64, most: usize) -> Batch {
         let log = self.log();
@@ -183,16 +185,16 @@ impl EventLog {
         }
     }
 
-    /// Number of the latest event; 0 = none yet.
+    /// Number of the latest event; 0 before the first.
     #[must_use]
     pub fn last(&self) -> u64 {
         self.log().last
     }
 
-    /// Waits until there is an event behind this number.
+    /// Waits for an event after the number `behind`.
     pub async fn wait(&self, behind: u64) {
         loop {
-            // From here on no news is missed.
+            // Registered before the check, so that no event is missed.
             let news = self.news.notified();
             if self.last() > behind {
                 return;
@@ -201,19 +203,19 @@ impl EventLog {
         }
     }
 
-    /// The id of the event of this number.
+    /// Id of the event with this number.
     #[must_use]
     pub fn id(&self, number: u64) -> String {
         format!("{}-{number}", self.run)
     }
 
-    /// What tells this run of the agent from others.
+    /// Identifier of this run of the agent.
     #[must_use]
     pub fn run(&self) -> String {
         self.run.to_string()
     }
 
-    /// What an id means to this run; `None` = it is no id.
+    /// Position of an id relative to this run. `None` if it is not an id.
     #[must_use]
     pub fn position(&self, id: &str) -> Option<Position> {
         let (run, number) = id.split_once('-')?;
@@ -227,14 +229,14 @@ impl EventLog {
         })
     }
 
-    /// So many events were overwritten before this reader came to them.
+    /// Counts events that were overwritten before this reader read them.
     pub fn overtook(&self, reader: Reader, count: u64) {
         if let Some(overtaken) = self.overtaken.get(reader as usize) {
             overtaken.fetch_add(count, Ordering::Relaxed);
         }
     }
 
-    /// Events recorded, by name, also those of which there was none.
+    /// Number of recorded events by name, including zeros.
     #[must_use]
     pub fn recorded(&self) -> Vec<(&'static str, u64)> {
         let log = self.log();
@@ -245,7 +247,7 @@ impl EventLog {
             .collect()
     }
 
-    /// Events that were not told, or not to everybody, by reason.
+    /// Number of events not delivered to all readers, by reason.
     #[must_use]
     pub fn dropped(&self) -> Vec<(&'static str, u64)> {
         let mut dropped = vec![("storm", self.log().suppressed)];
@@ -270,7 +272,7 @@ impl EventLog {
         self.news.notify_waiters();
     }
 
-    /// As if so many events had come and all that is kept had gone since.
+    /// Simulates `count` events, after which all kept events are overwritten.
     #[cfg(test)]
     pub(super) fn overwrite(&self, count: u64) {
         let mut log = self.log();
@@ -280,15 +282,16 @@ impl EventLog {
         self.news.notify_waiters();
     }
 
-    /// What was appended before a panic is whole.
+    /// Locks the log. A poisoned lock is usable, since appended events are complete.
     fn log(&self) -> MutexGuard<'_, Log> {
         self.log.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Log {
-    /// It is this second of the source's clock now: tells what the last one held back. What belongs
-    /// to the second before is of this one; further back the clock was set.
+    /// Advances the source's clock to this second and reports suppressed events of the last one. An
+    /// event of the second before counts in this one. A larger step back means that the clock was
+    /// set.
     fn turn_robot(&mut self, second: u64) {
         let current = self.robot.second;
         if second == current || second.checked_add(1) == Some(current) {
@@ -343,14 +346,14 @@ impl Log {
 }
 
 impl Storm {
-    /// Begins this second; what the one before held back, by name.
+    /// Begins a second. Returns the suppressed events of the one before, by name.
     fn turn(&mut self, second: u64) -> BTreeMap<&'static str, u64> {
         self.second = second;
         self.recorded.clear();
         std::mem::take(&mut self.held_back)
     }
 
-    /// Whether there is room for an event of this name; held back otherwise.
+    /// Returns whether another event of this name is allowed; otherwise counts it as suppressed.
     fn admits(&mut self, name: &'static str) -> bool {
         let recorded = self.recorded.entry(name).or_default();
         if *recorded >= MOST {
@@ -393,7 +396,7 @@ impl fmt::Display for Run {
     }
 }
 
-/// What the names of a class have in common.
+/// Common prefix of a class's event names.
 const fn group(class: Class) -> &'static str {
     match class {
         Class::Participant => "ros2.participant.*",

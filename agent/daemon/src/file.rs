@@ -1,33 +1,36 @@
-//! Files that others name, or leave in a directory: opened without waiting for them.
+//! Opens regular files by untrusted paths without blocking.
 //!
-//! Opening a pipe without a writer waits for ever, and so may reading a device. What is no regular
-//! file is refused. The open file is checked, so it cannot be exchanged in between.
+//! Opening a pipe without a writer blocks forever, as may reading a device. Only regular files are
+//! accepted. The check uses the open descriptor, so the file cannot be replaced in between.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _};
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
 
-/// Opens a regular file to read it.
+/// Opens a regular file for reading.
 ///
 /// # Errors
-/// It cannot be opened, or is no regular file.
+///
+/// The file cannot be opened, or is not a regular file.
 pub fn open(path: &Path) -> io::Result<File> {
     open_with(path, 0)
 }
 
-/// As [`open`]; does not follow a link in place of the file.
+/// As [`open`], but does not follow a symbolic link in the last component.
 ///
 /// # Errors
-/// It cannot be opened, or is a link or no regular file.
+///
+/// The file cannot be opened, is a symbolic link, or is not a regular file.
 pub fn open_no_link(path: &Path) -> io::Result<File> {
     open_with(path, libc::O_NOFOLLOW)
 }
 
-/// Reads a regular file; of one longer than `limit`, one byte more than that.
+/// Reads at most `limit + 1` bytes of a regular file, so that callers detect longer ones.
 ///
 /// # Errors
-/// It cannot be read, or is no regular file.
+///
+/// The file cannot be read, or is not a regular file.
 pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?
@@ -39,7 +42,8 @@ pub fn read(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 /// Reads a text of at most `limit` bytes.
 ///
 /// # Errors
-/// It cannot be read, is no regular file, is longer or no UTF-8.
+///
+/// The file cannot be read, is not a regular file, is longer, or is not UTF-8.
 pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
     let bytes = read(path, limit)?;
     if bytes.len() as u64 > limit {

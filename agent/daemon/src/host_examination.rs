@@ -1,4 +1,4 @@
-//! What `rp doctor` examines of this host with the code that captures, without an agent.
+//! Examinations of this host for `rp doctor`, which use the code of the capture without an agent.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -13,21 +13,21 @@ use rustix::thread::CapabilitySet;
 /// The cgroup v2 hierarchy as this process sees it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CgroupHierarchy {
-    /// None is mounted.
+    /// No hierarchy is mounted.
     NotMounted,
-    /// That of the whole host, at this mount point.
+    /// The hierarchy of the whole host, at this mount point.
     WholeHost(PathBuf),
-    /// A part of it, as containers have.
+    /// A part of the hierarchy, as in containers, at this mount point.
     Part(PathBuf),
-    /// It cannot be opened, for this reason.
+    /// The hierarchy at this mount point cannot be opened, for this reason.
     Unopened(PathBuf, String),
-    /// The mount point is no cgroup, for this reason.
+    /// The mount point is not a cgroup, for this reason.
     Invalid(PathBuf, String),
 }
 
 impl CgroupHierarchy {
-    /// Finds the hierarchy in `mounts`, the content of `/proc/self/mountinfo`. `at` maps an absolute
-    /// path to the file to open.
+    /// Finds the hierarchy in `mounts`, the content of `/proc/self/mountinfo`. `at` maps an
+    /// absolute path to the file to open.
     #[must_use]
     pub fn find(mounts: &[u8], at: impl Fn(&Path) -> PathBuf) -> Self {
         let Some(point) = topmost(mounts) else {
@@ -45,7 +45,8 @@ impl CgroupHierarchy {
 /// Reads the state of the kernel's clock.
 ///
 /// # Errors
-/// Returns the kernel's reason if it refuses.
+///
+/// Returns the kernel's error as text.
 pub fn clock() -> Result<ClockState, String> {
     clock_state().map_err(|error| error.to_string())
 }
@@ -56,13 +57,13 @@ pub fn exact_mode_lacks(effective: CapabilitySet) -> Vec<&'static str> {
     uprobe::lacking(effective)
 }
 
-/// Whether a file of this name is the library of Fast DDS.
+/// Returns whether a file of this name is the library of Fast DDS.
 #[must_use]
 pub fn is_fast_dds(name: &str) -> bool {
     uprobe::processes::is_library(name)
 }
 
-/// An error and its causes in one line; of a verifier's log, the first line.
+/// Error and its causes in one line. Of a verifier log, only the first line.
 #[must_use]
 pub fn error_in_words(error: &dyn Error) -> String {
     in_words(error)

@@ -1,12 +1,14 @@
-//! The agent: brings what its sources capture to the model, and serves what the model knows.
+//! The agent: feeds captured traffic to the model, and serves the model's state.
 //!
-//! - [`agent::run`] is the life of an agent. [`agent::Components`] composes one, live or replayed.
+//! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
+//!   replayed.
 //! - [`replay_agent`] replays a capture within the process of a client.
-//! - [`config`] reads the configuration, [`watches`] merges what is watched.
+//! - [`config`] reads the configuration, [`watches`] merges the watched topics.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
-//! - [`snapshot_cell`] holds the latest snapshot, [`events`] what happened, [`limit_facts`] the caps.
+//! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
+//!   caps.
 //! - [`surface`] serves snapshots: Prometheus, OTLP, the API and the page.
-//! - [`subscriptions`] and [`recording`] take single messages, into streams and bags.
+//! - [`subscriptions`] and [`recording`] pass single messages into streams and bags.
 //!
 //! ```
 //! use ros2probe_daemon::config::Config;

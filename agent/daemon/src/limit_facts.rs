@@ -1,7 +1,7 @@
-//! How far the caps of the configuration are used, and what was refused or given up because of each.
+//! Usage of the configured caps, and the entries refused or evicted because of each.
 //!
-//! Most of it the model counts in its tables anyway. What surfaces and recordings hand out (slots
-//! of connections, bags, watches) is counted here, where it is handed out.
+//! The model counts most of this in its tables. Resources of surfaces and recordings (connection
+//! slots, bags, watches) are counted here.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -11,57 +11,57 @@ use super::snapshot_cell::State;
 use crate::config::{Limit, Limits};
 
 const LIMITS: usize = Limit::ALL.len();
-/// An agent is at a limit for so long after something was refused or given up because of it.
+/// Time for which a limit counts as reached after a refusal or eviction.
 const LATELY: Duration = Duration::from_secs(60);
 
-/// One cap of the configuration, at one moment.
+/// State of one cap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LimitFacts {
-    /// Which.
+    /// Identity of the cap.
     pub limit: Limit,
-    /// Entries, connections or bytes that may be.
+    /// Largest number of entries, connections or bytes.
     pub cap: u64,
-    /// That are.
+    /// Current number.
     pub used: u64,
-    /// Refused, or given up to make room, since the start.
+    /// Number refused or evicted since the start.
     pub reached: u64,
-    /// There is no room, or there was none within the last minute.
+    /// Whether the cap is reached now, or was within the last minute.
     pub at_limit: bool,
 }
 
-/// The caps in force, and what is counted where the model does not.
+/// Caps in force, and counters for resources outside of the model.
 #[derive(Debug)]
 pub struct LimitFigures {
     caps: Limits,
-    /// What is not handed out as slots.
+    /// Usage of resources that have no slots.
     used: [AtomicU64; LIMITS],
     reached: [AtomicU64; LIMITS],
     rises: Mutex<[Rise; LIMITS]>,
     slots: Mutex<Vec<(Limit, Weak<Slots>)>>,
 }
 
-/// When the count of what was refused or given up rose last.
+/// Time of the last increase of a counter.
 #[derive(Clone, Copy, Debug, Default)]
 struct Rise {
     count: u64,
     at: Option<Instant>,
 }
 
-/// Slots of which only so many can be taken at once.
+/// Slots, of which a limited number can be taken at once.
 #[derive(Debug)]
 pub struct Slots {
     cap: usize,
     taken: AtomicUsize,
 }
 
-/// One slot; free again when this is dropped.
+/// One slot, which dropping releases.
 #[derive(Debug)]
 pub struct Slot {
     of: Arc<Slots>,
 }
 
 impl LimitFigures {
-    /// Nothing used yet.
+    /// Creates the figures with zero usage.
     #[must_use]
     pub fn new(caps: Limits) -> Self {
         Self {
@@ -79,8 +79,7 @@ impl LimitFigures {
         &self.caps
     }
 
-    /// As many slots as `limit` allows. Each of several listeners has its own slots, so that a full
-    /// listener does not lock the others.
+    /// Slots for `limit`. Each listener has its own, so that a full one does not block the others.
     #[must_use]
     pub fn slots(&self, limit: Limit) -> Arc<Slots> {
         let slots = Arc::new(Slots {
@@ -92,21 +91,21 @@ impl LimitFigures {
         slots
     }
 
-    /// So many are in use now.
+    /// Sets the current usage.
     pub fn set_used(&self, limit: Limit, used: usize) {
         if let Some(slot) = self.used.get(limit as usize) {
             slot.store(used as u64, Ordering::Relaxed);
         }
     }
 
-    /// So many were refused, or given up.
+    /// Counts refused or evicted entries.
     pub fn reached(&self, limit: Limit, count: usize) {
         if let Some(reached) = self.reached.get(limit as usize) {
             reached.fetch_add(count as u64, Ordering::Relaxed);
         }
     }
 
-    /// Notes what was refused or given up until `state`.
+    /// Updates the times of refusals and evictions from `state`.
     pub fn note(&self, state: &State) {
         let mut rises = self.rises.lock().unwrap_or_else(PoisonError::into_inner);
         for (rise, limit) in rises.iter_mut().zip(Limit::ALL) {
@@ -118,7 +117,7 @@ impl LimitFigures {
         }
     }
 
-    /// All caps as they stand; what the model counts is of `state`.
+    /// State of all caps, with the model's counters from `state`.
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
@@ -137,7 +136,7 @@ impl LimitFigures {
         })
     }
 
-    /// Which limits keep part of the robot from being seen, in words.
+    /// Limits that hide part of the robot, as text. `None` if no limit does.
     #[must_use]
     pub fn degraded(&self, state: &State) -> Option<String> {
         let all = self.facts(state).into_iter();
@@ -195,14 +194,14 @@ impl LimitFigures {
         let all = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
         let slots = all.iter().filter(|(of, _)| *of == limit);
         let taken = slots.filter_map(|(_, slots)| Some(slots.upgrade()?.taken() as u64));
-        // The fullest of several: there the next one is refused.
+        // The largest usage: that listener refuses the next connection.
         let taken = taken.max().unwrap_or(0);
         (taken.max(read(&self.used)), read(&self.reached))
     }
 }
 
 impl Slots {
-    /// A slot, if one is free.
+    /// Takes a slot. `None` if all are in use.
     pub fn take(self: &Arc<Self>) -> Option<Slot> {
         let more = |taken| (taken < self.cap).then_some(taken + 1);
         let taken = self
@@ -213,7 +212,7 @@ impl Slots {
         })
     }
 
-    /// How many there are.
+    /// Number of slots.
     #[must_use]
     pub const fn cap(&self) -> usize {
         self.cap
@@ -286,7 +285,7 @@ mod tests {
         let lately = "at a limit: participants (9 of 10, 5 refused or evicted)";
         assert_eq!(at(62, 9, 5).as_deref(), Some(lately));
         assert_eq!(at(63, 9, 5), None);
-        // What clients hand in hides nothing of the robot.
+        // Resources of clients hide nothing of the robot.
         figures.set_used(Limit::Watches, 1_000);
         assert_eq!(at(64, 9, 5), None);
     }

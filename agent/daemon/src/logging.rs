@@ -1,4 +1,4 @@
-//! The log: events to standard error, in a form the journal keeps well.
+//! Log on standard error, in a format that suits the journal.
 
 mod lines;
 
@@ -13,21 +13,21 @@ use tracing_subscriber::layer::SubscriberExt as _;
 use tracing_subscriber::util::SubscriberInitExt as _;
 use tracing_subscriber::{Layer as _, Registry, fmt, reload};
 
-/// Changes the level of the running agent.
+/// Log whose level can change at run time.
 #[derive(Debug)]
 pub(crate) struct Log {
     level: reload::Handle<EnvFilter, Registry>,
-    /// `RUST_LOG` was given: it stays in force.
+    /// Whether `RUST_LOG` is set, which then stays in force.
     fixed: bool,
     lost: Arc<AtomicU64>,
 }
 
 impl Log {
-    /// Begins logging at `level`, or as `RUST_LOG` says.
+    /// Starts logging at `level`, or as `RUST_LOG` sets.
     pub(crate) fn start(level: Level) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
-        // The journal stamps each line itself.
+        // The journal adds its own timestamps.
         let journal = std::env::var_os("JOURNAL_STREAM").is_some();
         let lost = Arc::<AtomicU64>::default();
         let target = Mutex::new(Lines::new(io::stderr(), Arc::clone(&lost)));
@@ -37,7 +37,7 @@ impl Log {
         } else {
             lines.boxed()
         };
-        // Fails when a log has begun already, which only a test could do.
+        // Fails if a log exists already, which happens only in tests.
         let _ = tracing_subscriber::registry()
             .with(filter)
             .with(lines)
@@ -49,7 +49,7 @@ impl Log {
         }
     }
 
-    /// Lines that standard error did not take, as they are counted.
+    /// Counter of lines that standard error did not accept.
     pub(crate) fn lost_lines(&self) -> Arc<AtomicU64> {
         Arc::clone(&self.lost)
     }

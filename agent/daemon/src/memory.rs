@@ -1,5 +1,5 @@
-//! Where state is kept, as the configuration or the service manager says, and what was found there.
-//! Problems go to the log: an agent without memory still observes.
+//! Selects the state directory from the configuration or the service manager, and loads its
+//! content. Problems are logged: an agent without saved state still observes.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,14 +10,14 @@ use crate::watches::{self, LoadedWatches, Watches};
 use anyhow::anyhow;
 use ros2probe_model::discovery::Memory;
 
-/// Where the package and the service manager put it.
+/// Default directory of the package and of the service manager.
 const DEFAULT: &str = "/var/lib/ros2probe";
-/// Set by the service manager.
+/// Variable of the service manager.
 const VARIABLE: &str = "STATE_DIRECTORY";
-/// In the state directory.
+/// Subdirectory of recordings.
 const RECORDINGS: &str = "recordings";
 
-/// The directory to use; `None` = none.
+/// Opens the state directory. `None` if no state is saved.
 pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
     let named = std::env::var_os(VARIABLE).filter(|path| !path.is_empty());
     let opened = match (choice, named) {
@@ -33,14 +33,14 @@ pub(crate) fn open(choice: &StateChoice) -> Option<Arc<StateDirectory>> {
             let reason = format!("{:#}", anyhow!(error));
             tracing::warn!(
                 reason,
-                "no state is kept: a restart loses names and added watches"
+                "state is not saved: a restart loses names and added watches"
             );
             None
         }
     }
 }
 
-/// Where bags go; `None` = nowhere. Made when the first one is.
+/// Directory of bags, created with the first one. `None` if there is no place for it.
 pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -> Option<PathBuf> {
     match choice {
         StateChoice::Off => None,
@@ -49,7 +49,7 @@ pub(crate) fn recordings(choice: &StateChoice, state: Option<&StateDirectory>) -
     }
 }
 
-/// What the last agent knew, and whether this one may keep what it knows in its place.
+/// Discovery state of the last agent, and whether this agent may overwrite it.
 pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     let path = directory.path().display();
     let known = match directory.load() {
@@ -76,7 +76,7 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
     (known, true)
 }
 
-/// The operator went back to an older rp, and may go forth again.
+/// Logs that state of a newer version is preserved, since the operator may upgrade again.
 fn left_alone(newer: &Newer) {
     let Newer {
         path,
@@ -92,8 +92,8 @@ fn left_alone(newer: &Newer) {
     );
 }
 
-/// Watches again what clients of the last agent had asked for; whether this one may keep in its
-/// place what they ask for.
+/// Restores watches that clients of the last agent had added. Returns whether this agent may
+/// overwrite them.
 pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> bool {
     let Some(kept) = load_watches(directory) else {
         return false;
@@ -109,7 +109,7 @@ pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> 
     true
 }
 
-/// `None` = those of a newer rp.
+/// Reads saved watches. `None` if a newer version wrote them.
 fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
     let path = directory.path().display();
     Some(match watches::load(directory) {

@@ -1,5 +1,5 @@
-//! An agent within this process that replays a capture. Clients ask it over pipes in memory, as they
-//! ask another agent over sockets: the same code describes a capture and a robot.
+//! Agent within this process that replays a capture. Clients send requests over pipes in memory, as
+//! over sockets to other agents. The same code thus describes a capture and a robot.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -25,38 +25,38 @@ use crate::surface::MetricSources;
 use crate::surface::api;
 use crate::watches::Watches;
 
-/// Bytes that a pipe holds: more than most answers.
+/// Capacity of a pipe in bytes; most answers are smaller.
 const PIPE_BYTES: usize = 1 << 20;
-/// A capture is read offline: the limit of a live agent does not apply.
+/// Cap on topics. A capture is read offline, so the limit of a live agent does not apply.
 const TOPICS: usize = 16_384;
-/// The longest wait for the end of a replay whose streams have ended.
+/// Longest wait for the end of a replay whose streams have ended.
 const TIMEOUT: Duration = Duration::from_millis(500);
 
-/// What of a capture is replayed, and how.
+/// Range and pace of a replay.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReplayOptions {
-    /// Where [`Pace::Pause`] pauses; `None` = at the beginning of the capture.
+    /// Time at which [`Pace::Pause`] pauses. `None` means the beginning of the capture.
     pub from: Option<CaptureTime>,
-    /// Where the replay ends; `None` = at the end of the capture.
+    /// Time at which the replay ends. `None` means the end of the capture.
     pub until: Option<CaptureTime>,
     /// Whether every topic is measured.
     pub measured: bool,
-    /// How the replay goes on while clients ask.
+    /// Pace of the replay during requests.
     pub pace: Pace,
 }
 
-/// How a replay goes on while clients ask.
+/// Pace of a replay during requests.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pace {
-    /// It has ended before the first request.
+    /// It ends before the first request.
     ToEnd,
     /// It pauses until [`ReplayAgent::resume`].
     Pause,
-    /// It goes on at this speed.
+    /// It continues at this speed.
     Live(Speed),
 }
 
-/// A capture with an agent of its own, which ends with this value.
+/// A capture with its own agent. Dropping it ends the agent.
 #[derive(Debug)]
 pub struct ReplayAgent {
     capture: PathBuf,
@@ -66,19 +66,19 @@ pub struct ReplayAgent {
     outcome: Arc<OnceLock<Outcome>>,
 }
 
-/// How a replay ended.
+/// Result of a replay.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Outcome {
-    /// Why the rest of the capture was not read.
+    /// Reason why the rest of the capture was not read.
     pub fault: Option<String>,
-    /// Packets of link layers that are not supported.
+    /// Packets of unsupported link layers.
     pub unsupported_packets: u64,
 }
 
-/// Why a capture is not replayed.
+/// A capture cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
-    /// The file is no capture, or cannot be read.
+    /// The file is not a capture, or cannot be read.
     #[error(transparent)]
     Capture(PcapError),
     /// The agent could not be started.
@@ -87,13 +87,13 @@ pub enum ReplayError {
 }
 
 impl ReplayAgent {
-    /// Replays `capture` on a thread of its own. `report` receives a line for each part of the
-    /// capture that cannot be read, except with [`Pace::Live`]; what came before counts. Runs within
-    /// a tokio runtime, which serves the requests.
+    /// Replays `capture` on its own thread. `report` receives a line for each unreadable part of
+    /// the capture, except with [`Pace::Live`]; earlier packets count. Call it within a tokio
+    /// runtime, which serves the requests.
     ///
     /// # Errors
-    /// Returns [`ReplayError`] if the capture has a link layer that is not supported, or cannot be
-    /// opened.
+    ///
+    /// Returns [`ReplayError`] if the capture has an unsupported link layer or cannot be opened.
     pub async fn start(
         capture: &Path,
         options: ReplayOptions,
@@ -106,7 +106,7 @@ impl ReplayAgent {
         let agent = assemble(replay, options.measured, &config, stop.clone());
         let agent = agent.map_err(ReplayError::Start)?;
         let is_live = matches!(options.pace, Pace::Live(_));
-        // With `Pace::Live` the terminal belongs to the client.
+        // With `Pace::Live` the client uses the terminal.
         let report = (!is_live).then(|| Report {
             file: capture.to_path_buf(),
             print: report,
@@ -135,7 +135,7 @@ impl ReplayAgent {
         })
     }
 
-    /// How the replay ended; `None` while it goes on.
+    /// Result of the replay. `None` until its end.
     #[must_use]
     pub fn outcome(&self) -> Option<Outcome> {
         let deadline = Instant::now() + TIMEOUT;
@@ -154,14 +154,14 @@ impl ReplayAgent {
         client
     }
 
-    /// Replays the rest.
+    /// Replays the rest after a pause.
     pub fn resume(&self) {
         if let Some(control) = &self.control {
             control.resume();
         }
     }
 
-    /// The file.
+    /// Path of the capture.
     #[must_use]
     pub fn capture(&self) -> &Path {
         &self.capture
@@ -174,7 +174,7 @@ impl Drop for ReplayAgent {
     }
 }
 
-/// Opens the capture, and the control of its pause if there is one.
+/// Opens the capture, with a control of its pause if there is one.
 fn open(
     capture: &Path,
     options: ReplayOptions,
@@ -219,7 +219,7 @@ fn assemble(
         everything.into_iter().collect(),
     );
     let settings = observer::Settings {
-        // No kernel has to follow first.
+        // No kernel filter has to be updated first.
         payload_delay: 0,
         ..observer::Settings::default().with_limits(&config.limits)
     };
@@ -241,15 +241,15 @@ fn assemble(
     components.assemble().map_err(io::Error::other)
 }
 
-/// Prints what was not read of a file.
+/// Prints the unreadable parts of a file.
 struct Report {
     file: PathBuf,
     print: fn(&str),
 }
 
-/// The thread of a replay.
+/// Thread of a replay.
 struct Running {
-    /// How it ended.
+    /// Result of the replay.
     outcome: Arc<OnceLock<Outcome>>,
     /// Receives its error at the end.
     ended: oneshot::Receiver<Option<RunError>>,
@@ -282,7 +282,7 @@ fn spawn(
     Ok(Running { outcome, ended })
 }
 
-/// What of a capture was not read, and what to do: a line each.
+/// Unreadable parts of a capture with their remedies, one a line.
 fn faults(
     capture: &Path,
     result: &Result<(), RunError>,
@@ -291,16 +291,16 @@ fn faults(
     let capture = capture.display();
     let mut lines = Vec::new();
     match result {
-        // The error of the whole command says so.
+        // The command's own error covers it.
         Err(RunError::Replay(PcapError::UnsupportedLink { .. })) => return lines,
         Err(RunError::Replay(error @ (PcapError::Truncated { .. } | PcapError::Read { .. }))) => {
             lines.push(format!(
-                "{capture} is incomplete: {error}; what follows is missing. Copy it again, or let \
+                "{capture} is incomplete: {error}; the rest is missing. Copy it again, or let \
                  tcpdump end by itself"
             ));
         }
         Err(RunError::Replay(error)) => lines.push(format!(
-            "{capture} cannot be read further: {error}; what follows is missing"
+            "{capture} cannot be read further: {error}; the rest is missing"
         )),
         Err(error) => lines.push(error.to_string()),
         Ok(()) => {}

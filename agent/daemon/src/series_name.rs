@@ -4,8 +4,8 @@ use std::borrow::Cow;
 
 use ros2probe_model::topic_kind::TopicKind;
 
-/// The ROS name of a topic. Services and other plumbing keep their DDS names: a request, its reply
-/// and a topic may share their ROS name. A DDS name that looks like a ROS name is marked.
+/// ROS name of a topic. Topics of services and actions keep their DDS names, because a request, its
+/// reply and a topic may share their ROS name. A DDS name that looks like a ROS name is marked.
 pub(crate) fn series_name<'a>(kind: TopicKind, name: &'a str, dds_name: &'a str) -> Cow<'a, str> {
     match kind {
         TopicKind::Topic | TopicKind::ActionFeedback | TopicKind::ActionStatus => {

@@ -1,4 +1,4 @@
-//! The part of the configuration that decides what is shown, replaced by reloads.
+//! Settings of the displayed data, which reloads replace.
 
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -7,37 +7,37 @@ use arc_swap::ArcSwap;
 
 use crate::config::{Config, Limits, Watch};
 
-/// The settings in force, and how the last reload went.
+/// Settings in force, and the result of the last reload.
 #[derive(Debug)]
 pub struct SettingsCell {
     settings: ArcSwap<Settings>,
     reload: ArcSwap<Reload>,
 }
 
-/// The part of the configuration that decides what is shown.
+/// Settings of the displayed data.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Settings {
-    /// Expectations are shown as configured.
+    /// Watches, whose expectations are shown as configured.
     pub watches: Vec<Arc<Watch>>,
-    /// Histograms of watched topics.
+    /// Whether watched topics have histograms.
     pub histograms: bool,
-    /// Series per writer.
+    /// Whether watched topics have series per writer.
     pub per_writer: bool,
     /// Caps; those of the start stay in force.
     pub limits: Limits,
 }
 
-/// How the last reload of the configuration went.
+/// Result of the last reload of the configuration.
 #[derive(Clone, Copy, Debug)]
 pub struct Reload {
-    /// It was taken over.
+    /// Whether it was applied.
     pub successful: bool,
-    /// When one was last taken over.
+    /// Time of the last successful reload.
     pub last_success: SystemTime,
 }
 
 impl Settings {
-    /// What `config` wants to be shown, with the watches that are in force.
+    /// Settings of `config`.
     #[must_use]
     pub fn new(config: &Config) -> Self {
         Self {
@@ -50,7 +50,7 @@ impl Settings {
 }
 
 impl SettingsCell {
-    /// Of an agent that read its configuration now.
+    /// Creates the cell of an agent that read its configuration now.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         let reload = Reload {
@@ -63,13 +63,13 @@ impl SettingsCell {
         }
     }
 
-    /// The settings in force.
+    /// Settings in force.
     #[must_use]
     pub fn settings(&self) -> Arc<Settings> {
         self.settings.load_full()
     }
 
-    /// How the last reload went.
+    /// Result of the last reload.
     #[must_use]
     pub fn reload(&self) -> Reload {
         **self.reload.load()
@@ -83,7 +83,7 @@ impl SettingsCell {
         });
     }
 
-    /// Takes over the settings of a reload that worked.
+    /// Applies the settings of a successful reload.
     pub fn reloaded(&self, settings: Settings) {
         self.settings.store(Arc::new(settings));
         let reload = Reload {
@@ -93,7 +93,7 @@ impl SettingsCell {
         self.reload.store(Arc::new(reload));
     }
 
-    /// Notes that a reload was refused.
+    /// Records a refused reload.
     pub fn reload_failed(&self) {
         let last_success = self.reload.load().last_success;
         self.reload.store(Arc::new(Reload {

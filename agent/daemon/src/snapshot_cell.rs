@@ -1,7 +1,7 @@
-//! The latest snapshot, as the capture thread publishes it and surfaces read it.
+//! Latest snapshot, published by the capture thread and read by surfaces.
 //!
-//! A reader takes the latest state and the writer replaces it: neither waits for the other. A reader
-//! may ask for a newer state and wait for it within its timeout.
+//! Readers and the writer never wait for each other. A reader may request a newer state and wait
+//! for it within its timeout.
 
 use std::os::fd::BorrowedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,7 +16,7 @@ use ros2probe_capture::bell::Bell;
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::Snapshot;
 
-/// Older than this, the state no longer describes the robot.
+/// Age above which the state no longer describes the robot.
 const FRESH: Duration = Duration::from_secs(5);
 
 /// The latest state and the last seconds.
@@ -24,23 +24,23 @@ const FRESH: Duration = Duration::from_secs(5);
 pub struct SnapshotCell {
     state: ArcSwap<State>,
     past: ArcSwap<Past>,
-    /// A reader waits for a newer state.
+    /// Whether a reader waits for a newer state.
     asked: AtomicBool,
     bell: Arc<CaptureBell>,
     news: Notify,
 }
 
-/// Wakes the capture thread while it waits for packets. Without a socket pair it does not, and readers
-/// wait until the thread looks by itself.
+/// Wakes the capture thread from its wait for packets. Without a socket pair, readers wait until
+/// the thread wakes by itself.
 #[derive(Debug)]
 pub struct CaptureBell(Option<Bell>);
 
-/// What the capture thread found out.
+/// State published by the capture thread.
 #[derive(Clone, Debug)]
 pub struct State {
-    /// The robot; `None` until the first snapshot.
+    /// State of the robot; `None` until the first snapshot.
     pub snapshot: Option<Snapshot>,
-    /// The agent.
+    /// State of the agent.
     pub agent: AgentFacts,
 }
 
@@ -56,13 +56,13 @@ impl CaptureBell {
         }
     }
 
-    /// Readable after [`Self::ring`] until [`Self::silence`].
+    /// Descriptor that is readable after [`Self::ring`] until [`Self::silence`].
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         Some(self.0.as_ref()?.descriptor())
     }
 
-    /// Takes back all rings so far.
+    /// Discards all rings so far.
     pub fn silence(&self) {
         if let Some(bell) = &self.0 {
             bell.silence();
@@ -71,7 +71,7 @@ impl CaptureBell {
 }
 
 impl SnapshotCell {
-    /// Without a snapshot, of an agent that starts now.
+    /// Creates the cell of an agent that starts now, without a snapshot.
     #[must_use]
     pub fn new(source: SourceKind) -> Self {
         let agent = AgentFacts::new(source, Instant::now());
@@ -99,12 +99,12 @@ impl SnapshotCell {
         state
     }
 
-    /// Replaces what was measured in the last seconds.
+    /// Replaces the measurements of the last seconds.
     pub fn publish_past(&self, past: Past) {
         self.past.store(Arc::new(past));
     }
 
-    /// What was measured in the last seconds.
+    /// Measurements of the last seconds.
     #[must_use]
     pub fn past(&self) -> Arc<Past> {
         self.past.load_full()
@@ -116,20 +116,20 @@ impl SnapshotCell {
         self.state.load_full()
     }
 
-    /// Whether a reader waits for a newer state.
+    /// Returns whether a reader waits for a newer state.
     #[must_use]
     pub fn is_asked(&self) -> bool {
         self.asked.load(Ordering::Relaxed)
     }
 
-    /// The bell of the capture thread.
+    /// Bell of the capture thread.
     #[must_use]
     pub const fn bell(&self) -> &Arc<CaptureBell> {
         &self.bell
     }
 
-    /// Asks for a newer state and waits for it, but no longer than `timeout`: counters that a
-    /// scrape reads should be those of its moment, or rates over short windows would be off.
+    /// Requests a newer state and waits for it for at most `timeout`. Counters in a scrape should
+    /// be current, or rates over short windows would be wrong.
     pub async fn refresh(&self, timeout: Duration) {
         let news = self.news.notified();
         if self.state.load().agent.finished {
@@ -137,37 +137,39 @@ impl SnapshotCell {
         }
         self.asked.store(true, Ordering::Relaxed);
         self.bell.ring();
-        // Late or not: the latest state is shown, with its age.
+        // After a timeout, the latest state is shown with its age.
         let _ = tokio::time::timeout(timeout, news).await;
     }
 
-    /// Returns when a newer state is published, without asking for one.
+    /// Returns when a newer state is published, without requesting one.
     pub async fn published(&self) {
         self.news.notified().await;
     }
 }
 
 impl State {
-    /// The robot; nothing at all until the first snapshot.
+    /// State of the robot; empty until the first snapshot.
     #[must_use]
     pub fn known(&self) -> &Snapshot {
         static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
         self.snapshot.as_ref().unwrap_or(&NOTHING)
     }
 
-    /// Whether what is shown describes the robot at `now`.
+    /// Checks whether the state describes the robot at `now`.
     ///
     /// # Errors
-    /// The reason why it does not.
+    ///
+    /// Returns the reason if it does not.
     pub fn ready(&self, now: Instant) -> Result<(), String> {
         self.progresses(now)?;
         self.agent.gone.clone().map_or(Ok(()), Err)
     }
 
-    /// Whether the capture works, also while what it looks at is gone.
+    /// Checks whether the capture works, even if its target no longer exists.
     ///
     /// # Errors
-    /// The reason why it does not.
+    ///
+    /// Returns the reason if it does not.
     pub fn progresses(&self, now: Instant) -> Result<(), String> {
         if self.snapshot.is_none() {
             return Err("starting: nothing captured yet".to_owned());

@@ -1,6 +1,6 @@
-//! How long the names of metrics and events stay.
+//! Stability of the names of metrics and events.
 
-/// Promise to users.
+/// Promise to users about a name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stability {
     /// Changes only with a major version.

@@ -1,10 +1,10 @@
-//! The state directory: what discovery knew, on disk for the next start. What clients watch lies
-//! beside it (`watches`).
+//! State directory: the discovery state, saved for the next start. Watches of clients are saved in
+//! the same directory (`watches`).
 //!
-//! JSON files, each replaced as a whole (new file, fsync, rename, fsync of the directory), so that a
-//! power cut leaves the old or the new one. Writing happens on a thread of its own; the capture
-//! hands over and never waits. Nothing here ends the agent: a file that cannot be read is kept
-//! aside, a disk that is full is counted and said once. One agent to a directory.
+//! JSON files are replaced as a whole: new file, fsync, rename, fsync of the directory. A power
+//! failure therefore leaves the old or the new one. A separate thread writes, so that the capture
+//! never waits. No failure here ends the agent: an unreadable file is moved aside, and a full disk
+//! is counted and logged once. Each agent needs its own directory.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, BufWriter, Read as _, Write as _};
@@ -22,114 +22,114 @@ use serde::{Deserialize, Serialize};
 use crate::file;
 use ros2probe_model::discovery::Memory;
 
-/// The form that is written. What was added to it so far may be lacking in a file and has a default
-/// then. An agent that does not know a field must not take the file for its own: whatever is added
-/// from now on, or means something else, is a new version with a reader of its own.
+/// Version of the written format. Fields added so far may be missing in a file and then have
+/// defaults. An agent that does not know a field must not accept the file. Every further change
+/// therefore needs a new version with its own reader.
 const VERSION: u32 = 1;
 const FORM: Form<Document> = Form {
     file: FILE,
     readers: &[(VERSION, from_json)],
 };
 const FILE: &str = "discovery.json";
-/// What a file is called while it is written.
+/// Name of the file while it is written.
 const NEW_FILE: &str = "discovery.json.new";
-/// A larger file was not written by this.
+/// Largest file accepted, in bytes.
 const MAX_BYTES: u64 = 64 << 20;
-/// How often at most the file is written.
+/// Least time between two writes.
 const PERIOD: Duration = Duration::from_secs(3);
-/// How long after a failure the disk is tried again, if nothing has changed.
+/// Time after a failure until the next attempt, if nothing has changed.
 const AGAIN: Duration = Duration::from_secs(10);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
-/// Where state is kept, to this process alone.
+/// State directory, locked by this process.
 #[derive(Debug)]
 pub struct StateDirectory {
     path: PathBuf,
-    /// Holds the lock, and is what a rename is made durable by.
+    /// Holds the lock; its fsync makes renames durable.
     directory: File,
 }
 
-/// Why no state is kept.
+/// The state directory cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum StateError {
-    /// It cannot be used.
+    /// The directory is unusable.
     #[error("cannot use the state directory {}", path.display())]
     Unusable {
-        /// Which.
+        /// Path of the directory.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// Another agent uses it.
+    /// Another agent uses the directory.
     #[error("the state directory {} is in use by another agent", path.display())]
     InUse {
-        /// Which.
+        /// Path of the directory.
         path: PathBuf,
     },
 }
 
-/// What was found at the start.
+/// Discovery state at the start.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Loaded {
-    /// No file.
+    /// No file exists.
     Nothing,
-    /// Of another boot of this host. The participants of these GUIDs are gone or on another host, and
-    /// process ids, which Fast DDS makes GUIDs of, come again.
+    /// The file belongs to another boot of this host. Its participants are gone or on another host,
+    /// and process ids, from which Fast DDS derives GUIDs, are reused.
     AnotherBoot,
-    /// Everybody that was there.
+    /// State of the last agent.
     Known(Memory),
-    /// A newer rp wrote it: it is left as it is, and nothing may be written in its place.
+    /// A newer version wrote the file; it must not be overwritten.
     Newer(Newer),
-    /// It cannot be used, for this reason, and now lies there.
+    /// The file is unusable and was moved aside.
     Unusable {
-        /// Why.
+        /// Reason why it is unusable.
         reason: String,
-        /// Where it lies, if it could be moved.
+        /// New path of the file, if it could be moved.
         moved_to: Option<PathBuf>,
     },
 }
 
-/// A file of the state directory, and every form it ever had.
+/// A file of the state directory with all versions of its format.
 pub(crate) struct Form<T: 'static> {
-    /// Its name.
+    /// Name of the file.
     pub(crate) file: &'static str,
-    /// What reads each version, the oldest first; the last one is what is written.
+    /// Readers of each version, the oldest first; the last one is the written version.
     pub(crate) readers: &'static [(u32, Reader<T>)],
 }
 
-/// Reads a document of one version as what it means today.
+/// Reads a document of one version into the current form.
 pub(crate) type Reader<T> = fn(&[u8]) -> serde_json::Result<T>;
 
-/// A file that only a newer rp can read.
+/// A file that only a newer version can read.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Newer {
-    /// Where it lies.
+    /// Path of the file.
     pub path: PathBuf,
-    /// Its version.
+    /// Version of the file.
     pub version: u32,
-    /// The newest one that is known here.
+    /// Newest version known here.
     pub known: u32,
 }
 
-/// What was found in one file.
+/// Content of one file.
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) enum Found<T> {
-    /// No file.
+    /// No file exists.
     Nothing,
     /// A document.
     This(T),
-    /// One that only a newer rp can read; it is where it was.
+    /// A document that only a newer version can read, left in place.
     Newer(Newer),
-    /// It cannot be used, for this reason, and now lies there.
+    /// The file is unusable and was moved aside.
     Unusable {
-        /// Why.
+        /// Reason why it is unusable.
         reason: String,
-        /// Where it lies, if it could be moved.
+        /// New path of the file, if it could be moved.
         moved_to: Option<PathBuf>,
     },
 }
 
-/// What can be read of a file of any version.
+/// Part that files of all versions share.
 #[derive(Deserialize)]
 struct Version {
     version: u32,
@@ -138,19 +138,19 @@ struct Version {
 #[derive(Serialize, Deserialize)]
 struct Document {
     version: u32,
-    /// The kernel's name of the boot it was written in.
+    /// Boot id of the kernel at the time of writing.
     boot: String,
     #[serde(flatten)]
     memory: Memory,
 }
 
-/// The thread that writes, and what it has done.
+/// The writing thread and its counters.
 #[derive(Debug)]
 pub struct StateWriter {
     inbox: SyncSender<Memory>,
     thread: JoinHandle<()>,
     done: Arc<Done>,
-    /// The revision that was handed over last, and when.
+    /// Last revision handed over, and its time.
     handed: Option<(u64, Instant)>,
 }
 
@@ -158,25 +158,26 @@ pub struct StateWriter {
 struct Done {
     writes: AtomicU64,
     failures: AtomicU64,
-    /// The last write was one of these.
+    /// Whether the last write failed.
     is_failing: AtomicBool,
 }
 
-/// How often state was written.
+/// Counters of writes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StateFacts {
-    /// Written.
+    /// Successful writes.
     pub writes: u64,
-    /// Not written.
+    /// Failed writes.
     pub failures: u64,
 }
 
 impl StateDirectory {
-    /// Opens a directory that exists, for this process alone. Whether it can be written is seen when
-    /// it is: what lies in one that is full or read-only is known all the same.
+    /// Opens and locks an existing directory. It need not be writable: state in a full or read-only
+    /// directory is still read.
     ///
     /// # Errors
-    /// It does not exist, cannot be entered, or another agent uses it.
+    ///
+    /// The directory does not exist, cannot be entered, or is used by another agent.
     pub fn open(path: &Path) -> Result<Self, StateError> {
         let unusable = |source| StateError::Unusable {
             path: path.to_path_buf(),
@@ -193,9 +194,9 @@ impl StateDirectory {
             }
             Err(TryLockError::Error(error)) => return Err(unusable(error)),
         }
-        // Nothing could be found in it otherwise, and nothing be written.
+        // Otherwise nothing could be read from it or written to it.
         fs::metadata(path.join(".")).map_err(unusable)?;
-        // Of an agent that was killed while it wrote.
+        // Left by an agent that was killed during a write.
         let _ = fs::remove_file(path.join(NEW_FILE));
         Ok(Self {
             path: path.to_path_buf(),
@@ -203,13 +204,13 @@ impl StateDirectory {
         })
     }
 
-    /// Where it is.
+    /// Path of the directory.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Reads what the last agent left. What is no state is moved aside.
+    /// Reads the state of the last agent. Invalid files are moved aside.
     #[must_use]
     pub fn load(&self) -> Loaded {
         match self.read(&FORM) {
@@ -221,8 +222,8 @@ impl StateDirectory {
         }
     }
 
-    /// Reads a document of any version that is known. What is none is moved aside; what a newer rp
-    /// wrote stays where that one will look for it.
+    /// Reads a document of any known version. An invalid file is moved aside; the file of a newer
+    /// version stays in place for it.
     pub(crate) fn read<T>(&self, form: &Form<T>) -> Found<T> {
         let file = form.file;
         let path = self.path.join(file);
@@ -239,7 +240,7 @@ impl StateDirectory {
         let version = match serde_json::from_slice::<Version>(&bytes) {
             Ok(Version { version }) => version,
             Err(error) => match begins_with_version(&bytes) {
-                // Too large for us, or no JSON any more: that is for the newer one to judge.
+                // Too large or not JSON here, but a newer version may be able to read it.
                 Some(version) if version > known => version,
                 _ if is_whole => return self.set_aside(file, error.to_string()),
                 _ => return self.set_aside(file, format!("it is larger than {MAX_BYTES} bytes")),
@@ -261,7 +262,7 @@ impl StateDirectory {
         }
     }
 
-    /// Keeps a file that cannot be used out of the way.
+    /// Moves an unusable file aside.
     pub(crate) fn set_aside<T>(&self, file: &str, reason: String) -> Found<T> {
         let aside = self.path.join(format!("{file}.corrupt"));
         let moved = fs::rename(self.path.join(file), &aside);
@@ -279,7 +280,7 @@ impl StateDirectory {
             self.directory.sync_all()
         });
         if written.is_err() {
-            // Half a file is of no use, least of all on a full disk.
+            // A partial file is useless, and takes space on a full disk.
             let _ = fs::remove_file(&new);
         }
         written
@@ -295,12 +296,12 @@ impl StateDirectory {
     }
 }
 
-/// The form that is written today.
+/// Reads the current format.
 pub(crate) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> serde_json::Result<T> {
     serde_json::from_slice(bytes)
 }
 
-/// What a file says first of itself, whatever follows: every version is written so.
+/// Version at the start of a file; all versions begin with it.
 fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     let rest = bytes.strip_prefix(b"{\"version\":")?;
     let digits = rest.iter().take_while(|byte| byte.is_ascii_digit());
@@ -308,7 +309,7 @@ fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     std::str::from_utf8(&digits).ok()?.parse().ok()
 }
 
-/// Makes the file anew: what lies there, of an agent that was killed or a link, goes first.
+/// Creates the file. An existing file or link, as from a killed agent, is removed first.
 fn new_file(path: &Path) -> io::Result<File> {
     match fs::remove_file(path) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
@@ -327,7 +328,7 @@ fn write_new(path: &Path, document: &impl Serialize) -> io::Result<()> {
     file.sync_all()
 }
 
-/// Which boot this is; empty where the kernel does not tell.
+/// Boot id of the kernel. Empty if it is unavailable.
 fn boot() -> String {
     let boot = fs::read_to_string(BOOT_ID).unwrap_or_default();
     boot.trim().to_owned()
@@ -337,7 +338,8 @@ impl StateWriter {
     /// Starts the thread.
     ///
     /// # Errors
-    /// No thread is to be had.
+    ///
+    /// The thread cannot be started.
     pub fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
         let (inbox, outbox) = sync_channel(1);
         let done = Arc::<Done>::default();
@@ -353,7 +355,7 @@ impl StateWriter {
         })
     }
 
-    /// Whether it is time to hand over what is known at `revision`.
+    /// Returns whether the state at `revision` is to be handed over now.
     #[must_use]
     pub fn wants(&self, revision: u64, now: Instant) -> bool {
         let is_failing = self.done.is_failing.load(Ordering::Relaxed);
@@ -363,7 +365,8 @@ impl StateWriter {
         })
     }
 
-    /// Hands over; returns at once. While the disk keeps the thread busy, a later one will do.
+    /// Hands over the state without blocking. While a write is in progress, a later state replaces
+    /// it.
     pub fn keep(&mut self, memory: Memory, revision: u64, now: Instant) {
         match self.inbox.try_send(memory) {
             Ok(()) => self.handed = Some((revision, now)),
@@ -374,13 +377,13 @@ impl StateWriter {
     /// Writes the last state and waits until it is on disk.
     pub fn finish(self, memory: Memory) {
         let Self { inbox, thread, .. } = self;
-        // The thread ends with its inbox alone; if it has panicked, that is in the log.
+        // The thread ends when its inbox closes; a panic of it is in the log.
         let _ = inbox.send(memory);
         drop(inbox);
         let _ = thread.join();
     }
 
-    /// What the thread has done.
+    /// Counters of the thread.
     #[must_use]
     pub fn facts(&self) -> StateFacts {
         StateFacts {
@@ -398,14 +401,14 @@ fn keep(directory: &StateDirectory, inbox: &Receiver<Memory>, done: &Done) {
             Ok(()) => {
                 done.writes.fetch_add(1, Ordering::Relaxed);
                 if failed_before {
-                    tracing::info!(path = %directory.path.display(), "state is written again");
+                    tracing::info!(path = %directory.path.display(), "state is saved again");
                 }
             }
             Err(error) => {
                 done.failures.fetch_add(1, Ordering::Relaxed);
                 if !failed_before {
                     let path = directory.path.display();
-                    tracing::error!(%path, %error, "state cannot be written: names would be lost with a restart");
+                    tracing::error!(%path, %error, "cannot save state: a restart would lose names");
                 }
             }
         }

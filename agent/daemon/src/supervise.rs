@@ -1,5 +1,5 @@
-//! What goes on around the working thread: signals, reloads, the metrics listener, the service
-//! manager and its watchdog, and an orderly end.
+//! Supervises the working thread: signals, reloads, the metrics listener, the service manager with
+//! its watchdog, and an orderly end.
 
 use std::borrow::Cow;
 use std::path::PathBuf;
@@ -31,68 +31,67 @@ use tokio_util::sync::CancellationToken;
 
 use crate::logging::Log;
 
-/// How often readiness is looked at until the agent is ready, and the watchdog from then on.
+/// Polling interval of readiness until the agent is ready, and of the watchdog from then on.
 const STARTING_TICK: Duration = Duration::from_millis(100);
 const TICK: Duration = Duration::from_secs(2);
-/// For answers that have begun and the working thread's last round.
+/// Time for answers in progress and for the working thread's last round.
 const DRAIN: Duration = Duration::from_secs(3);
 
-/// The agent around its working thread.
+/// Supervisor of an agent.
 pub(crate) struct Supervisor {
     pub(crate) sources: MetricSources,
-    /// As it was read at the start, before the command line changed it.
+    /// Configuration at the start, before overrides of the command line.
     pub(crate) config: Config,
-    /// Where the configuration came from; read again on SIGHUP and when a client asks.
+    /// File of the configuration, which SIGHUP and clients reload.
     pub(crate) file: Option<PathBuf>,
     pub(crate) watches: Arc<Watches>,
     pub(crate) reloads: Reloads,
     pub(crate) stop: CancellationToken,
     pub(crate) log: Log,
-    /// Pushes metrics, where something is to be pushed.
+    /// Exporter of metrics, if one is configured.
     pub(crate) exporter: Option<Exporter>,
 }
 
-/// What is served, bound and not answered yet.
+/// Bound listeners that do not answer yet.
 pub(crate) struct Surfaces {
     pub(crate) metrics: Option<Server>,
     pub(crate) control: api::Server,
     pub(crate) context: api::Context,
-    /// Nothing is served by a thread that has any privilege.
+    /// Proof that the serving thread has no privilege.
     pub(crate) powerless: Unprivileged,
 }
 
-/// Signals that are listened to from before the working thread starts.
+/// Signals, registered before the working thread starts.
 struct Signals {
     terminate: Signal,
     interrupt: Signal,
     hangup: Signal,
-    /// Writes what the snapshots keep.
+    /// Writes all snapshots.
     snapshot: Signal,
 }
 
-/// The thread that answers requests, waiting for its listeners. It is another one than the thread
-/// that feeds the watchdog, so that no page that is made delays that.
+/// Thread that answers requests, waiting for its listeners. The watchdog runs on another thread, so
+/// that a slow answer cannot delay it.
 pub(crate) struct Responder {
     begin: oneshot::Sender<Surfaces>,
     ended: oneshot::Receiver<Result<()>>,
 }
 
-/// The working thread, waiting for what it is to do, and the news of its end.
+/// Working thread that waits for its task, and the notification of its end.
 pub(crate) struct Worker {
     thread: JoinHandle<()>,
     begin: oneshot::Sender<Run>,
     ended: oneshot::Receiver<Result<(), RunError>>,
 }
 
-/// The working thread at work.
+/// Working thread in operation.
 struct Working {
     thread: JoinHandle<()>,
     ended: oneshot::Receiver<Result<(), RunError>>,
 }
 
 impl Supervisor {
-    /// Runs everything until a signal or a failure, or with `once` until the capture ends, and says
-    /// in the log how it ended.
+    /// Runs until a signal or a failure, or with `once` until the capture ends, and logs the end.
     pub(crate) async fn run(
         mut self,
         worker: Worker,
@@ -118,14 +117,14 @@ impl Supervisor {
                 }
                 _ = signals.snapshot.recv() => snapshots.write_all(),
                 Some(answer) = self.reloads.next() => {
-                    // Who asked may have gone.
+                    // The client may have disconnected.
                     let _ = answer.send(self.reload());
                 }
                 ended = &mut serving => {
                     answering = false;
                     let died = |_| Err(anyhow!("the thread that answers requests died"));
                     let ended = ended.unwrap_or_else(died);
-                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended")));
+                    break Err(ended.err().unwrap_or_else(|| anyhow!("a listener ended unexpectedly")));
                 }
                 ended = &mut worker.ended, if working => {
                     working = false;
@@ -135,7 +134,7 @@ impl Supervisor {
                             tracing::info!("the capture has ended; its final state remains");
                         }
                         Ok(Err(error)) => break Err(error.into()),
-                        // Its sender went without a word: the panic is in the log.
+                        // The sender was dropped without a result: the panic is in the log.
                         Err(_) => break Err(anyhow!("the working thread panicked")),
                     }
                 }
@@ -161,7 +160,7 @@ impl Supervisor {
         if drained && worker.thread.join().is_err() {
             tracing::error!("the working thread panicked while shutting down");
         }
-        // After the working thread, whose last state it exports.
+        // After the working thread, whose last state is exported.
         if let Some(exporter) = self.exporter.take() {
             exporter.finish().await;
         }
@@ -174,7 +173,7 @@ impl Supervisor {
         }
     }
 
-    /// Reads the configuration again; a mistake changes nothing.
+    /// Reloads the configuration. A mistake leaves everything unchanged.
     fn reload(&mut self) -> Result<Reloaded, NotReloaded> {
         let Some(file) = &self.file else {
             tracing::warn!("nothing to reload: the agent was started without a configuration file");
@@ -214,7 +213,7 @@ impl Supervisor {
         self.sources.events.record(AgentEvent::Reloaded { watches });
         self.sources.settings.reloaded(Settings {
             watches: shown,
-            // The caps are those the agent was started with.
+            // The caps of the start stay in force.
             limits: *self.sources.limits.caps(),
             ..Settings::new(config)
         });
@@ -233,7 +232,7 @@ fn ticks(period: Duration) -> Interval {
     ticks
 }
 
-/// One line each.
+/// Mistakes, one a line.
 fn mistakes(error: &ConfigError) -> Vec<String> {
     let mut text = error.to_string();
     let mut cause = std::error::Error::source(error);
@@ -256,13 +255,13 @@ impl Signals {
 }
 
 impl Responder {
-    /// Starts the thread, confined to its role already.
+    /// Starts the thread, already confined to its role.
     pub(crate) fn start() -> Result<Self, SpawnError> {
         let (begin, begins) = oneshot::channel::<Surfaces>();
         let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("http".to_owned());
         privilege::spawn(Role::Serve, thread, move || {
-            // An agent that fails to start, or a report, has nothing to answer.
+            // An agent that fails to start, or prints a report, answers nothing.
             if let Ok(surfaces) = begins.blocking_recv() {
                 let _ = report.send(surfaces.answer());
             }
@@ -271,7 +270,7 @@ impl Responder {
     }
 
     fn begin(self, surfaces: Surfaces) -> oneshot::Receiver<Result<()>> {
-        // The thread takes it or has died, which is heard next.
+        // If the thread has died, the next wait reports it.
         let _ = self.begin.send(surfaces);
         self.ended
     }
@@ -280,9 +279,9 @@ impl Responder {
 impl Surfaces {
     /// Answers requests until the agent stops.
     fn answer(self) -> Result<()> {
-        // Capabilities belong to threads: those of this one are read back, too.
+        // Capabilities belong to threads: those of this one are verified, too.
         let _: (Unprivileged, Unprivileged) = (self.powerless, Unprivileged::verify()?);
-        // Threads that block make bags for clients; the unit allows 32 threads in all.
+        // Blocking threads create bags for clients; the unit allows 32 threads in total.
         let runtime = tokio::runtime::Builder::new_current_thread()
             .max_blocking_threads(4)
             .enable_all()
@@ -300,26 +299,26 @@ impl Surfaces {
                 () = stop.cancelled() => {}
                 Some(ended) = serving.join_next() => {
                     ended??;
-                    return Err(anyhow!("a listener ended"));
+                    return Err(anyhow!("a listener ended unexpectedly"));
                 }
             }
             while serving.join_next().await.is_some() {}
             Ok(())
         });
-        // A bag that is being finished for a client is waited for elsewhere.
+        // The recording service waits for unfinished bags.
         runtime.shutdown_background();
         served
     }
 }
 
 impl Worker {
-    /// Starts the thread, confined to its role already: the caller need not keep what it needs.
+    /// Starts the thread, already confined to its role; the caller can drop its own privileges.
     pub(crate) fn start(role: Role) -> Result<Self, SpawnError> {
         let (begin, begins) = oneshot::channel::<Run>();
         let (report, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("capture".to_owned());
         let thread = privilege::spawn(role, thread, move || {
-            // An agent that fails to start has nothing to do.
+            // An agent that fails to start has no work.
             if let Ok(run) = begins.blocking_recv() {
                 let _ = report.send(run.run());
             }
@@ -338,7 +337,7 @@ impl Worker {
     }
 
     fn begin(self, run: Run) -> Working {
-        // A dead thread takes nothing; the next wait reports its death.
+        // If the thread has died, the next wait reports it.
         let _ = self.begin.send(run);
         Working {
             thread: self.thread,
@@ -347,7 +346,7 @@ impl Worker {
     }
 }
 
-/// Tells the service manager that the agent sees, as long as it does.
+/// Notifies the service manager while the agent observes.
 struct Watchdog {
     period: Option<Duration>,
     fed: Option<Instant>,
@@ -357,7 +356,7 @@ struct Watchdog {
 
 impl Watchdog {
     fn new() -> Self {
-        // A third of what is allowed: one late round does not kill.
+        // A third of the allowed time, so that one late round is tolerated.
         let period = sd_notify::watchdog_enabled().map(|allowed| allowed / 3);
         Self {
             period,
@@ -367,8 +366,8 @@ impl Watchdog {
         }
     }
 
-    /// Not a timer: what feeds the watchdog is the capture's progress. Whether the agent has just
-    /// become ready.
+    /// Feeds the watchdog if the capture has progressed. Returns whether the agent has just become
+    /// ready.
     fn check(&mut self, latest: &SnapshotCell, events: &EventLog) -> bool {
         let now = Instant::now();
         let state = latest.state();
@@ -376,7 +375,7 @@ impl Watchdog {
         for event in self.sight.check(&ready, state.agent.attached_anew, now) {
             events.record(event);
         }
-        // A restart does not bring back what is gone.
+        // A restart cannot restore a missing target.
         if state.progresses(now).is_err() || (ready.is_err() && !self.ready) {
             return false;
         }

@@ -1,8 +1,7 @@
-//! All that is watched: what the configuration lists, what the command line adds, and what clients
-//! add and remove while the agent runs.
+//! All watched topics: those of the configuration, of the command line, and of clients at run time.
 //!
-//! One entry for each pattern and domain; the configuration's comes first. The capture thread is
-//! handed the merged list in a slot that holds the latest one, and is woken. No thread waits for it.
+//! Each pattern and domain has one entry; the configuration takes precedence. The capture thread
+//! reads the latest merged list from a slot and is woken on changes. No thread waits for it.
 
 mod persistence;
 
@@ -22,12 +21,12 @@ use crate::state::StateDirectory;
 use persistence::WatchWriter;
 pub use persistence::{LoadedWatches, load};
 
-/// Who asked for a watch.
+/// Origin of a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
     /// The configuration file.
     Config,
-    /// `--watch`.
+    /// The option `--watch`.
     CommandLine,
     /// A client of the API.
     Api,
@@ -36,46 +35,46 @@ pub enum Origin {
 /// One watch in force.
 #[derive(Clone, Debug)]
 pub struct Entry {
-    /// What is watched.
+    /// The watch.
     pub watch: Arc<Watch>,
-    /// On whose behalf.
+    /// Origin of the watch.
     pub origin: Origin,
 }
 
-/// What is in force, immutable.
+/// Watches in force, immutable.
 #[derive(Clone, Debug, Default)]
 pub struct InForce {
     entries: Vec<Entry>,
     watchlist: Arc<Watchlist>,
 }
 
-/// What became of a watch that was asked for.
+/// Result of a request to add a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Done {
-    /// It was not there before.
+    /// It was added.
     Added,
-    /// It was there, with other settings.
+    /// It replaced one with other settings.
     Replaced,
-    /// It was there just so.
+    /// The same watch exists already.
     Unchanged,
 }
 
-/// Why the list of watches stays as it is.
+/// A change of the watches was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
-    /// Listed by the configuration or the command line, which a client does not overrule.
+    /// The configuration or the command line has this watch; clients cannot override it.
     #[error("it is defined by {}", by.phrase())]
     Given {
-        /// Which of them.
+        /// Origin of the watch.
         by: Origin,
     },
     /// A client added it with other settings.
     #[error("it is watched already, with other settings")]
     Different,
-    /// No such watch.
+    /// No such watch exists.
     #[error("it is not watched")]
     Unknown,
-    /// There would be more than may be.
+    /// The number of watches would exceed its limit.
     #[error(
         "there would be more than {0} watches, which is limits.watches: use globs, or raise it"
     )]
@@ -90,7 +89,7 @@ pub enum Refused {
 pub struct Watches {
     lists: Mutex<Lists>,
     in_force: ArcSwap<InForce>,
-    /// For the capture thread: the latest list it has not taken yet.
+    /// Latest list that the capture thread has not read yet.
     news: ArcSwapOption<Watchlist>,
     limits: Arc<LimitFigures>,
     events: Arc<EventLog>,
@@ -107,7 +106,7 @@ struct Lists {
 }
 
 impl Origin {
-    /// As clients see it.
+    /// Name in the API.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -117,7 +116,7 @@ impl Origin {
         }
     }
 
-    /// As in a sentence.
+    /// Name within a sentence.
     #[must_use]
     pub const fn phrase(self) -> &'static str {
         match self {
@@ -129,13 +128,14 @@ impl Origin {
 }
 
 impl InForce {
-    /// Each watch: of the configuration, of the command line, of clients in the order they came.
+    /// All watches: of the configuration, of the command line, then of clients in order of their
+    /// addition.
     #[must_use]
     pub fn entries(&self) -> &[Entry] {
         &self.entries
     }
 
-    /// The watches alone.
+    /// The watches without their origins.
     #[must_use]
     pub fn watchlist(&self) -> &Watchlist {
         &self.watchlist
@@ -149,7 +149,7 @@ impl InForce {
         patterns.filter(|pattern| pattern.contains('*'))
     }
 
-    /// The watch with this pattern for this domain.
+    /// The watch with this pattern and domain.
     #[must_use]
     pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
         let place = self.watchlist.position(pattern, domain_id.map(DomainId))?;
@@ -158,10 +158,11 @@ impl InForce {
 }
 
 impl Watches {
-    /// What the configuration and the command line list.
+    /// Creates the list from the configuration and the command line.
     ///
     /// # Errors
-    /// They are too many, or their globs are too many.
+    ///
+    /// There are too many watches or globs.
     pub fn new(
         limits: Arc<LimitFigures>,
         events: Arc<EventLog>,
@@ -192,11 +193,11 @@ impl Watches {
         Ok(watches)
     }
 
-    /// Watches again what clients had added before the last agent ended; how many of them are left
-    /// out, for want of room.
+    /// Restores watches that clients of the last agent had added. Returns how many did not fit.
     ///
     /// # Errors
-    /// The globs are too many; then nothing changes.
+    ///
+    /// There are too many globs; nothing changes.
     pub fn restore(&self, watches: Vec<Watch>) -> Result<usize, Refused> {
         let in_force = self.in_force();
         let mut room = self.cap().saturating_sub(in_force.entries().len());
@@ -227,35 +228,37 @@ impl Watches {
         Ok(left_out)
     }
 
-    /// Keeps what clients add from now on in this directory.
+    /// Saves watches of clients in this directory from now on.
     ///
     /// # Errors
-    /// No thread is to be had for it.
+    ///
+    /// The thread cannot be started.
     pub fn keep_in(&self, directory: Arc<StateDirectory>) -> io::Result<()> {
         let keeper = WatchWriter::start(directory)?;
-        // Only the first one would ever be asked for.
+        // Only the first one is ever used.
         let _ = self.keeper.set(keeper);
         Ok(())
     }
 
-    /// Whether what clients add outlives the agent: kept somewhere, and the last write worked.
+    /// Returns whether watches of clients outlive the agent: a directory exists, and the last write
+    /// succeeded.
     #[must_use]
     pub fn is_kept(&self) -> bool {
         self.keeper.get().is_some_and(WatchWriter::works)
     }
 
-    /// Waits until what clients have added is on disk, when the agent ends.
+    /// Waits until watches of clients are on disk, at the end of the agent.
     pub fn finish(&self) {
         if let Some(keeper) = self.keeper.get() {
             keeper.finish();
         }
     }
 
-    /// The configuration lists these now; what else is watched stays.
+    /// Replaces the watches of the configuration; others stay.
     ///
     /// # Errors
-    /// With what else is watched they are too many, or their globs are too many;
-    /// then nothing changes.
+    ///
+    /// There would be too many watches or globs; nothing changes.
     pub fn configure(&self, watches: Vec<Watch>) -> Result<(), Refused> {
         self.change(|lists, _| {
             lists.configured = watches.into_iter().map(Arc::new).collect();
@@ -264,26 +267,29 @@ impl Watches {
         Ok(())
     }
 
-    /// Watches this too, unless it is watched already.
+    /// Adds a watch of a client, unless it exists.
     ///
     /// # Errors
-    /// It is watched with other settings, or there is no room.
+    ///
+    /// It exists with other settings, or there is no room.
     pub fn add(&self, watch: Watch) -> Result<Done, Refused> {
         self.put(watch, false)
     }
 
-    /// Watches this too, in place of what a client has asked for before.
+    /// Adds a watch of a client, or replaces one of a client.
     ///
     /// # Errors
-    /// The configuration lists it with other settings, or there is no room.
+    ///
+    /// The configuration has it with other settings, or there is no room.
     pub fn replace(&self, watch: Watch) -> Result<Done, Refused> {
         self.put(watch, true)
     }
 
-    /// Watches what a client has added no longer.
+    /// Removes a watch of a client.
     ///
     /// # Errors
-    /// There is no such watch, or it is not a client's.
+    ///
+    /// The watch does not exist, or is not a client's.
     pub fn remove(&self, pattern: &str, domain_id: Option<u32>) -> Result<(), Refused> {
         self.change(|lists, in_force| {
             match in_force.find(pattern, domain_id) {
@@ -305,13 +311,13 @@ impl Watches {
         Ok(())
     }
 
-    /// What is in force.
+    /// Watches in force.
     #[must_use]
     pub fn in_force(&self) -> Arc<InForce> {
         self.in_force.load_full()
     }
 
-    /// For the capture thread: what to watch from now on, when that has changed since the last call.
+    /// For the capture thread: the watches, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Watchlist>> {
         self.news.swap(None)
@@ -352,9 +358,9 @@ impl Watches {
         Ok(done)
     }
 
-    /// Changes the lists, merges them and hands the outcome to whom it concerns; on an error, and
-    /// with [`Done::Unchanged`], nothing changes. `change` sees what is in force and decides under the
-    /// lock: of two clients that ask at once, one comes second.
+    /// Changes the lists, merges them and notifies all users of the result. Nothing changes on an
+    /// error, or with [`Done::Unchanged`]. `change` runs under the lock, so concurrent clients are
+    /// serialized.
     fn change(
         &self,
         change: impl FnOnce(&mut Lists, &InForce) -> Result<Done, Refused>,

@@ -53,7 +53,7 @@ struct Info {
     /// Read all messages and print the size of topics, services and actions
     #[arg(short, long)]
     verbose: bool,
-    /// Sort topics, services and actions by this
+    /// Sort order of topics, services and actions
     #[arg(long, value_enum, default_value_t)]
     sort: Sort,
     /// Distribution whose output to print [default: ROS_DISTRO, else jazzy]
@@ -77,7 +77,7 @@ enum Storage {
 }
 
 impl Bag {
-    /// With which code Ctrl-C ends it at once; a recording is completed first.
+    /// Exit code of an immediate end by Ctrl-C. `None` for a recording, which is completed first.
     pub(crate) const fn interrupted(&self) -> Option<u8> {
         match self.verb {
             Some(Verb::Record(_) | Verb::Convert(_)) => None,
@@ -127,12 +127,12 @@ impl Reindex {
         require(&self.bag_path, "reindex");
         if !self.bag_path.is_dir() {
             let path = self.bag_path.display();
-            return Err(UserError(format!("{path} is a file: give the bag's directory")).into());
+            return Err(UserError(format!("{path} is a file: pass the bag's directory")).into());
         }
         let report = reindex::reindex(&self.bag_path)?;
         let mut output = Output::new();
         for file in &report.files {
-            // The name of a file is anything but a slash.
+            // A file name can contain control characters.
             output.write(&format!("{}\n", visible(&file.to_string())))?;
         }
         let metadata = &report.metadata;
@@ -153,7 +153,7 @@ impl Reindex {
     }
 }
 
-/// A path that does not exist is a usage error, as in the original.
+/// Ends with a usage error if the path does not exist, as the original does.
 fn require(path: &std::path::Path, verb: &str) {
     if path.exists() {
         return;

@@ -1,4 +1,4 @@
-//! `rp bag convert`: a bag out of a capture, offline.
+//! `rp bag convert`: writes a bag from a capture, offline.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -1,4 +1,4 @@
-//! `rp discover`: whom to ask, and how.
+//! `rp discover`: options for the participants and the requests.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ announced only once. This command finds participants by listening, prints what i
 requests the announcements again: at most 6 unicast packets for each, from a participant that lives
 for a few milliseconds and says goodbye. A running agent on this host sees the answers too. Without
 --participant and --all it lists the participants.
-Participants with DDS security are not asked. Needs the same capabilities as `rp run`.
+Participants with DDS security receive no requests. Needs the same capabilities as `rp run`.
 Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
 
 Examples:
@@ -23,10 +23,10 @@ pub(crate) struct Discover {
     /// Only participants of this domain
     #[arg(long, value_name = "N")]
     pub(crate) domain: Option<u32>,
-    /// Ask this participant, by its GUID prefix: 24 hexadecimal digits
+    /// Request from this participant, by its GUID prefix: 24 hexadecimal digits
     #[arg(long, value_name = "PREFIX", value_parser = prefix, conflicts_with = "all")]
     pub(crate) participant: Option<GuidPrefix>,
-    /// Ask every participant found
+    /// Request from every participant found
     #[arg(long)]
     pub(crate) all: bool,
     /// Print what would be sent, but send nothing
@@ -35,7 +35,7 @@ pub(crate) struct Discover {
     /// Request endpoints only: one packet less
     #[arg(long)]
     pub(crate) no_nodes: bool,
-    /// Listen on the wire of this interface instead of at the host's sockets
+    /// Listen on this interface instead of at the host's sockets
     #[arg(long, value_name = "NAME")]
     pub(crate) interface: Option<String>,
     /// How long to listen for participants: most announce themselves every 3 to 8 seconds

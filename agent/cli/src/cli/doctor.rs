@@ -83,7 +83,7 @@ impl Doctor {
     }
 }
 
-/// The agent on this host, if one is to be had.
+/// Tries to reach the agent on this host.
 fn reach(target: &Target) -> Reach {
     let asked = Agent::reach(target).and_then(|agent| {
         let answers = Answers::ask(&agent, target.domain_id)?;
@@ -96,7 +96,7 @@ fn reach(target: &Target) -> Reach {
     }
 }
 
-/// What an agent here runs with. A file that was named must be there.
+/// Reads the configuration of an agent on this host. A file named on the command line must exist.
 fn configured(file: Option<&Path>) -> Result<Configured> {
     let path = file.unwrap_or(Path::new(DEFAULT_CONFIG));
     if file.is_none() && !path.exists() {
@@ -118,7 +118,7 @@ fn configured(file: Option<&Path>) -> Result<Configured> {
     }
 }
 
-/// See <https://no-color.org>.
+/// Returns whether to print colours. See <https://no-color.org>.
 fn colours() -> bool {
     let is_set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
     let is_dumb = std::env::var_os("TERM").is_some_and(|terminal| terminal == "dumb");

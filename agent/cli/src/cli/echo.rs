@@ -1,4 +1,4 @@
-//! `rp topic echo`: what a topic's messages say.
+//! `rp topic echo`: prints the messages of a topic.
 
 use std::process::ExitCode;
 
@@ -103,7 +103,7 @@ impl Echo {
         let agent = Agent::reach_stream(&self.target)?;
         let mut output = Output::new();
 
-        // What a capture has is known when it has been read.
+        // A capture's topics are complete only after its end.
         let is_waiting = self.target.replay.is_some();
         let known = topic(&agent, domain_id, &name)?;
         let expected = match &known {
@@ -166,7 +166,7 @@ impl Echo {
         })
     }
 
-    /// The type to print messages by; where the topic has several, one has to be named.
+    /// Name of the expected type. Fails if the topic has several types and the command names none.
     fn expected(&self, known: &Topic<'_>) -> Result<Option<String>> {
         if self.message_type.is_some() {
             return Ok(self.message_type.clone());
@@ -207,11 +207,11 @@ struct Printer<'a> {
     echo: echo::Echo,
     lost: Lost,
     output: Output,
-    /// The type to print messages by.
+    /// Expected type of the messages.
     expected: Option<String>,
-    /// The topic was known before its first message.
+    /// Whether the topic was known before its first message.
     is_known: bool,
-    /// Time of the first item.
+    /// Time of the first item, in nanoseconds.
     start: Option<i64>,
     is_seen: bool,
 }
@@ -241,7 +241,7 @@ impl Printer<'_> {
         })
     }
 
-    /// Prints a message of the expected type; whether it was printed.
+    /// Prints a message of the expected type. Returns whether it was printed.
     fn message(&mut self, sample: &Sample, payload: &Bytes) -> Result<bool> {
         if self.is_unknown()
             && let Some(known) = topic(self.agent, self.domain_id, self.name)?
@@ -275,7 +275,7 @@ impl Printer<'_> {
         Ok(true)
     }
 
-    /// Nothing tells the type of the topic yet.
+    /// Returns whether the topic's type is still unknown.
     const fn is_unknown(&self) -> bool {
         !self.is_seen && !self.is_known && self.command.message_type.is_none()
     }
@@ -297,7 +297,7 @@ impl Printer<'_> {
     }
 }
 
-/// What explains why nothing may come.
+/// Prints the likely reason for silence.
 fn hint(name: &str, known: &Topic<'_>, expected: Option<&str>) {
     let types = &known.message_types;
     if let Some(expected) = expected

@@ -1,4 +1,4 @@
-//! `rp service echo` and `rp action echo`: what services and actions say of themselves.
+//! `rp service echo` and `rp action echo`: print service events and the parts of actions.
 
 use std::process::ExitCode;
 
@@ -51,7 +51,7 @@ pub(crate) struct ActionEcho {
     target: Target,
 }
 
-/// An action's parts and their topics below it.
+/// Parts of an action, and their topics below its name.
 const PARTS: [(&str, &str); 5] = [
     ("GOAL_SERVICE", "/_action/send_goal/_service_event"),
     ("CANCEL_SERVICE", "/_action/cancel_goal/_service_event"),
@@ -67,7 +67,7 @@ impl ServiceEcho {
         let domain_id = self.target.domain()?;
         let agent = Agent::reach_stream(&self.target)?;
         let mut output = Output::new();
-        // What a capture has is known when it has been read.
+        // A capture's topics are complete only after its end.
         if self.target.replay.is_none() {
             if self.service_type.is_none() {
                 let names = names_of(&agent, domain_id)?;
@@ -124,7 +124,7 @@ impl ActionEcho {
     }
 }
 
-/// The parts that are named, in the original's words where one is not.
+/// Parsed `--interfaces`. An unknown part fails with the original's message.
 fn chosen(interfaces: Option<&str>) -> Result<Vec<(&'static str, &'static str)>, Refused> {
     let Some(interfaces) = interfaces else {
         return Ok(PARTS.to_vec());

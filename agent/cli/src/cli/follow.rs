@@ -1,4 +1,4 @@
-//! The messages of topics with their bytes and types, for what is printed of them one by one.
+//! Messages of topics with their bytes and types, for verbs that print each message.
 
 use std::collections::HashMap;
 use std::io::IsTerminal as _;
@@ -21,14 +21,14 @@ use ros2probe_message::{Library, Limits, MessageType, Sources, Truncation, decod
 use super::UserError;
 use super::notes::Notes;
 
-/// What is wrong when a live agent ends its stream.
+/// Error for a live agent that ends its stream.
 pub(crate) const AGENT_ENDED: &str = "the agent has ended: `systemctl status ros2probe` shows why, `rp run` starts one in a terminal";
-/// How a replay ends.
+/// Note at the end of a replay.
 pub(crate) const END_OF_CAPTURE: &str = "end of capture";
-/// Writers whose types are remembered.
+/// Most writers with a remembered type.
 const MAX_WRITERS: usize = 1024;
 
-/// How much of messages is printed, and where their definitions are.
+/// Options for printing messages, and places of their definitions.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct Printing {
     /// Print all fields of a message in one line, separated by commas
@@ -77,7 +77,7 @@ impl Printing {
     }
 }
 
-/// The definitions in these directories, of an installed ROS, and those that come with `rp`.
+/// Definitions from these directories, from an installed ROS, and from `rp` itself.
 pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
     let installed = std::env::var_os("AMENT_PREFIX_PATH");
     Library::new(Sources::new(
@@ -91,12 +91,12 @@ pub(crate) fn library(target: &Target, directories: Vec<PathBuf>) -> Library {
 pub(crate) enum StreamItem<'a> {
     Message(&'a Sample, Bytes),
     Missed(&'a Missed),
-    /// Everything up to here was delivered.
+    /// All messages up to this time have been delivered.
     Clock,
 }
 
-/// What messages say, for stdout: as it is for programs, without control characters for a terminal,
-/// which they could command. YAML has none by itself.
+/// Escapes control characters if stdout is a terminal, which would interpret them. YAML output
+/// contains none by itself.
 pub(crate) fn for_stdout(text: String) -> String {
     if std::io::stdout().is_terminal() {
         visible_lines(&text).into_owned()
@@ -105,20 +105,20 @@ pub(crate) fn for_stdout(text: String) -> String {
     }
 }
 
-/// The state of a stream.
+/// State of a stream after `follow` returns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum StreamStatus {
     Open,
-    /// The reader wants no more.
+    /// The visitor stopped the stream.
     Stopped,
     /// The capture has ended.
     CaptureEnded,
-    /// The rest of the capture cannot be read, which stderr says.
+    /// The rest of the capture cannot be read; the error is on stderr.
     CaptureTruncated,
 }
 
-/// The messages of topics: each thing that comes, and the time in nanoseconds, until `visit` has
-/// enough.
+/// Passes each item of the topics with its time in nanoseconds to `visit`, until `visit` stops the
+/// stream or it ends.
 pub(crate) fn follow(
     agent: &Agent,
     domain_id: u32,
@@ -170,7 +170,7 @@ pub(crate) fn follow(
     Err(UserError(AGENT_ENDED.to_owned()).into())
 }
 
-/// What an agent knows of a topic.
+/// The agent's facts about a topic. `None` if the topic does not exist.
 pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<Topic<'static>>> {
     let path = encoded(name.strip_prefix('/').unwrap_or(name));
     match agent.get(&format!("/topics/{path}?domain_id={domain_id}")) {
@@ -180,11 +180,11 @@ pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<
     }
 }
 
-/// Which definition each writer's messages are read by.
+/// Definitions for the messages of each writer.
 pub(crate) struct Types {
     library: Library,
     writers: HashMap<String, Option<Arc<MessageType>>>,
-    /// A type without a definition is reported once.
+    /// Types without a definition; each is reported once.
     undefined: Vec<String>,
 }
 
@@ -197,13 +197,13 @@ impl Types {
         }
     }
 
-    /// The definition of a type that was named, or that all of a topic's writers have.
+    /// Definition of a type named on the command line, or shared by all writers of a topic.
     pub(crate) fn find(&self, name: &str, hash: Option<&str>) -> Result<Arc<MessageType>> {
         let found = self.library.find(name, hash);
         found.map_err(|error| UserError(error_chain(&error)).into())
     }
 
-    /// The definition that a message was written by; `None` where there is none.
+    /// Definition for a message. `None` if there is no definition of its type.
     pub(crate) fn of(&mut self, sample: &Sample) -> Option<Arc<MessageType>> {
         if let Some(known) = self.writers.get(&sample.writer) {
             return known.clone();
@@ -231,8 +231,8 @@ impl Types {
     }
 }
 
-/// Lets messages through for which an expression is true. What has no definition, or is none of its
-/// type, does not pass; stderr says so once.
+/// Passes messages for which an expression is true. Messages without a definition, or of another
+/// type, do not pass; stderr reports each such type once.
 pub(crate) struct MessageFilter {
     filter: Filter,
     types: Types,
@@ -273,7 +273,7 @@ impl MessageFilter {
     }
 }
 
-/// An error with its causes in one line.
+/// Error and its causes in one line.
 fn error_chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut source = error.source();

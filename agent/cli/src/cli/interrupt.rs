@@ -1,17 +1,18 @@
-//! Ctrl-C: a verb ends at once with the exit code of the original, which differs by verb and
-//! distribution and is not that of a process that a signal ended.
+//! Handles Ctrl-C: a verb ends at once with the exit code of the original. That code depends on
+//! verb and distribution, and differs from that of a process ended by a signal.
 
 use std::io;
 
 use tokio::signal::unix::{SignalKind, signal};
 
-/// What the original answers to Ctrl-C by default.
+/// The original's default exit code after Ctrl-C.
 pub(crate) const INTERRUPTED: u8 = 2;
 
-/// From now on Ctrl-C ends the process with this code.
+/// Makes Ctrl-C end the process with `code`.
 ///
 /// # Errors
-/// Signals cannot be listened to.
+///
+/// The signal handler cannot be installed.
 pub(crate) fn listen(code: u8) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()

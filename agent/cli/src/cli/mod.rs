@@ -1,5 +1,5 @@
-//! The command line: a module for each noun, and what all verbs share. A verb asks an agent, has
-//! the answer put into words, and prints; it decides nothing else.
+//! Command line: a module for each noun, and the parts that all verbs share. A verb queries an
+//! agent, formats the answer and prints it.
 
 mod action;
 mod bag;
@@ -54,7 +54,7 @@ pub(crate) enum Command {
         #[arg(default_value = DEFAULT_CONFIG)]
         file: PathBuf,
     },
-    /// Ask running participants to repeat their announcements: the only command that sends
+    /// Request that participants repeat their announcements: the only command that sends
     Discover(Discover),
     /// Print completions for a shell
     Completions(reference::Completions),
@@ -64,7 +64,7 @@ pub(crate) enum Command {
     Ask(Question),
 }
 
-/// What an agent, or a capture, is asked.
+/// Commands that query an agent or a capture.
 #[derive(Debug, Subcommand)]
 #[expect(clippy::large_enum_variant, reason = "there is one")]
 pub(crate) enum Question {
@@ -87,7 +87,7 @@ pub(crate) enum Question {
 }
 
 impl Question {
-    /// Asks, prints, and says with which code to end.
+    /// Runs the command and returns its exit code.
     pub(crate) fn ask(self) -> Result<ExitCode> {
         if let Some(code) = self.interrupted() {
             interrupt::listen(code)?;
@@ -104,7 +104,7 @@ impl Question {
         }
     }
 
-    /// The exit code when Ctrl-C ends it at once; `None` for what wants to end by itself.
+    /// Exit code of an immediate end by Ctrl-C. `None` for commands that end by themselves.
     fn interrupted(&self) -> Option<u8> {
         match self {
             Self::Bag(bag) => bag.interrupted(),
@@ -114,13 +114,13 @@ impl Question {
             | Self::Action(_)
             | Self::Doctor(_)
             | Self::Page(_) => Some(interrupt::INTERRUPTED),
-            // Gives the terminal back first.
+            // `top` restores the terminal first.
             Self::Top(_) => None,
         }
     }
 }
 
-/// The help of a command that was given no verb, as the original prints it.
+/// Prints the help of a command without a verb, as the original does.
 pub(crate) fn help(names: &[&str]) -> Result<ExitCode> {
     let mut command = Arguments::command();
     command.build();
@@ -153,7 +153,7 @@ mod tests {
         for (verb, names) in options {
             let mut words = verb.split(' ');
             let found = words.try_fold(&root, |command, word| command.find_subcommand(word));
-            let command = found.unwrap_or_else(|| panic!("there is no `rp {verb}`"));
+            let command = found.unwrap_or_else(|| panic!("no command `rp {verb}`"));
             for name in names {
                 let is_called = |argument: &clap::Arg| match name.strip_prefix("--") {
                     Some(long) => argument.get_long() == Some(long),

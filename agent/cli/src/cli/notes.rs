@@ -1,5 +1,6 @@
-//! What stderr says beside a verb's output: which topics are sampled, what could not be captured, why
-//! nothing comes. Each at the moment it is known, and once; stdout stays the original's.
+//! Notes on stderr beside the output of a verb: sampled topics, messages that could not be
+//! captured, and reasons for silence. Each is printed once, as soon as it is known; stdout matches
+//! the original.
 
 use std::collections::{BTreeMap, HashSet};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -18,15 +19,15 @@ use ros2probe_daemon::recording::{GraphSnapshot, PublishedTopic};
 
 use super::shared::names_of;
 
-/// After so long without a message the reason is asked for.
+/// Silence after which the reason is requested.
 pub(crate) const SILENT: Duration = Duration::from_secs(5);
-/// Missing messages of a topic are reported at most this often.
+/// Least time between two reports of a topic's missing messages.
 const PAUSE: Duration = Duration::from_secs(5);
-/// What being sampled means where messages are printed.
+/// Consequence of sampling for verbs that print messages.
 pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";
-/// Topics that are named in one line.
+/// Most topics named in one line.
 const NAMES: usize = 8;
-/// What makes sampled topics exact.
+/// Remedy for sampled topics.
 const SWITCH: &str = "`capture.shm.exact: auto` captures each message";
 
 /// Notes on the topics of one verb.
@@ -34,11 +35,11 @@ pub(crate) struct Notes<'a> {
     agent: &'a Agent,
     domain_id: u32,
     is_replay: bool,
-    /// Those that were named; none where all are wanted.
+    /// Topics on the command line; empty for all topics.
     names: Vec<String>,
-    /// One of them is enough.
+    /// Whether one existing topic suffices.
     are_parts: bool,
-    /// What being sampled means here.
+    /// Consequence of sampling for this verb.
     consequence: &'static str,
     heard: HashSet<String>,
     sampled: HashSet<String>,
@@ -46,23 +47,23 @@ pub(crate) struct Notes<'a> {
     is_explained: bool,
 }
 
-/// Messages that are missing and not reported yet: a process has one verb, which Ctrl-C may end.
+/// Missing messages that are not reported yet. Global, because Ctrl-C may end the process, which
+/// has only one verb.
 static MISSING: Mutex<Missing> = Mutex::new(Missing(BTreeMap::new()));
 
-/// Missing messages by topic and reason: how many are not reported yet, and the time of the last
-/// report.
+/// Missing messages by topic and reason: the unreported count, and the time of the last report.
 struct Missing(BTreeMap<(String, &'static str), (u64, Option<Instant>)>);
 
-/// Reports what is missing: the process ends.
+/// Reports missing messages before the process ends.
 pub(crate) fn end() {
-    // The thread that holds it waits for stderr.
+    // If another thread holds the lock, it is blocked on stderr.
     if let Ok(mut missing) = MISSING.try_lock() {
         missing.report(true);
     }
 }
 
 impl<'a> Notes<'a> {
-    /// Names the topics that are sampled. `names` are those that were named.
+    /// Reports sampled topics. `names` are those on the command line.
     pub(crate) fn begin(
         agent: &'a Agent,
         domain_id: u32,
@@ -82,7 +83,7 @@ impl<'a> Notes<'a> {
             begun: Instant::now(),
             is_explained: false,
         };
-        // A capture of the network has nothing of shared memory.
+        // A network capture contains no shared memory.
         if !is_replay && samples_shared_memory(agent) {
             let topics = notes.topics();
             let topics = topics.iter().filter(|topic| is_sampled(topic));
@@ -92,7 +93,7 @@ impl<'a> Notes<'a> {
         notes
     }
 
-    /// The named topics are parts of one thing, of which not all need be there.
+    /// Treats the topics as parts of one entity, of which some may not exist.
     pub(crate) fn of_parts(self) -> Self {
         Self {
             are_parts: true,
@@ -100,12 +101,12 @@ impl<'a> Notes<'a> {
         }
     }
 
-    /// Those that were said to be sampled.
+    /// Topics that were reported as sampled.
     pub(crate) fn sampled(&self) -> impl Iterator<Item = &str> {
         self.sampled.iter().map(String::as_str)
     }
 
-    /// A message came.
+    /// Records the arrival of a message.
     pub(crate) fn received(&mut self, topic: &str, sampled: bool) {
         if sampled && !self.sampled.contains(topic) {
             self.print_sampled(&[topic.to_owned()]);
@@ -115,13 +116,13 @@ impl<'a> Notes<'a> {
         }
     }
 
-    /// Messages will not come.
+    /// Records messages that will not arrive.
     pub(crate) fn missed(&mut self, missed: &Missed) {
         let why = match missed.reason {
             MissedReason::QueueFull => "were dropped: too slow here",
             MissedReason::NotCaptured => "could not be captured",
             MissedReason::Unannounced => "were sent before their publisher was announced",
-            // The verb itself reports what its subscriber lost.
+            // The verb itself reports messages lost by its subscriber.
             MissedReason::Incomplete | MissedReason::Lost => return,
         };
         let mut missing = Missing::all();
@@ -129,7 +130,7 @@ impl<'a> Notes<'a> {
         missing.report(false);
     }
 
-    /// Time passes: says why nothing came, once.
+    /// Reports once why nothing arrived, after enough time.
     pub(crate) fn now(&mut self) -> Result<()> {
         Missing::all().report(false);
         if self.is_replay || self.is_explained || self.begun.elapsed() < SILENT {
@@ -138,7 +139,7 @@ impl<'a> Notes<'a> {
         self.explain()
     }
 
-    /// Nothing more will come.
+    /// Reports what remains at the end of the stream.
     pub(crate) fn end(&mut self) -> Result<()> {
         Missing::all().report(true);
         if self.is_explained {
@@ -178,7 +179,7 @@ impl<'a> Notes<'a> {
         Ok(())
     }
 
-    /// A reason and its remedy; `None` where a message may come at any time.
+    /// Text of a reason and its remedy. `None` if a message may still arrive.
     fn words(&self, reason: &Reason) -> Option<String> {
         let Open::Known(code) = &reason.code else {
             return None;
@@ -192,10 +193,12 @@ impl<'a> Notes<'a> {
             ReasonCode::Encrypted => {
                 "its publisher uses DDS security; its messages may be encrypted"
             }
-            ReasonCode::WatchRejected => "limits.topics topics are measured already: raise it",
+            ReasonCode::WatchRejected => {
+                "the limit on measured topics is reached: raise limits.topics"
+            }
             ReasonCode::SharedMemory if self.is_replay => {
-                "publisher and subscriber use shared memory, which a capture of the network does not \
-                 hold: record on the robot with `rp bag record`"
+                "publisher and subscriber use shared memory, which a capture of the network lacks: \
+                 record on the robot with `rp bag record`"
             }
             ReasonCode::DataSharing => {
                 "subscribers read the publisher's memory (data sharing), which cannot be observed: \
@@ -230,7 +233,7 @@ impl<'a> Notes<'a> {
         self.sampled.extend(topics.iter().cloned());
     }
 
-    /// The named topics, or all of the domain; none where the agent does not answer.
+    /// The topics of the verb. Empty if the agent does not answer.
     fn topics(&self) -> Vec<PublishedTopic> {
         let topics = match self.names.as_slice() {
             [name] => {
@@ -283,7 +286,7 @@ impl Missing {
     }
 }
 
-/// Whether the agent sees messages in shared memory, but not each of them.
+/// Returns whether the agent sees messages in shared memory only as samples.
 pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
     let Ok(Health { abilities, .. }) = agent.get("/health") else {
         return false;
@@ -296,12 +299,12 @@ pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
     able("shared_memory") && !able("shared_memory_exact")
 }
 
-/// Whether all messages of a topic pass through shared memory.
+/// Returns whether all messages of a topic pass through shared memory.
 pub(crate) fn is_sampled(topic: &PublishedTopic) -> bool {
     topic.subscribed && topic.other_transport.as_deref() == Some("shared_memory")
 }
 
-/// That topics are sampled, what follows from it, and what helps.
+/// Text about sampled topics: the consequence and the remedy.
 pub(crate) fn sampled(topics: &[String], consequence: &str) -> Option<String> {
     let names = few(topics);
     let verb = if topics.len() == 1 { "is" } else { "are" };

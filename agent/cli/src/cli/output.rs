@@ -1,9 +1,10 @@
-//! Standard output that is passed on line by line, also in a pipe, and that ends without a word
-//! when its reader has gone; and what goes to standard error bare.
+//! Standard output, flushed after each line also in a pipe. If its reader closes it, the program
+//! ends silently.
 
 use std::io::{self, Write as _};
 
-/// A line for stderr as it is, as the original prints its errors; the exit code is 1.
+/// A line printed on stderr without a prefix, as the original prints its errors; the exit code is
+/// 1.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub(crate) struct UserError(pub(crate) String);
@@ -21,10 +22,11 @@ impl Output {
         }
     }
 
-    /// Writes and passes on what are whole lines, or everything where it ends with none.
+    /// Writes text and flushes whole lines; text without a line end is flushed entirely.
     ///
     /// # Errors
-    /// The reader has gone, or the disk is full.
+    ///
+    /// The reader has closed the output, or the disk is full.
     pub(crate) fn write(&mut self, text: &str) -> io::Result<()> {
         self.write_bytes(text.as_bytes())
     }
@@ -40,7 +42,7 @@ impl Output {
     }
 }
 
-/// The reader of standard output has gone: there is no output left to write.
+/// Returns whether the error is a closed standard output.
 pub(crate) fn is_broken_pipe(error: &anyhow::Error) -> bool {
     error.chain().any(|cause| {
         let cause = cause.downcast_ref::<io::Error>();

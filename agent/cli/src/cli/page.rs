@@ -11,9 +11,9 @@ use serde_json::json;
 
 use super::{Output, UserError};
 
-/// The built-in port of the API.
+/// Default port of the API.
 const PORT: &str = "17401";
-/// Opens addresses on a desktop.
+/// Program that opens an address in the browser of a desktop.
 const OPENER: &str = "xdg-open";
 
 /// `rp page`.
@@ -57,7 +57,7 @@ impl Page {
             let reason = "the agent serves no page: api.listen or api.page is off".to_owned();
             return Err(UserError(reason).into());
         };
-        // Where this program has just reached it, if that was by an address.
+        // Prefers the address at which this program has reached the agent.
         let address = near.unwrap_or(address);
         let address = format!("{address}#token={token}");
         output.write(&format!("{address}\n"))?;
@@ -68,7 +68,7 @@ impl Page {
     }
 }
 
-/// Name and port of a host.
+/// Host name and port of an address.
 fn parts(host: &str) -> (&str, &str) {
     match host.rsplit_once(':') {
         Some((name, port)) if !name.ends_with(':') && port.parse::<u16>().is_ok() => (name, port),
@@ -76,13 +76,13 @@ fn parts(host: &str) -> (&str, &str) {
     }
 }
 
-/// Whether this is the host of this program.
+/// Returns whether the name is that of this host.
 fn is_near(name: &str) -> bool {
     let address = name.trim_matches(['[', ']']).parse::<IpAddr>();
     name == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }
 
-/// How the page of another host comes to this one.
+/// SSH command that forwards the page of another host to this one.
 fn tunnel(name: &str, port: &str) -> String {
     format!(
         "ssh -L {port}:127.0.0.1:{port} {name}\n\

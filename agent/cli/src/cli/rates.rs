@@ -1,5 +1,5 @@
-//! `rp topic hz`, `bw` and `delay`: interest in topics for as long as the verb runs, and what comes
-//! of it put into words. How it is reported is decided elsewhere, by the stream's own clock.
+//! `rp topic hz`, `bw` and `delay`: subscribe to topics at the agent while the verb runs, and print
+//! the measurements. The stream's own clock times the reports.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -21,23 +21,22 @@ use super::notes::Notes;
 use super::shared::{Matching, Spinning, names_of};
 use super::{Output, UserError};
 
-/// Window of `hz` and `delay`.
+/// Default window of `hz` and `delay`, in messages.
 const LONG: usize = 10_000;
-/// Window of `bw`.
+/// Default window of `bw`, in messages.
 const SHORT: usize = 100;
 /// `rp topic hz`.
 #[derive(Args, Debug)]
 pub(crate) struct Hz {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest intervals
+    /// Number of newest intervals to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
     window: usize,
-    /// Count only messages for which this expression over `m`, the message, is true: as for
-    /// `rp topic echo`
+    /// Count only messages that match this expression over `m`, the message, as in `rp topic echo`
     #[arg(long, value_name = "EXPR")]
     filter: Option<String>,
-    /// Directory that has definitions as package/msg/Type.msg, for --filter; may be repeated
+    /// Directory with definitions (package/msg/Type.msg), for --filter; may be repeated
     #[arg(long, value_name = "DIR")]
     definitions: Vec<PathBuf>,
     /// Accepted without effect: messages are always timed by the clock of the capture
@@ -52,7 +51,7 @@ pub(crate) struct Hz {
 pub(crate) struct Bandwidth {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest messages
+    /// Number of newest messages to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = SHORT, value_parser = positive)]
     window: usize,
     #[command(flatten)]
@@ -64,7 +63,7 @@ pub(crate) struct Bandwidth {
 pub(crate) struct Delay {
     #[command(flatten)]
     topics: Topics,
-    /// Calculate from so many of the newest messages
+    /// Number of newest messages to calculate from
     #[arg(long, short = 'w', value_name = "WINDOW", default_value_t = LONG, value_parser = positive)]
     window: usize,
     #[command(flatten)]
@@ -109,7 +108,7 @@ impl Hz {
         )
     }
 
-    /// With which code Ctrl-C ends it.
+    /// Exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         since(Dialect::Kilted, &self.options.target)
     }
@@ -127,7 +126,7 @@ impl Bandwidth {
         )
     }
 
-    /// With which code Ctrl-C ends it.
+    /// Exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         since(Dialect::Rolling, &self.options.target)
     }
@@ -146,7 +145,7 @@ impl Delay {
     }
 }
 
-/// From this distribution on, Ctrl-C is how a measurement ends well.
+/// Exit code after Ctrl-C: 0 from distribution `first` on.
 fn since(first: Dialect, target: &Target) -> u8 {
     if target.dialect() < first {
         INTERRUPTED
@@ -223,7 +222,7 @@ fn measure(
     Ok(measurement.code)
 }
 
-/// A measurement that takes the lines of a stream.
+/// Measures from the lines of a stream.
 struct Measurement<'a> {
     agent: &'a Agent,
     domain_id: u32,
@@ -234,7 +233,7 @@ struct Measurement<'a> {
 }
 
 impl Measurement<'_> {
-    /// Takes a line, and the payload of a sample; returns why the measurement ends, if it does.
+    /// Processes a line and the payload of a sample. Returns the reason if the measurement ends.
     fn line(&mut self, line: Line, payload: &Bytes) -> Result<Result<(), End>> {
         Ok(match line {
             Line::Open(open) => {
@@ -252,7 +251,7 @@ impl Measurement<'_> {
                 Ok(())
             }
             Line::Missed(missed) => {
-                // Arrivals are counted without their bytes.
+                // Arrivals are counted without their payload.
                 if matches!(
                     missed.reason,
                     MissedReason::QueueFull | MissedReason::Unannounced
@@ -269,7 +268,7 @@ impl Measurement<'_> {
                 }
                 self.notes.end()?;
                 if is_truncated {
-                    // The rest of the capture cannot be read, which stderr says.
+                    // The rest of the capture cannot be read; the error is on stderr.
                     self.code = ExitCode::FAILURE;
                 }
                 Err(End::Idle)
@@ -292,7 +291,7 @@ impl Measurement<'_> {
         let appeared = self.rates.appeared(&sample.topic, types);
         Ok(appeared.and_then(|()| match passes {
             false => Ok(()),
-            // Whether those that were not seen would pass is not known.
+            // Whether unseen messages would pass the filter is unknown.
             true if sample.sampled && self.sieve.is_none() => {
                 let origin = Origin {
                     writer: &sample.writer,
@@ -306,7 +305,7 @@ impl Measurement<'_> {
 }
 
 impl Topics {
-    /// The topics to measure; `None` = all.
+    /// Topics to measure. `None` for all topics.
     fn names(self, quantity: Quantity, dialect: Dialect) -> Result<Option<Vec<Named>>> {
         if self.all {
             if !self.names.is_empty() {
@@ -327,7 +326,7 @@ impl Topics {
     }
 }
 
-/// What being sampled means for this quantity.
+/// Consequence of sampling for this quantity.
 const fn sampled(quantity: Quantity) -> &'static str {
     match quantity {
         Quantity::Rate | Quantity::Bandwidth => {
@@ -341,7 +340,8 @@ fn user_error(refused: Refused) -> anyhow::Error {
     UserError(refused.0).into()
 }
 
-/// What the original says when it is given no topic: a usage error as long as it took one alone.
+/// The original's message for a command without topics. A usage error in distributions that accept
+/// only one topic.
 fn unnamed(quantity: Quantity, dialect: Dialect) -> anyhow::Error {
     let several = match quantity {
         Quantity::Rate => dialect >= Dialect::Kilted,

@@ -1,5 +1,5 @@
-//! `rp bag record`: a bag written by this process, with its rights and where it was started, out of
-//! what an agent gives. Says on stderr what the original says there.
+//! `rp bag record`: this process writes a bag in its own directory and with its own rights, from an
+//! agent's stream. Stderr has the original's messages.
 
 mod graph_cache;
 mod keys;
@@ -32,7 +32,7 @@ use keys::{Keys, read_keys};
 use output::{RecordingOutput, log, report};
 use signals::{Phase, listen};
 
-/// Room for messages that wait for the storage, as the original's cache.
+/// Default bytes of messages that wait for the storage, as the original's cache.
 const CACHE: u64 = 100 << 20;
 
 /// `rp bag record`.
@@ -141,12 +141,12 @@ pub(crate) struct Record {
     unused: Unused,
     #[command(flatten)]
     target: Target,
-    /// Set for `rp bag convert`, which ends by itself and needs no keys.
+    /// Set for `rp bag convert`, which ends by itself and reads no keys.
     #[arg(skip)]
     is_batch: bool,
 }
 
-/// Options of the original that change nothing here.
+/// Options of the original without effect.
 #[derive(Args, Debug)]
 struct Unused {
     /// Accepted without effect, as are other options of subscriptions and threads
@@ -171,7 +171,8 @@ struct Unused {
 }
 
 impl Record {
-    /// As `rp bag convert` means it: this capture into this bag, all topics unless some are chosen.
+    /// Options of `rp bag convert`: writes `capture` into `bag`, with all topics unless some are
+    /// selected.
     pub(crate) fn of_capture(mut self, capture: PathBuf, bag: PathBuf) -> Self {
         self.all |= self.positional.is_empty()
             && self.topics.is_empty()
@@ -199,7 +200,7 @@ impl Record {
         let agent = Agent::reach_stream_measured(&self.target)?;
         let query = filter.query(domain_id, self.max_cache_size);
         let graph_cache = Arc::new(Mutex::new(GraphCache::new(&agent, domain_id)));
-        // A replay goes on with the stream.
+        // The replay continues with the stream.
         let before = locked(&graph_cache).latest_snapshot();
         let mut samples = Samples::open(&agent, &query)?;
         let filter = if self.no_discovery {
@@ -251,7 +252,7 @@ impl Record {
         }
     }
 
-    /// The directory of the bag, which must not exist.
+    /// Directory of the bag, which must not exist yet.
     fn directory(&self) -> Result<PathBuf> {
         let directory = self.output.clone().unwrap_or_else(|| default_name().into());
         if directory.exists() {
@@ -264,7 +265,7 @@ impl Record {
         Ok(directory)
     }
 
-    /// Where the recorder learns what samples do not show.
+    /// Sources of facts that samples do not contain.
     fn sources<'a>(&self, graph_cache: &Arc<Mutex<GraphCache<'a>>>) -> Sources<'a> {
         let places = Places::new(
             self.definitions.clone(),
@@ -280,7 +281,7 @@ impl Record {
         }
     }
 
-    /// The recorder as it begins: paused, or with a ring in memory.
+    /// The recorder in its initial state: recording, paused, or with a ring in memory.
     fn begun<'a>(&self, mut recorder: Recorder<'a>) -> Recorder<'a> {
         if self.snapshot_mode {
             let room = usize::try_from(self.max_cache_size).unwrap_or(usize::MAX);
@@ -317,14 +318,11 @@ impl Record {
 
     fn options(&self) -> Result<Options> {
         if self.storage != "mcap" {
-            bail!(
-                "the storage `{}` is not written here: mcap is",
-                self.storage
-            );
+            bail!("unsupported storage `{}`: use mcap", self.storage);
         }
         let format = self.unused.serialization_format.as_deref();
         if let Some(format) = format.filter(|format| !matches!(*format, "" | "cdr")) {
-            bail!("the serialization format `{format}` is not written here: cdr is");
+            bail!("unsupported serialization format `{format}`: use cdr");
         }
         let mut storage = Storage::preset(&self.storage_preset_profile)?;
         if let Some(path) = &self.storage_config_file {
@@ -352,7 +350,7 @@ fn refused(error: &FilterError) -> anyhow::Error {
     UserError(format!("{error}")).into()
 }
 
-/// Whose distribution this is, as far as the shell says.
+/// Distribution of this shell, if it is set.
 fn installed() -> String {
     std::env::var("ROS_DISTRO").unwrap_or_default()
 }

@@ -1,4 +1,4 @@
-//! `rp completions` and `rp man`: what the command table says, for shells and for `man`.
+//! `rp completions` and `rp man`: the command table for shells and for `man`.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -46,7 +46,7 @@ impl Completions {
 
 impl Manual {
     pub(crate) fn print(&self) -> Result<ExitCode> {
-        // `help` would have a page for each command once more.
+        // `help` would add a second page for each command.
         let command = Arguments::command().disable_help_subcommand(true);
         match &self.directory {
             Some(directory) => clap_mangen::generate_to(command, directory)

@@ -87,7 +87,7 @@ fn access() -> impl TypedValueParser<Value = Access> {
         let mut levels = levels.into_iter().map(|(access, _)| access);
         levels
             .find(|access| access.name() == name)
-            .ok_or("no level that is known")
+            .ok_or("unknown level")
     })
 }
 

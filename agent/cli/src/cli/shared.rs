@@ -1,5 +1,5 @@
-//! What the verbs of the graph share: options that the original has and that change nothing here,
-//! and asking for names and for one thing by its name.
+//! Parts that the verbs of the graph share: accepted options without effect, and requests for all
+//! names or for one entity.
 
 use std::process::ExitCode;
 use std::sync::Once;
@@ -17,10 +17,10 @@ use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
 
-/// Options that concern the original's own node; accepted, so that scripts go on working.
+/// Options of the original's own node, accepted for existing scripts.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Spinning {
-    /// Accepted without effect: nothing has to be waited for
+    /// Accepted without effect: answers need no waiting
     #[arg(long, value_name = "SPIN_TIME")]
     spin_time: Option<f64>,
     /// Accepted without effect
@@ -31,7 +31,7 @@ pub(crate) struct Spinning {
     no_daemon: bool,
 }
 
-/// Quality of service of the original's own subscription; accepted, so that scripts go on working.
+/// QoS options of the original's own subscription, accepted for existing scripts.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Matching {
     /// Accepted without effect, as all QoS options: rp does not subscribe
@@ -52,7 +52,7 @@ pub(crate) struct Matching {
 }
 
 impl Matching {
-    /// Any was given that keeps the original from looking at what publishers offer.
+    /// Returns whether any option is set that makes the original ignore the QoS of publishers.
     pub(crate) fn any(&self) -> bool {
         let given = [
             &self.qos_depth,
@@ -80,17 +80,17 @@ impl Graph {
         Ok(Self { agent, domain_id })
     }
 
-    /// All names, as [`names_of`] has them.
+    /// All names, as [`names_of`] returns them.
     pub(crate) fn names(&self) -> Result<Names<'static>> {
         names_of(&self.agent, self.domain_id)
     }
 
-    /// The topic of this name, if there is one.
+    /// The topic of this name. `None` if it does not exist.
     pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic<'static>>> {
         self.thing("topics", name, Code::NoSuchTopic)
     }
 
-    /// The node of this name, if there is one, with all that is hidden.
+    /// The node of this name, with hidden entities. `None` if it does not exist.
     pub(crate) fn node(&self, name: &str) -> Result<Option<Node<'static>>> {
         self.thing("nodes", name, Code::NoSuchNode)
     }
@@ -110,10 +110,11 @@ impl Graph {
     }
 }
 
-/// Whether stderr says already why names are lacking.
+/// Whether the note about missing names has been printed.
 static EXPLAINED: Once = Once::new();
 
-/// All names in a domain, also hidden ones. Why they are lacking, stderr says once.
+/// All names in a domain, including hidden ones. The reason for missing names is printed once on
+/// stderr.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
     let names: Names<'_> =
         agent.get_visible(&format!("/names?domain_id={domain_id}&hidden=true"))?;
@@ -131,8 +132,8 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> 
     Ok(names)
 }
 
-/// What was announced before the agent, or the capture, began, or not at all: endpoints are announced
-/// once, and to other participants.
+/// Note about announcements that were made before the agent or the capture started. Endpoints are
+/// announced once, and only to other participants.
 fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
@@ -164,13 +165,13 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
         ),
     };
     Some(if is_replay {
-        format!("{what}: the capture does not hold their announcements")
+        format!("{what}: the capture lacks their announcements")
     } else {
-        format!("{what}: the agent started after them; `rp discover` has them announced again")
+        format!("{what}: the agent started after them; `rp discover` requests their announcements")
     })
 }
 
-/// Prints what there is to say.
+/// Prints a text and returns success.
 pub(crate) fn print_text(text: &str) -> Result<ExitCode> {
     Output::new().write(text)?;
     Ok(ExitCode::SUCCESS)
@@ -181,7 +182,7 @@ pub(crate) fn answer(text: Result<String, Refused>) -> Result<ExitCode> {
     print_text(&text.map_err(|refused| UserError(refused.0))?)
 }
 
-/// As [`print_text`]; where there is nothing, the exit code says so alone.
+/// As [`print_text`]; without a text, only the exit code reports the failure.
 pub(crate) fn print_or_fail(text: Option<&str>) -> Result<ExitCode> {
     match text {
         Some(text) => print_text(text),

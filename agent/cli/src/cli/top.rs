@@ -11,7 +11,7 @@ use ros2probe_daemon::agent::Speed;
 
 use super::{Output, UserError};
 
-/// Longest pause between two looks.
+/// Longest interval between two requests, in seconds.
 const MAX_INTERVAL: f64 = 3600.0;
 
 /// `rp top`.
@@ -29,13 +29,13 @@ pub(crate) struct Top {
     /// Print one table as text and end; needs no terminal
     #[arg(long, visible_alias = "batch")]
     once: bool,
-    /// Sort by this
+    /// Column to sort by
     #[arg(long, value_enum, value_name = "COLUMN", default_value_t = Column::Name)]
     sort: Column,
     /// Reverse the order
     #[arg(long)]
     reverse: bool,
-    /// Show only topics with this in name, type or state
+    /// Show only topics with this text in name, type or state
     #[arg(
         long,
         value_name = "TEXT",

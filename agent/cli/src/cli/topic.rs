@@ -104,7 +104,7 @@ struct Find {
 }
 
 impl Topic {
-    /// With which code Ctrl-C ends it.
+    /// Exit code after Ctrl-C.
     pub(crate) fn interrupted(&self) -> u8 {
         match &self.verb {
             Some(Verb::Hz(hz)) => hz.interrupted(),

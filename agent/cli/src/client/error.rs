@@ -1,11 +1,11 @@
-//! Why an agent could not be asked, each in one line that says what to do.
+//! Errors of requests to an agent. Each is one line with the remedy.
 
 use std::io;
 use std::path::PathBuf;
 
 use ros2probe_api::problem::{Code, Problem, URN};
 
-/// Why there is no answer.
+/// A request to an agent failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
     /// No agent listens on this host.
@@ -14,120 +14,120 @@ pub enum ClientError {
          terminal with `sudo rp run`; to read a capture, use `--replay FILE`"
     )]
     NoAgent,
-    /// An agent listens, but not for this user.
+    /// An agent listens, but this user has no permission for its socket.
     #[error(
         "the agent's socket {} is accessible only to root and the group ros2probe: `sudo usermod \
          -aG ros2probe $USER`, then log in again", path.display()
     )]
     Denied {
-        /// The socket.
+        /// Path of the socket.
         path: PathBuf,
     },
-    /// No agent answers where one was expected.
+    /// No agent listens at the given place.
     #[error("no agent answers at {place}: {}", because(source))]
     Unreachable {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
-        /// Why not.
+        /// Error of the connection attempt.
         source: io::Error,
     },
-    /// The agent accepts and then says nothing.
+    /// The agent accepted the connection and sent no answer in time.
     #[error("the agent at {place} does not answer")]
     Slow {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
     },
-    /// The connection ended within an answer.
+    /// The connection broke within an answer.
     #[error("the connection to the agent at {place} was lost")]
     Broke {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
-        /// Why.
+        /// Error of the connection.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The agent wants a token and got none, or a wrong one.
+    /// The agent requires a token, and the request had none or a wrong one.
     #[error("the agent at {place} {}", if *.offered { "does not accept this token" } else {
-        "wants its token: pass `--token-file FILE` or set ROS2PROBE_TOKEN_FILE" })]
+        "requires a token: pass `--token-file FILE` or set ROS2PROBE_TOKEN_FILE" })]
     Unauthorized {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
-        /// A token was sent.
+        /// Whether the request had a token.
         offered: bool,
     },
-    /// Something else listens there.
+    /// Another program listens there.
     #[error("{place} is not a ros2probe agent")]
     NotAnAgent {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
     },
-    /// The agent does not know what was asked for.
+    /// The agent does not have the requested path.
     #[error("the agent at {place} is older than this rp and has no {path}")]
     Older {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
-        /// The path without its query.
+        /// Path without its query.
         path: String,
     },
-    /// The agent's answer is not what this version expects.
+    /// The agent's answer does not have the form that this version expects.
     #[error(
         "the agent at {place} has another version than this rp: its answer for {path} cannot \
         be read"
     )]
     Unreadable {
-        /// Where.
+        /// Socket path, or host and port.
         place: String,
-        /// The path without its query.
+        /// Path without its query.
         path: String,
-        /// What is wrong with it.
+        /// Error of the JSON decoder.
         source: serde_json::Error,
     },
-    /// The agent says no.
+    /// The agent refused the request.
     #[error("{0}")]
     Refused(Refusal),
-    /// The path has characters that a path has not.
-    #[error("{path} cannot be requested")]
+    /// The path has characters that are invalid in a URL.
+    #[error("`{path}` is not a valid URL path")]
     Path {
         /// The path.
         path: String,
     },
-    /// The token cannot be had.
+    /// The token file cannot be read.
     #[error("cannot read the token in {}: {}", path.display(), because(source))]
     Token {
-        /// The file.
+        /// Path of the token file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the read.
         source: io::Error,
     },
-    /// The capture is none, or cannot be opened.
+    /// The capture cannot be opened, or is not a capture.
     #[error("cannot replay {}", path.display())]
     Capture {
-        /// The file.
+        /// Path of the capture.
         path: PathBuf,
-        /// Why not.
+        /// Error of the open.
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// Not even a connection could be begun.
+    /// The asynchronous runtime of the connection cannot be started.
     #[error("cannot start the runtime of the connection")]
     Runtime {
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
 }
 
-/// A request that the agent refused: problem details.
+/// Problem details of a request that the agent refused.
 #[derive(Clone, Debug, thiserror::Error, PartialEq, Eq)]
 #[error("{detail}")]
 pub struct Refusal {
-    /// Status of the answer.
+    /// HTTP status.
     pub status: u16,
-    /// Stable code, as `no-such-topic`.
+    /// Stable code, such as `no-such-topic`.
     pub code: String,
-    /// What is wrong, in words.
+    /// Explanation in plain text.
     pub detail: String,
 }
 
 impl Refusal {
-    /// `None` where the body is not an agent's.
+    /// Decodes problem details. Returns `None` if the body has another form.
     pub(super) fn read(status: u16, body: &[u8]) -> Option<Self> {
         let Problem {
             kind,
@@ -148,14 +148,14 @@ impl Refusal {
 }
 
 impl ClientError {
-    /// The agent refused for this reason.
+    /// Returns whether the refusal has this code.
     #[must_use]
     pub fn is(&self, code: Code) -> bool {
         matches!(self, Self::Refused(refusal) if refusal.code == code.as_str())
     }
 }
 
-/// The reason without the operating system's number.
+/// Text of an I/O error without the operating system's number.
 fn because(error: &io::Error) -> String {
     let text = error.to_string();
     let end = text.find(" (os error").unwrap_or(text.len());

@@ -1,4 +1,4 @@
-//! A stream of lines, with raw bytes between them where a line says so.
+//! Stream of lines from an agent, with raw bytes after lines that announce them.
 
 use std::time::Duration;
 
@@ -9,36 +9,36 @@ use tokio::time::timeout;
 
 use super::{Agent, ClientError};
 
-/// How long what has come is looked for when the silence is over.
+/// Time for data that has already arrived, after the limit on silence has passed.
 const GRACE: Duration = Duration::from_millis(500);
-/// Longer than any line.
+/// Longest line, in bytes.
 const MAX_LINE: usize = 1 << 20;
 
-/// More raw bytes than any message has.
+/// Longest run of raw bytes after a line.
 const MAX_BYTES: usize = 1 << 30;
 
-/// What an agent goes on saying.
+/// Lines of one open response.
 #[derive(Debug)]
 pub struct Lines<'a> {
     agent: &'a Agent,
     body: Incoming,
     buffer: BytesMut,
-    /// So much of the buffer has no end of a line in it.
+    /// Leading bytes of the buffer without a line end.
     searched: usize,
     ended: bool,
-    /// How long the agent may be silent, and how long it was waited for since it was heard.
+    /// Longest silence, and the time waited since the agent last sent data.
     silence: Option<Duration>,
     waited: Duration,
 }
 
-/// What came within a time.
+/// Result of a wait with a timeout.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Next {
     /// A line, without its end.
     Line(Bytes),
-    /// Nothing yet.
+    /// No line within the timeout.
     Nothing,
-    /// The agent hung up.
+    /// The agent closed the stream.
     End,
 }
 
@@ -55,23 +55,25 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Who says it.
+    /// The agent that sends the stream.
     pub(super) const fn agent(&self) -> &'a Agent {
         self.agent
     }
 
-    /// Waits for a line; `None` when the agent hung up.
+    /// Waits for a line. Returns `None` when the agent closes the stream.
     ///
     /// # Errors
-    /// The connection broke, the agent is silent, or what comes has no lines.
+    ///
+    /// The connection broke, the agent is silent for too long, or a line is too long.
     pub fn line(&mut self) -> Result<Option<Bytes>, ClientError> {
         let agent = self.agent;
         agent.runtime.block_on(self.next_line())
     }
 
-    /// Waits for a line, but no longer than `longest`.
+    /// Waits for a line for at most `longest`.
     ///
     /// # Errors
+    ///
     /// As [`Self::line`].
     pub fn line_within(&mut self, longest: Duration) -> Result<Next, ClientError> {
         let agent = self.agent;
@@ -79,7 +81,7 @@ impl<'a> Lines<'a> {
             match timeout(longest, self.next_line()).await {
                 Ok(line) => Ok(line?.map_or(Next::End, Next::Line)),
                 Err(_) => {
-                    // What is left of the silence is shorter by that.
+                    // The wait counts towards the silence.
                     self.waited += longest;
                     Ok(Next::Nothing)
                 }
@@ -87,10 +89,11 @@ impl<'a> Lines<'a> {
         })
     }
 
-    /// Exactly this many bytes that follow the line which was read last.
+    /// Reads the `count` raw bytes that follow the last line.
     ///
     /// # Errors
-    /// The stream ends before, or no message is so long.
+    ///
+    /// The stream ends early, or `count` exceeds the limit.
     pub fn bytes(&mut self, count: usize) -> Result<Bytes, ClientError> {
         let agent = self.agent;
         if count > MAX_BYTES {
@@ -110,7 +113,7 @@ impl<'a> Lines<'a> {
         })
     }
 
-    /// Nothing is lost when this is given up while it waits: what came is in the buffer.
+    /// Reads up to the next line end. Cancel-safe: received bytes stay in the buffer.
     async fn next_line(&mut self) -> Result<Option<Bytes>, ClientError> {
         loop {
             let fresh = self.buffer.get(self.searched..).unwrap_or_default();
@@ -131,7 +134,7 @@ impl<'a> Lines<'a> {
         }
     }
 
-    /// Whether anything more came.
+    /// Appends the next data to the buffer. Returns `false` at the end of the stream.
     async fn fill(&mut self) -> Result<bool, ClientError> {
         while !self.ended {
             match self.frame().await? {
@@ -150,7 +153,7 @@ impl<'a> Lines<'a> {
         Ok(false)
     }
 
-    /// The next frame, unless the agent is silent for too long.
+    /// Receives the next frame, or `None` after too long a silence.
     async fn frame(&mut self) -> Result<Option<Result<Frame<Bytes>, hyper::Error>>, ClientError> {
         let Some(silence) = self.silence else {
             return Ok(self.body.frame().await);
@@ -158,7 +161,7 @@ impl<'a> Lines<'a> {
         let left = silence.saturating_sub(self.waited);
         let mut frame = timeout(left, self.body.frame()).await;
         if frame.is_err() {
-            // This process may have been stopped meanwhile: what has come is read first.
+            // This process may have been stopped for a while: data that has arrived is read first.
             frame = timeout(GRACE, self.body.frame()).await;
         }
         self.waited = Duration::ZERO;

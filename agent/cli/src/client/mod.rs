@@ -1,9 +1,11 @@
-//! The connection to an agent, with a blocking face: on this host by its unix socket or loopback
-//! address, on another robot by `--host` and a token. A capture is replayed into an agent within
-//! this process, which is asked the same way.
+//! Blocking client of an agent's API.
 //!
-//! It asks and decodes; other modules know what answers mean. It never reads a clock for what it
-//! shows, and keeps nothing between requests.
+//! An agent on this host is reached by its unix socket or loopback, one on another robot by
+//! `--host` and a token. A capture is replayed into an agent within this process, which answers the
+//! same requests.
+//!
+//! The client sends requests and decodes answers; other modules interpret them. It reads no clock
+//! for its output and keeps nothing between requests.
 
 mod error;
 mod lines;
@@ -36,17 +38,17 @@ pub use samples::Samples;
 pub use target::{InvalidEnvironment, Target};
 use transport::Transport;
 
-/// The longest wait for a whole answer: graphs of thousands of topics come within a second.
+/// Longest wait for a whole answer. Graphs of thousands of topics take less than a second.
 const TIMEOUT: Duration = Duration::from_secs(30);
-/// The longest silence of an agent: before its answer, within it, and in a stream of messages, which
+/// Longest silence of an agent: before its answer, within it, and in a stream of messages, which
 /// has a clock.
 const SILENCE: Duration = Duration::from_secs(5);
-/// The longest silence in a stream of events, which has a beat every 15 s.
+/// Longest silence in a stream of events, which has a heartbeat every 15 s.
 const BEATS: Duration = Duration::from_secs(40);
-/// More than any answer has; a stream is not bounded by it.
+/// Bytes of the largest answer. Streams have no such limit.
 const MAX_ANSWER: usize = 256 << 20;
 
-/// An agent that can be asked.
+/// Connection to one agent.
 pub struct Agent {
     runtime: Runtime,
     transport: Transport,
@@ -54,28 +56,31 @@ pub struct Agent {
 }
 
 impl Agent {
-    /// Finds the agent that `target` means. A capture is replayed to its end, or to `--until`:
-    /// what it is asked for is how things stand then.
+    /// Finds the agent that `target` names. A capture is replayed to its end or to `--until`;
+    /// requests then see that state.
     ///
     /// # Errors
-    /// There is none, its token cannot be read, or the capture cannot.
+    ///
+    /// The agent is not running, its token cannot be read, or the capture cannot be read.
     pub fn reach(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::ToEnd, false)
     }
 
-    /// As [`Self::reach`], but a capture is replayed only to `--from`, else not at all, and goes on
-    /// with the first [`Self::stream`].
+    /// As [`Self::reach`], but a capture is replayed only to `--from`, or not at all. The replay
+    /// continues with the first [`Self::stream`].
     ///
     /// # Errors
+    ///
     /// As [`Self::reach`].
     pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Pause, false)
     }
 
-    /// As [`Self::reach`], but all topics of a capture are measured, and it goes on at `speed`, where
-    /// one is given, while it is asked.
+    /// As [`Self::reach`], but all topics of a capture are measured. With `speed`, the replay
+    /// continues at that speed during requests.
     ///
     /// # Errors
+    ///
     /// As [`Self::reach`].
     pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
         Self::find(target, speed.map_or(Pace::ToEnd, Pace::Live), true)
@@ -84,6 +89,7 @@ impl Agent {
     /// As [`Self::reach_stream`], but all topics of a capture are measured.
     ///
     /// # Errors
+    ///
     /// As [`Self::reach`].
     pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Pause, true)
@@ -103,18 +109,21 @@ impl Agent {
         })
     }
 
-    /// What is at `path`, which may have a query; names in it go through [`ros2probe_api::path::encoded`].
+    /// Requests `path`, which may have a query. Encode names in it with
+    /// [`ros2probe_api::path::encoded`].
     ///
     /// # Errors
-    /// The agent is gone, refuses, or answers something else.
+    ///
+    /// The agent is unreachable, refuses, or sends an unexpected answer.
     pub fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         self.exchange(Method::GET, path, None, TIMEOUT)
     }
 
-    /// As [`Self::get`], with control characters of all text escaped: names come from the network, and
-    /// go to a terminal.
+    /// As [`Self::get`], with control characters escaped in all texts. Names come from the network
+    /// and are printed on a terminal.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn get_visible<T: DeserializeOwned>(&self, path: &str) -> Result<T, ClientError> {
         let answer = self.get(path)?;
@@ -122,9 +131,10 @@ impl Agent {
             .map_err(|source| self.transport.unreadable(path, source))
     }
 
-    /// As [`Self::get`], with an answer within `longest`.
+    /// As [`Self::get`], with at most `longest` for the answer.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn get_within<T: DeserializeOwned>(
         &self,
@@ -134,9 +144,10 @@ impl Agent {
         self.exchange(Method::GET, path, None, longest)
     }
 
-    /// Sends `body`.
+    /// Sends `body` with POST.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn post<B: Serialize, T: DeserializeOwned>(
         &self,
@@ -146,9 +157,10 @@ impl Agent {
         self.exchange(Method::POST, path, Some(json(body)), TIMEOUT)
     }
 
-    /// Puts `body` there.
+    /// Sends `body` with PUT.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn put<B: Serialize, T: DeserializeOwned>(
         &self,
@@ -158,9 +170,10 @@ impl Agent {
         self.exchange(Method::PUT, path, Some(json(body)), TIMEOUT)
     }
 
-    /// Removes what is there.
+    /// Deletes the resource at `path`.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn delete(&self, path: &str) -> Result<(), ClientError> {
         self.runtime.block_on(async {
@@ -169,10 +182,11 @@ impl Agent {
         })
     }
 
-    /// Lines that go on coming, perhaps with raw bytes between them, until this end or the other
-    /// one hangs up.
+    /// Opens a stream of lines, some with raw bytes behind them. It lasts until either end closes
+    /// it.
     ///
     /// # Errors
+    ///
     /// As [`Self::get`].
     pub fn stream(&self, path: &str) -> Result<Lines<'_>, ClientError> {
         self.runtime.block_on(async {
@@ -184,7 +198,7 @@ impl Agent {
                 } else {
                     SILENCE
                 };
-                // A replay within this process has the pace of its capture.
+                // A replay within this process runs at the pace of its capture.
                 let silence = (!self.transport.is_replayed()).then_some(silence);
                 Ok(Lines::new(self, answer.into_body(), silence))
             } else {
@@ -196,30 +210,30 @@ impl Agent {
         })
     }
 
-    /// A line or an answer, read.
+    /// Decodes the JSON of a line or an answer.
     fn decoded<T: DeserializeOwned>(&self, path: &str, text: &[u8]) -> Result<T, ClientError> {
         serde_json::from_slice(text).map_err(|source| self.transport.unreadable(path, source))
     }
 
-    /// It ended before it said anything.
+    /// Error of a connection that closed before the answer.
     fn hung_up(&self, path: &str) -> ClientError {
         self.transport
             .broke(format!("{path} ended before its first byte"))
     }
 
-    /// It is a capture that is asked.
+    /// Returns whether the agent replays a capture within this process.
     #[must_use]
     pub const fn is_replay(&self) -> bool {
         matches!(self.transport, Transport::ReplayAgent(_))
     }
 
-    /// How the replay of a capture ended; `None` for a live agent, and while it goes on.
+    /// How the replay of a capture ended. `None` for a live agent and during the replay.
     #[must_use]
     pub fn outcome(&self) -> Option<Outcome> {
         self.transport.outcome()
     }
 
-    /// Where it is, for people.
+    /// Address of the agent as text for people.
     #[must_use]
     pub fn place(&self) -> String {
         self.transport.to_string()
@@ -271,7 +285,7 @@ impl Agent {
         answer.unwrap_or_else(|_| Err(self.transport.slow()))
     }
 
-    /// The whole body of an answer that is no refusal.
+    /// Reads the whole body of a successful answer; problem details become an error.
     async fn whole(&self, path: &str, answer: Response<Incoming>) -> Result<Bytes, ClientError> {
         let status = answer.status();
         let mut body = Limited::new(answer.into_body(), MAX_ANSWER);
@@ -318,7 +332,7 @@ fn visible_text(value: Value) -> Value {
     }
 }
 
-/// What has no JSON form would be refused by the agent as an empty body.
+/// Encodes `body`. A body without a JSON form becomes empty, which the agent refuses.
 fn json<B: Serialize>(body: &B) -> Bytes {
     serde_json::to_vec(body).unwrap_or_default().into()
 }

@@ -1,5 +1,4 @@
-//! The messages of an agent's stream, with their bytes, as a subscription within the agent would
-//! give them.
+//! Messages of an agent's stream with their bytes, in the form of a subscription within the agent.
 
 use std::time::Duration;
 
@@ -10,7 +9,7 @@ use ros2probe_api::samples::{Line, Open};
 use ros2probe_daemon::subscriptions::NextItem;
 use ros2probe_daemon::subscriptions::line_reader::LineReader;
 
-/// What an agent gives of topics, until it is dropped.
+/// Open stream of messages. Dropping it closes the stream.
 #[derive(Debug)]
 pub struct Samples<'a> {
     lines: Lines<'a>,
@@ -18,11 +17,12 @@ pub struct Samples<'a> {
 }
 
 impl<'a> Samples<'a> {
-    /// Opens the stream that `query` asks for, as `/samples` documents it, with payloads. When this
-    /// returns, the agent knows what is wanted.
+    /// Opens the stream of `query`, in the syntax of `/samples`, with payloads. The agent has
+    /// registered the subscription when this returns.
     ///
     /// # Errors
-    /// The agent is gone, refuses, or says something else.
+    ///
+    /// The agent is unreachable, refuses, or sends an unexpected answer.
     pub fn open(agent: &'a Agent, query: &str) -> Result<Self, ClientError> {
         let path = format!("/samples?payload=true&{query}");
         let mut lines = agent.stream(&path)?;
@@ -42,16 +42,17 @@ impl<'a> Samples<'a> {
         })
     }
 
-    /// What was there when it began.
+    /// Topics at the start of the stream.
     #[must_use]
     pub const fn opened(&self) -> &Open {
         self.reader.opened()
     }
 
-    /// What comes next.
+    /// Waits at most `timeout` for the next item.
     ///
     /// # Errors
-    /// The connection broke, or what comes cannot be read.
+    ///
+    /// The connection broke, or an item cannot be decoded.
     pub fn next_within(&mut self, timeout: Duration) -> Result<NextItem, ClientError> {
         let agent = self.lines.agent();
         let line = match self.lines.line_within(timeout)? {

@@ -1,4 +1,4 @@
-//! Which agent a command is for, and what it is asked about: the options that all verbs share.
+//! Options that all verbs share: the agent, the domain and the distribution.
 
 use std::io;
 use std::path::PathBuf;
@@ -10,10 +10,10 @@ use crate::ros2::{Dialect, dialect};
 use ros2probe_api::MAX_DOMAIN_ID;
 use ros2probe_daemon::run::CaptureTime;
 
-/// A longer file is no token.
+/// Largest token file, in bytes.
 const MAX_TOKEN: u64 = 4096;
 
-/// Which agent, which domain, which `ros2`. To be flattened last, for its heading.
+/// Agent, domain and distribution of a command. Flatten it last, because of its heading.
 #[derive(Args, Clone, Debug, Default)]
 #[command(next_help_heading = "Which agent")]
 pub struct Target {
@@ -26,7 +26,7 @@ pub struct Target {
     /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
     #[arg(long, value_name = "PATH")]
     pub socket: Option<PathBuf>,
-    /// Ask a capture (pcap or pcapng, may be gzipped) instead of an agent
+    /// Query a capture (pcap or pcapng, may be gzipped) instead of an agent
     #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
     pub replay: Option<PathBuf>,
     /// Start at this time of the capture: Unix seconds, or +S from its beginning
@@ -44,16 +44,17 @@ pub struct Target {
     pub distro: Option<Dialect>,
 }
 
-/// The environment says what cannot be.
+/// A variable of the environment has an invalid value.
 #[derive(Debug, thiserror::Error)]
-#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN_ID}")]
+#[error("ROS_DOMAIN_ID is `{0}`, but must be a number from 0 to {MAX_DOMAIN_ID}")]
 pub struct InvalidEnvironment(String);
 
 impl Target {
-    /// The domain that is asked about.
+    /// Domain of the command.
     ///
     /// # Errors
-    /// The environment names none that there is.
+    ///
+    /// `ROS_DOMAIN_ID` is not a valid domain.
     pub fn domain(&self) -> Result<u32, InvalidEnvironment> {
         if let Some(domain_id) = self.domain_id {
             return Ok(domain_id);
@@ -69,14 +70,14 @@ impl Target {
         }
     }
 
-    /// The output's dialect.
+    /// Dialect of the output.
     #[must_use]
     pub fn dialect(&self) -> Dialect {
         let named = || Dialect::of_distro(&std::env::var("ROS_DISTRO").ok()?);
         self.distro.or_else(named).unwrap_or_default()
     }
 
-    /// The token, where one was named.
+    /// Reads the token if one is configured.
     pub(super) fn token(&self) -> Result<Option<String>, ClientError> {
         let named = || std::env::var_os("ROS2PROBE_TOKEN_FILE").filter(|path| !path.is_empty());
         let path = self.token_file.clone();

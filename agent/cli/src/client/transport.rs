@@ -1,5 +1,7 @@
-//! The transport to an agent: one connection for each request, for connections on a host are cheap and
-//! what is kept open would have to be minded.
+//! Transport to an agent.
+//!
+//! Each request has its own connection: connections within a host are cheap, and no connection has
+//! to be kept alive.
 
 use std::fmt;
 use std::io;
@@ -19,28 +21,28 @@ use tokio::time::timeout;
 use super::{ClientError, Target};
 use ros2probe_daemon::replay_agent::{Outcome, Pace, ReplayAgent, ReplayError, ReplayOptions};
 
-/// Where the package and the service manager put the agent's socket.
+/// The agent's socket, as created by the package and the service manager.
 const SOCKET: &str = "/run/ros2probe/api.sock";
-/// Where an agent listens by default.
+/// Default address of the agent's API.
 const LOOPBACK: &str = "127.0.0.1:17401";
-/// Where an agent listens when only its host is named.
+/// Default port of an agent on another host.
 const PORT: &str = "17401";
-/// The longest wait for a connection.
+/// Longest wait for a connection.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
-/// How an agent is reached.
+/// Way to reach an agent.
 #[derive(Debug)]
 pub(super) enum Transport {
-    /// By its socket.
+    /// Path of a unix socket.
     Socket(PathBuf),
-    /// By host name or address, and port.
+    /// Host name or address, with port.
     Address(String),
-    /// Within this process.
+    /// A replay within this process.
     ReplayAgent(Box<ReplayAgent>),
 }
 
 impl Transport {
-    /// As `target` says; else by what there is on this host.
+    /// Selects the transport from `target`, else from the agents on this host.
     pub(super) async fn find(
         target: &Target,
         pace: Pace,
@@ -85,7 +87,7 @@ impl Transport {
         }
     }
 
-    /// What requests call the agent.
+    /// Value of the `Host` header.
     pub(super) fn host(&self) -> &str {
         match self {
             Self::Socket(_) | Self::ReplayAgent(_) => "localhost",
@@ -93,7 +95,7 @@ impl Transport {
         }
     }
 
-    /// The answer's head; its body comes while it is read.
+    /// Sends a request and returns the head of the answer. The body is received while it is read.
     pub(super) async fn send(
         &self,
         request: Request<Full<Bytes>>,
@@ -112,19 +114,19 @@ impl Transport {
         }
     }
 
-    /// Whether it is within this process.
+    /// Returns whether the agent runs within this process.
     pub(super) const fn is_replayed(&self) -> bool {
         matches!(self, Self::ReplayAgent(_))
     }
 
-    /// What a replay waited for has begun.
+    /// Continues a paused replay.
     pub(super) fn resume(&self) {
         if let Self::ReplayAgent(replayed) = self {
             replayed.resume();
         }
     }
 
-    /// How a replay ended, if this is one that did.
+    /// How a replay ended; `None` for other transports and during the replay.
     pub(super) fn outcome(&self) -> Option<Outcome> {
         match self {
             Self::ReplayAgent(replayed) => replayed.outcome(),
@@ -232,7 +234,7 @@ fn without_query(path: &str) -> String {
     path.split('?').next().unwrap_or_default().to_owned()
 }
 
-/// `robot1`, `robot1:80`, `::1`, `[::1]` and `[::1]:80` all have a port in the end.
+/// Appends the default port if `host` has none: `robot1`, `robot1:80`, `::1`, `[::1]`, `[::1]:80`.
 fn with_port(host: &str) -> String {
     let is_bare_v6 = host.matches(':').count() > 1 && !host.starts_with('[');
     if is_bare_v6 {

@@ -1,5 +1,5 @@
-//! The agent itself: whether it answers, sees, loses nothing and keeps what it knows; where none
-//! runs, what would keep it from starting.
+//! Checks of the agent itself: whether it answers, observes, loses nothing and persists its state.
+//! Without a running agent, obstacles to starting one.
 
 use std::fs;
 use std::net::SocketAddr;
@@ -16,17 +16,17 @@ use ros2probe_daemon::config::{self, Config, StateChoice};
 
 const AREA: Area = Area::Agent;
 const FROM: &str = "GET /health";
-/// Where the package puts what is kept.
+/// State directory of the package.
 const STATE: &str = "/var/lib/ros2probe";
 const SOCKETS: [&str; 2] = ["/proc/net/tcp", "/proc/net/tcp6"];
-/// State of a listening socket in those files.
+/// State of a listening socket in `/proc/net/tcp` and `/proc/net/tcp6`.
 const LISTENING: &str = "0A";
-/// Bytes of those files that are read.
+/// Bytes read of each of those files.
 const MAX_SOCKETS: u64 = 8 << 20;
-/// Watches that are named.
+/// Most watches in one sentence.
 const NAMED: usize = 5;
 
-/// One that answers.
+/// Findings about an agent that answers.
 #[must_use]
 pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> {
     let health = &answers.health;
@@ -41,11 +41,11 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings
 }
 
-/// None that answers, for this reason.
+/// Findings for a host without an answering agent. `reason` is why the request failed.
 #[must_use]
 pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) -> Vec<Finding> {
     let finding = if is_denied {
-        let sentence = "an agent is running, but this user may not query it";
+        let sentence = "an agent is running, but this user has no permission to query it";
         Finding::new(AREA, "reachable", Severity::Unknown, sentence)
             .seen(reason, "connect(2)")
             .remedy("sudo rp doctor    # or: sudo usermod -aG ros2probe $USER, and log in again")
@@ -66,7 +66,7 @@ pub fn absent(host: &HostState, config: &Config, reason: &str, is_denied: bool) 
     findings
 }
 
-/// A configuration that an agent would not start with.
+/// Finding for a configuration that prevents the agent from starting.
 #[must_use]
 pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     let first = mistakes.lines().next().unwrap_or_default();
@@ -165,7 +165,7 @@ fn losses(health: &Health) -> Vec<Finding> {
     findings
 }
 
-/// Caps of the configuration that are or were reached, each with the line to change.
+/// Findings for limits of the configuration that are or were reached, each with the key to change.
 fn limits(health: &Health) -> Vec<Finding> {
     let full = |limit: &&Limit| limit.reached > 0 || (limit.cap > 0 && limit.used >= limit.cap);
     let full = health.limits.iter().filter(full);
@@ -190,7 +190,7 @@ fn limits(health: &Health) -> Vec<Finding> {
         let (severity, sentence) = match blinds {
             true => (
                 Severity::Problem,
-                format!("{sentence}; part of the robot may not be seen"),
+                format!("{sentence}; part of the robot may be invisible"),
             ),
             false => (Severity::Warning, sentence),
         };
@@ -216,7 +216,8 @@ fn limits(health: &Health) -> Vec<Finding> {
     .collect()
 }
 
-/// Tables that have no key in the configuration; of an agent that tells no limits, all of them.
+/// Findings for full tables that are not among the limits the agent reports. Older agents report
+/// no limits.
 fn evictions(health: &Health) -> Vec<Finding> {
     let is_told = |table: &str| {
         let limit = limit(table);
@@ -227,7 +228,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     let mut findings: Vec<_> = full
         .map(|table| {
             let sentence = format!(
-                "its table of {} was full at {}: {} entries were evicted",
+                "the table of {} was full at {}: {} entries were evicted",
                 table.table, table.limit, table.evictions
             );
             let finding = Finding::new(AREA, "evictions", Severity::Warning, sentence).seen(
@@ -258,7 +259,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     findings
 }
 
-/// The key of a table's limit; most have none.
+/// Configuration key of a table's limit; most tables have none.
 fn limit(table: &str) -> Option<&'static str> {
     const KEYS: [(&str, &str); 7] = [
         ("deliveries", "flows"),
@@ -328,7 +329,7 @@ fn kept(health: &Health) -> Finding {
     )
 }
 
-/// Listeners that an agent would find taken.
+/// Findings for listen addresses that are already in use.
 fn ports(host: &HostState, config: &Config) -> Vec<Finding> {
     let wanted = [
         ("metrics.listen", config.metrics.listen),
@@ -369,7 +370,7 @@ fn listening(host: &HostState) -> Vec<u16> {
     ports
 }
 
-/// Whether an agent could write where it keeps what it knows.
+/// Finding for a state directory that an agent could not write.
 fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     let path = match choice {
         StateChoice::Off => return None,
@@ -413,7 +414,7 @@ fn state_directory(host: &HostState, choice: &StateChoice) -> Option<Finding> {
     Some(finding)
 }
 
-/// Whole seconds, minutes, hours or days.
+/// Duration in whole seconds, minutes, hours or days.
 fn duration(seconds: f64) -> String {
     match seconds {
         seconds if seconds < 120.0 => format!("{seconds:.0} s"),

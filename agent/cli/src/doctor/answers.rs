@@ -1,4 +1,4 @@
-//! What a running agent answers.
+//! Answers of a running agent.
 
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::ParticipantList;
@@ -7,7 +7,7 @@ use ros2probe_api::watches::WatchList;
 
 use crate::client::{Agent, ClientError};
 
-/// All answers of one agent.
+/// All answers that the checks need.
 #[derive(Clone, Debug, Default)]
 pub struct Answers {
     /// `GET /health`.
@@ -21,10 +21,11 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Asks an agent, about one domain or all of them.
+    /// Requests the answers for one domain, or for all of them.
     ///
     /// # Errors
-    /// It is gone, or does not answer what an agent answers.
+    ///
+    /// The agent is unreachable or sends an unexpected answer.
     pub fn ask(agent: &Agent, domain_id: Option<u32>) -> Result<Self, ClientError> {
         let within = domain_id.map_or_else(String::new, |domain| format!("?domain_id={domain}"));
         Ok(Self {

@@ -1,9 +1,10 @@
-//! Receive buffers of sockets and memory for IP reassembly, against the messages that were seen and
-//! those that died there.
+//! Checks of socket receive buffers and of memory for IP reassembly, against the sizes and losses
+//! of observed messages.
 //!
-//! What is recommended is computed: two of the largest messages in a socket's buffer, for one is
-//! still being read when the next comes; sixteen in reassembly, where what lacks a fragment stays for
-//! as long as `ipfrag_time`. The kernel counts its own overhead, and gives twice what is asked for.
+//! The recommended values are computed. A receive buffer holds two of the largest messages, since
+//! the next one arrives while one is being read. Reassembly memory holds sixteen, since an
+//! incomplete message stays for `ipfrag_time`. The kernel counts its own overhead and grants twice
+//! the requested size.
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
@@ -25,29 +26,29 @@ const REASSEMBLY: [(Sysctl, Sysctl); 2] = [
     ),
 ];
 const MEBIBYTE: u64 = 1 << 20;
-/// Larger messages travel in several datagrams or in IP fragments.
+/// Bytes above which a message travels in several datagrams or IP fragments.
 const LARGE: u64 = 64 << 10;
-/// Where no message was measured: what a camera or a lidar needs, in round numbers.
+/// Assumed message size without measurements: a typical camera image or lidar scan.
 const USUAL: u64 = 4 * MEBIBYTE;
 const MESSAGES_IN_BUFFER: u64 = 2;
 const MESSAGES_IN_REASSEMBLY: u64 = 16;
-/// Share of lost messages that is a problem.
+/// Ratio of lost messages above which the finding is a problem.
 const MANY: f64 = 0.01;
-/// Topics that are named.
+/// Most topics in one sentence.
 const NAMED: usize = 3;
 
-/// A kernel parameter.
+/// Name of a kernel parameter.
 #[derive(Clone, Copy, Debug)]
 struct Sysctl(&'static str);
 
-/// The largest messages that were measured.
+/// Largest measured messages.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Largest {
     bytes: u64,
     topic: String,
 }
 
-/// All of it.
+/// Findings of all buffer checks.
 #[must_use]
 pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     let topics = answers.map_or(&[][..], |answers| &answers.topics.topics);
@@ -99,7 +100,7 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     findings
 }
 
-/// By mean size: of what a topic carries, sizes differ little.
+/// Topic with the largest mean message size. Sizes vary little within a topic.
 fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     let mean = |measured: &Measurement| measured.bytes.checked_div(measured.messages);
     let of_topic = |topic: &Topic<'_>| {
@@ -119,7 +120,7 @@ fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     Some(Largest { bytes, topic })
 }
 
-/// Room for so many messages, in whole mebibytes.
+/// Bytes for `messages` of the largest messages, in whole mebibytes.
 fn wanted(largest: Option<&Largest>, messages: u64) -> u64 {
     let bytes = largest.map_or(USUAL, |largest| largest.bytes);
     bytes
@@ -192,7 +193,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
         };
         let report = |severity, sentence: String| Finding::new(AREA, check, severity, sentence);
         let Ok(most) = bytes else {
-            // Without IPv6 there is none of it.
+            // The parameter is absent without IPv6.
             if number == 0 {
                 let sentence = "the memory limit of IP reassembly is unknown".to_owned();
                 let finding =
@@ -236,7 +237,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
     findings
 }
 
-/// Messages that died in one way.
+/// Finding for messages lost at one place.
 fn lost(
     topics: &[Topic<'_>],
     check: &'static str,
@@ -291,7 +292,7 @@ impl Sysctl {
         format!("sudo sysctl -w {}={value}", self.0)
     }
 
-    /// The command, and where its line has to stand to last.
+    /// Command that sets the value, and the file that makes it permanent.
     fn set(self, value: u64) -> String {
         format!(
             "{}    # permanent: /etc/sysctl.d/60-ros.conf",
@@ -313,7 +314,7 @@ fn ratio(lost: u64, received: u64) -> f64 {
     lost as f64 / lost.saturating_add(received).max(1) as f64
 }
 
-/// As people say it.
+/// Size with a unit for people.
 #[expect(clippy::cast_precision_loss, reason = "a size for people")]
 fn size(bytes: u64) -> String {
     let bytes = bytes as f64;

@@ -1,10 +1,10 @@
-//! The clock: whether times of this host may be compared with those of others.
+//! Checks of the clock: whether timestamps of this host are comparable with those of others.
 
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 
 const AREA: Area = Area::Clock;
-/// Who keeps clocks.
+/// Programs that synchronize clocks.
 const KEEPERS: [&str; 7] = [
     "chronyd",
     "ntpd",
@@ -14,10 +14,10 @@ const KEEPERS: [&str; 7] = [
     "ntpd-rs",
     "openntpd",
 ];
-/// Above this many microseconds latency between hosts says little.
+/// Estimated error in microseconds above which latencies between hosts are unreliable.
 const COARSE: i64 = 10_000;
 
-/// All of it.
+/// Findings of all clock checks.
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let keepers = keepers(host);

@@ -1,34 +1,34 @@
-//! What a check says: one sentence, what it rests on, what to do. Nothing here looks at anything.
+//! Result of a check: one sentence, its evidence and its remedies. This module reads nothing.
 
 use serde::Serialize;
 
-/// How one thing is, from good to bad.
+/// Severity of a finding, from good to bad.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// As it should be.
+    /// The check passed.
     Ok,
-    /// Good to know: what will not be shown, and by what choice.
+    /// A limit of visibility by configuration or by design.
     Note,
-    /// It could not be looked at.
+    /// The check could not read its input.
     Unknown,
-    /// It costs something: an answer will be wrong or missing.
+    /// Some answers are wrong or incomplete.
     Warning,
-    /// It is broken.
+    /// Observation is broken.
     Problem,
 }
 
-/// What a check is about.
+/// Subject of a check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Area {
     /// The agent itself.
     Agent,
-    /// What it can see here.
+    /// Visible traffic of this host.
     Sight,
-    /// What the kernel has.
+    /// Features of the kernel.
     Kernel,
-    /// What this shell and the agent may do.
+    /// Permissions of this shell and of the agent.
     Privileges,
     /// Network interfaces.
     Interfaces,
@@ -36,54 +36,54 @@ pub enum Area {
     Shell,
     /// ROS processes of this host.
     Processes,
-    /// What the agent found.
+    /// Participants, topics and nodes in the agent's graph.
     Graph,
     /// Buffers of sockets and of IP reassembly.
     Buffers,
-    /// The clock.
+    /// Clock synchronization.
     Clock,
 }
 
-/// The result of one check.
+/// Result of one check.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// What it is about.
+    /// Subject of the check.
     pub area: Area,
-    /// The check's name, the same on every host.
+    /// Name of the check, stable across hosts and versions.
     pub check: &'static str,
-    /// How it is.
+    /// Severity of the result.
     #[serde(rename = "verdict")]
     pub severity: Severity,
-    /// In plain words.
+    /// Result in plain text.
     pub sentence: String,
-    /// What that rests on.
+    /// Values that the result is based on.
     pub evidence: Vec<Evidence>,
-    /// What to do, each by itself.
+    /// Remedies, each sufficient by itself.
     pub remedies: Vec<Remedy>,
 }
 
-/// A value that was read.
+/// A value that the check read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Evidence {
-    /// The value, or why there is none.
+    /// The value, or the reason for its absence.
     pub value: String,
-    /// Where it was read: a file, a path of the control API, a system call.
+    /// Source of the value: a file, a path of the API, or a system call.
     pub from: String,
 }
 
-/// One thing that helps.
+/// One remedy.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Remedy {
-    /// Where the line goes.
+    /// Where the line belongs.
     pub kind: RemedyTarget,
-    /// To be pasted there; what is in capitals is to be filled in.
+    /// Line to paste. Words in capitals are placeholders.
     pub line: String,
-    /// What to know of it.
+    /// Further explanation.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub comment: Option<String>,
 }
 
-/// Where a remedy goes.
+/// Where the line of a remedy belongs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RemedyTarget {
@@ -91,12 +91,12 @@ pub enum RemedyTarget {
     Command,
     /// The agent's configuration file.
     Configuration,
-    /// Settings of another program, which the comment names.
+    /// Settings of another program, named in the comment.
     Elsewhere,
 }
 
 impl Area {
-    /// Its heading.
+    /// Heading of the area.
     #[must_use]
     pub const fn title(self) -> &'static str {
         match self {
@@ -115,7 +115,7 @@ impl Area {
 }
 
 impl Severity {
-    /// All, from bad to good.
+    /// All severities, from bad to good.
     pub const ALL: [Self; 5] = [
         Self::Problem,
         Self::Warning,
@@ -124,7 +124,7 @@ impl Severity {
         Self::Ok,
     ];
 
-    /// As it is printed.
+    /// Label in the printed report.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -138,7 +138,7 @@ impl Severity {
 }
 
 impl Finding {
-    /// Without evidence and remedies so far.
+    /// Creates a finding without evidence and remedies.
     pub fn new(
         area: Area,
         check: &'static str,
@@ -155,7 +155,7 @@ impl Finding {
         }
     }
 
-    /// Rests on this too.
+    /// Adds evidence.
     #[must_use]
     pub fn seen(mut self, value: impl Into<String>, from: impl Into<String>) -> Self {
         let (value, from) = (value.into(), from.into());
@@ -163,19 +163,19 @@ impl Finding {
         self
     }
 
-    /// This command helps. Four spaces and `#` begin a comment, here and below.
+    /// Adds a command. Four spaces and `#` begin a comment, here and below.
     #[must_use]
     pub fn remedy(self, line: impl Into<String>) -> Self {
         self.with(RemedyTarget::Command, line.into())
     }
 
-    /// This in the agent's configuration helps.
+    /// Adds a line of the agent's configuration.
     #[must_use]
     pub fn configure(self, line: impl Into<String>) -> Self {
         self.with(RemedyTarget::Configuration, line.into())
     }
 
-    /// This helps, where the comment says.
+    /// Adds a setting of another program, named in the comment.
     #[must_use]
     pub fn elsewhere(self, line: impl Into<String>) -> Self {
         self.with(RemedyTarget::Elsewhere, line.into())

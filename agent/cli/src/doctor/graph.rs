@@ -1,5 +1,5 @@
-//! What the agent found, as far as it bears on what it can show: who is there, whose names are
-//! lacking, and which topics use transports that cannot be observed, or only in part.
+//! Checks of the agent's graph: participants without names, topics on transports that are invisible
+//! or sampled, and endpoints that do not match.
 
 use std::collections::BTreeMap;
 
@@ -10,14 +10,14 @@ use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
 
 const AREA: Area = Area::Graph;
-/// Adds what helps.
+/// Adds remedies to a finding.
 type Helps = fn(Finding) -> Finding;
 
-/// Topics that are named.
+/// Most topics in one sentence.
 const NAMED: usize = 3;
 
-/// All of it. `processes`: how many ROS processes were found on the agent's host, where that was
-/// looked at.
+/// Findings of all graph checks. `processes` is the number of ROS processes on the agent's host, if
+/// it is known.
 #[must_use]
 pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     let participants = &answers.participants.participants;
@@ -84,8 +84,8 @@ fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: 
     )
 }
 
-/// The only participant of a domain, with nothing announced: endpoints are announced to other
-/// participants.
+/// Returns whether the participant is the only one of its domain and announced no endpoints.
+/// Endpoints are announced only to other participants.
 fn is_alone(participant: &Participant<'_>, participants: &[Participant<'_>]) -> bool {
     let has_nothing = participant.writers == 0 && participant.readers == 0;
     let others = participants.iter();
@@ -111,10 +111,10 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     );
     let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
-    Some(finding.remedy("sudo rp discover --all    # asks it for them: a few packets"))
+    Some(finding.remedy("sudo rp discover --all    # requests them: a few packets"))
 }
 
-/// Those that were there before the agent.
+/// Finding for participants that started before the agent and whose names are unknown.
 fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     let is_nameless = |each: &&Participant<'_>| {
         let has_nothing = each.writers == 0 && each.readers == 0;
@@ -163,7 +163,7 @@ fn unknown_writers(answers: &Answers) -> Option<Finding> {
         format!("{}: {}", writers.len(), first.guid),
         "GET /participants",
     );
-    Some(finding.remedy("sudo rp discover --all    # asks their participants to repeat it"))
+    Some(finding.remedy("sudo rp discover --all    # requests the announcements"))
 }
 
 fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -185,7 +185,7 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
     )
 }
 
-/// Topics of which no pair of endpoints uses the network.
+/// Findings for topics without a pair of endpoints on the network.
 fn off_the_network(answers: &Answers) -> Vec<Finding> {
     let transports = [
         shared_memory(&answers.health),
@@ -226,11 +226,11 @@ fn off_the_network(answers: &Answers) -> Vec<Finding> {
     findings.collect()
 }
 
-/// What is reported of topics that use one transport aside from the network.
+/// Texts about topics on one transport other than the network.
 struct OffNetwork {
     transport: &'static str,
     severity: Severity,
-    /// The verb in the plural, and the rest of the sentence.
+    /// Verb in the plural, and the rest of the sentence.
     words: (&'static str, &'static str),
     remedy: Option<Helps>,
 }
@@ -256,7 +256,7 @@ impl OffNetwork {
     }
 }
 
-/// Shared memory of Fast DDS, as far as the agent reads it.
+/// Texts about shared memory of Fast DDS, by the agent's abilities.
 fn shared_memory(health: &Health) -> OffNetwork {
     let able = |ability: &str| {
         let mut abilities = health.abilities.iter();
@@ -286,7 +286,7 @@ fn shared_memory(health: &Health) -> OffNetwork {
     }
 }
 
-/// The transport of most pairs, where none uses the network.
+/// Transport of most pairs, if no pair uses the network.
 fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     if topic
         .passages
@@ -299,7 +299,7 @@ fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     Some(&most.passage)
 }
 
-/// Endpoints that should talk and do not.
+/// Findings for endpoints with incompatible types or QoS.
 fn mismatches(topics: &[Topic<'_>]) -> Vec<Finding> {
     const KINDS: [(&str, &str, &str); 3] = [
         (
@@ -438,11 +438,11 @@ mod tests {
                 .starts_with("sudo rp discover --all")
         );
         assert_eq!(severity(&lone, "names"), None);
-        // With a second one in its domain its announcements were missed.
+        // A second participant in the domain implies missed announcements.
         let two = of(r#"{"domain_id":3},{"domain_id":3,"writers":2}"#);
         assert_eq!(severity(&two, "alone"), None);
         assert_eq!(severity(&two, "names"), Some(Severity::Warning));
-        // Known, or not to be known.
+        // Names are known, or the participant has none.
         assert_eq!(severity(&of(r#"{"readers":1}"#), "alone"), None);
         assert_eq!(severity(&of(r#"{"secured":true}"#), "alone"), None);
         let apart = of(r#"{"domain_id":1},{"domain_id":2}"#);
@@ -480,7 +480,7 @@ mod tests {
             severity(&of("same_process", ""), "same_process"),
             Some(Severity::Note)
         );
-        // One pair over the network is enough for the messages to be counted.
+        // One pair on the network suffices to count the messages.
         let both = format!("{},{}", pairs("network"), pairs("data_sharing"));
         let findings = check(&answers(WELL, &topic("/x", &both), ""), None);
         assert_eq!(findings.len(), 1);

@@ -1,7 +1,7 @@
-//! This host as far as checks look at it: files below a root, and what the kernel tells this process.
+//! Inputs of the checks on this host: files below a root, and values of system calls.
 //!
-//! Every file is read through [`Files`], bounded, so that a test can give a directory. Nothing is
-//! written and nothing is sent over a network.
+//! Every file is read through [`Files`] with a size limit, so that a test can substitute a
+//! directory. Nothing is written or sent over a network.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -14,52 +14,52 @@ use rustix::param::page_size;
 use rustix::process::{Gid, getegid, geteuid, getgroups};
 use rustix::thread::{CapabilitySet, capabilities};
 
-/// Bytes of one file that are read, unless a check says otherwise.
+/// Default limit for the size of one file, in bytes.
 const MAX_FILE: u64 = 256 << 10;
-/// Names of one directory that are read.
+/// Most names read from one directory.
 const MAX_NAMES: usize = 1 << 16;
 
-/// What checks look at.
+/// State of a host.
 #[derive(Debug)]
 pub struct HostState {
     /// `/proc`, `/sys`, `/etc` and `/run`.
     pub files: Files,
-    /// Bytes of a page.
+    /// Size of a memory page in bytes.
     pub page_bytes: u64,
     /// Effective capabilities of this process.
     pub capabilities: CapabilitySet,
-    /// Effective user.
+    /// Effective user of this process.
     pub user_id: u32,
-    /// Its groups.
+    /// Groups of this process.
     pub group_ids: Vec<u32>,
     /// Variables of this shell.
     pub environment: BTreeMap<String, String>,
-    /// What the kernel says of the clock.
+    /// Clock state of the kernel.
     pub clock: Result<ClockState, String>,
 }
 
-/// Files below a root.
+/// Files below a root directory.
 #[derive(Debug)]
 pub struct Files {
     root: PathBuf,
 }
 
-/// Why a file was not read.
+/// Reason why a file could not be read.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Unread {
-    /// There is none.
+    /// The file does not exist.
     #[error("not there")]
     Missing,
-    /// Not by this user.
+    /// This user has no permission.
     #[error("not permitted")]
     NotPermitted,
-    /// Something else.
+    /// Another error of the operating system.
     #[error("{0}")]
     Other(String),
 }
 
 impl HostState {
-    /// This one.
+    /// Reads the state of this host.
     #[must_use]
     pub fn read() -> Self {
         Self {
@@ -74,7 +74,7 @@ impl HostState {
         }
     }
 
-    /// Whether it is root's process.
+    /// Returns whether this process runs as root.
     #[must_use]
     pub const fn is_root(&self) -> bool {
         self.user_id == 0
@@ -82,31 +82,33 @@ impl HostState {
 }
 
 impl Files {
-    /// Those below `root`.
+    /// Files below `root`.
     #[must_use]
     pub fn below(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
 
-    /// Where an absolute path really is.
+    /// Maps an absolute path to its place below the root.
     #[must_use]
     pub fn path(&self, path: &str) -> PathBuf {
         self.root.join(path.trim_start_matches('/'))
     }
 
-    /// A file's text without its last newline. What is no UTF-8 is replaced.
+    /// Reads a text file without its last newline. Invalid UTF-8 is replaced.
     ///
     /// # Errors
-    /// It cannot be read.
+    ///
+    /// The file cannot be read.
     pub fn text(&self, path: &str) -> Result<String, Unread> {
         let bytes = self.bytes(path, MAX_FILE)?;
         Ok(String::from_utf8_lossy(&bytes).trim_end().to_owned())
     }
 
-    /// Up to `most` bytes of a file.
+    /// Reads up to `most` bytes of a file.
     ///
     /// # Errors
-    /// It cannot be read.
+    ///
+    /// The file cannot be read.
     pub fn bytes(&self, path: &str, most: u64) -> Result<Vec<u8>, Unread> {
         let mut bytes = Vec::new();
         let file = File::open(self.path(path))?;
@@ -114,20 +116,22 @@ impl Files {
         Ok(bytes)
     }
 
-    /// A file that holds a number.
+    /// Reads a file that contains one number.
     ///
     /// # Errors
-    /// It cannot be read, or holds something else.
+    ///
+    /// The file cannot be read, or does not contain a number.
     pub fn number<T: FromStr>(&self, path: &str) -> Result<T, Unread> {
         let text = self.text(path)?;
         let number = text.parse();
         number.map_err(|_| Unread::Other(format!("`{text}` is not a number")))
     }
 
-    /// Names in a directory, sorted.
+    /// Sorted names of a directory.
     ///
     /// # Errors
-    /// It cannot be read.
+    ///
+    /// The directory cannot be read.
     pub fn names(&self, path: &str) -> Result<Vec<String>, Unread> {
         let entries = fs::read_dir(self.path(path))?;
         let entries = entries.flatten().take(MAX_NAMES);
@@ -138,13 +142,13 @@ impl Files {
         Ok(names)
     }
 
-    /// Whether something is there.
+    /// Returns whether the path exists.
     #[must_use]
     pub fn exists(&self, path: &str) -> bool {
         self.path(path).exists()
     }
 
-    /// Processes, by number.
+    /// Process ids, sorted.
     #[must_use]
     pub fn processes(&self) -> Vec<u32> {
         let names = self.names("/proc").unwrap_or_default();
@@ -164,7 +168,7 @@ impl From<io::Error> for Unread {
     }
 }
 
-/// The last part of a path.
+/// Last part of a path.
 #[must_use]
 pub fn base_name(path: &str) -> &str {
     Path::new(path)
@@ -193,7 +197,7 @@ fn environment() -> BTreeMap<String, String> {
 pub(super) mod tests {
     use super::*;
 
-    /// A host of these files alone, with no variables and no privileges.
+    /// Host with only these files, no variables and no privileges.
     pub(in crate::doctor) fn host(files: &[(&str, &str)]) -> (tempfile::TempDir, HostState) {
         let directory = tempfile::tempdir().unwrap();
         for (path, text) in files {

@@ -1,4 +1,4 @@
-//! Network interfaces: what DDS can use them for, and which of them the agent looks at.
+//! Checks of network interfaces: their use for DDS, and which ones the agent captures.
 
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
@@ -6,18 +6,18 @@ use ros2probe_api::health::Health;
 
 const AREA: Area = Area::Interfaces;
 const PLACE: &str = "/sys/class/net";
-/// Of this process's network namespace, whatever is mounted.
+/// Interfaces of this process's network namespace, independent of the mounted `/sys`.
 const OWN: &str = "/proc/self/net/dev";
-/// `man 7 netdevice`.
+/// Interface flags of `man 7 netdevice`.
 const UP: u32 = 0x1;
 const LOOPBACK: u32 = 0x8;
 const MULTICAST: u32 = 0x1000;
-/// Interfaces that are listed by name; a host of containers has hundreds.
+/// Most interfaces listed by name; a container host has hundreds.
 const LISTED: usize = 6;
-/// Cyclone DDS's fragments with all headers: below this every one of them is fragmented once more.
+/// MTU below which every Cyclone DDS fragment is fragmented again by IP, in bytes.
 const SMALL_MTU: u32 = 1400;
 
-/// One of them.
+/// One network interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Interface {
     name: String,
@@ -26,7 +26,8 @@ struct Interface {
     carrier: bool,
 }
 
-/// All of them. `localhost`: some ROS process is to talk to its own host only.
+/// Findings of all interface checks. `localhost` is whether some ROS process is limited to its own
+/// host.
 #[must_use]
 pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<Finding> {
     let names = match host.files.names(PLACE) {
@@ -82,7 +83,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     findings
 }
 
-/// `/sys` shows the network namespace in which it was mounted, which need not be this one.
+/// `/sys` shows the network namespace in which it was mounted, which may differ from this one.
 fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let table = host.files.text(OWN).ok()?;
     let own = table
@@ -95,7 +96,7 @@ fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
         let others = names
             .iter()
             .find(|name| !own.clone().any(|known| known == name.as_str()));
-        // Of bonding it also has a file there.
+        // A bonding master also has a file in `/sys/class/net`.
         others
             .map(String::as_str)
             .filter(|name| *name != "bonding_masters")
@@ -129,7 +130,7 @@ impl Interface {
         self.flags & UP != 0 && self.carrier
     }
 
-    /// To reach others by.
+    /// Returns whether the interface can reach other hosts.
     fn is_used(&self) -> bool {
         self.is_up() && self.flags & LOOPBACK == 0
     }
@@ -243,7 +244,7 @@ mod tests {
     use super::super::host_state::tests::host;
     use super::*;
 
-    /// Name, flags, MTU, state.
+    /// Findings for interfaces given as name, flags, MTU and state.
     fn found(interfaces: &[(&str, &str, &str, &str)], localhost: bool) -> Vec<Finding> {
         let mut files = Vec::new();
         for (name, flags, mtu, state) in interfaces {

@@ -1,5 +1,5 @@
-//! What the kernel has of what the agent can use: its version, its types, its compiler, control
-//! groups. What of the hooks really works is tried or asked for in `visibility`.
+//! Checks of kernel features: version, BTF, BPF JIT and control groups. The `visibility` module
+//! tests whether the hooks work.
 
 use std::path::Path;
 
@@ -15,14 +15,14 @@ const UNPRIVILEGED: &str = "/proc/sys/kernel/unprivileged_bpf_disabled";
 const LOCKDOWN: &str = "/sys/kernel/security/lockdown";
 const MOUNTS: &str = "/proc/self/mountinfo";
 const LIMITS: &str = "/proc/self/limits";
-/// The oldest release that the filter is verified by.
+/// Oldest release on which the filter passes the verifier.
 const OLDEST: (u32, u32) = (5, 10);
-/// From this release on BPF maps are no locked memory.
+/// First release that does not charge BPF maps to locked memory.
 const NO_MEMLOCK: (u32, u32) = (5, 11);
-/// Rings and tables of one source, with room.
+/// Bytes of rings and tables of one source, with a margin.
 const LOCKED_BYTES: u64 = 64 << 20;
 
-/// All of them.
+/// Findings of all kernel checks.
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let release = host.files.text(RELEASE);
@@ -92,7 +92,7 @@ fn compiler(host: &HostState) -> Finding {
         .remedy("sudo sysctl -w net.core.bpf_jit_enable=1"),
         Ok(value) => report(Severity::Ok, "BPF programs are compiled (JIT)")
             .seen(value.to_string(), COMPILER),
-        // Shown in the first network namespace only.
+        // Visible only in the initial network namespace.
         Err(Unread::Missing) => report(
             Severity::Ok,
             "BPF JIT status is not visible inside a container",
@@ -109,7 +109,7 @@ fn unprivileged(host: &HostState) -> Finding {
     match host.files.number::<u32>(UNPRIVILEGED) {
         Ok(0) => report(
             Severity::Note,
-            "any user may load BPF programs; the agent does not need this",
+            "any user can load BPF programs; the agent does not need this",
         )
         .seen("0", UNPRIVILEGED)
         .remedy("sudo sysctl -w kernel.unprivileged_bpf_disabled=1"),
@@ -129,7 +129,7 @@ fn lockdown(host: &HostState) -> Option<Finding> {
     let (severity, sentence) = match mode.as_str() {
         "confidentiality" => (
             Severity::Warning,
-            "the kernel is locked down for confidentiality: BPF programs may not read its \
+            "the kernel is locked down for confidentiality: BPF programs cannot read its \
              memory, so socket owners and causes of loss are unknown",
         ),
         "none" => (Severity::Ok, "the kernel is not locked down"),
@@ -202,7 +202,7 @@ fn pages(host: &HostState) -> Finding {
     finding.seen(host.page_bytes.to_string(), "sysconf(_SC_PAGESIZE)")
 }
 
-/// Of kernels that charge BPF maps to it.
+/// Finding for the limit on locked memory, on kernels that charge BPF maps to it.
 fn locked_memory(host: &HostState) -> Finding {
     let report = |severity, sentence: String| Finding::new(AREA, "memlock", severity, sentence);
     let limits = host.files.text(LIMITS).unwrap_or_default();
@@ -232,7 +232,7 @@ fn locked_memory(host: &HostState) -> Finding {
     finding.seen(soft.unwrap_or("not there"), LIMITS)
 }
 
-/// Major and minor version.
+/// Parses the major and minor version of a release.
 fn parse(release: &str) -> Option<(u32, u32)> {
     let mut parts = release.split(['.', '-', '+']);
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))
@@ -284,7 +284,7 @@ mod tests {
         let found = severities(&[]);
         assert!(
             found.iter().all(|(check, severity)| match *check {
-                // A directory of a test is not the topmost group.
+                // A test's directory is not the root control group.
                 "cgroup" => *severity == Severity::Note,
                 _ => *severity == Severity::Ok,
             }),

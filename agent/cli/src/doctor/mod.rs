@@ -1,8 +1,8 @@
-//! `rp doctor`: what this host will show and what not, and what to do about it.
+//! `rp doctor`: reports what is visible on this host, what is not, and the remedies.
 //!
-//! A module for each area gives findings; this one decides which areas there are to look at and in
-//! what order they are reported. It looks and changes nothing; where no agent runs and it may, it loads
-//! the agent's kernel programs for a moment, since only a trial tells whether they can be had.
+//! Each area has a module that returns findings; this one selects the areas and their order. The
+//! checks change nothing. Without a running agent, they load the agent's kernel programs briefly if
+//! permitted, because only a trial shows whether the hooks work.
 
 pub mod agent;
 pub mod answers;
@@ -35,27 +35,27 @@ use ros2probe_daemon::run;
 use variables::{Range, Variables};
 use visibility::Visibility;
 
-/// What became of asking for an agent on this host.
+/// Result of the attempt to reach an agent on this host.
 #[derive(Debug)]
 pub enum Reach {
-    /// It answered.
+    /// The agent answered: its answers and its address.
     Answered(Box<Answers>, String),
-    /// Nobody did.
+    /// No agent answered, for this reason.
     Nobody(String),
-    /// One is there that this user may not ask.
+    /// This user has no permission to reach the agent.
     Denied(String),
 }
 
-/// The configuration on this host.
+/// Configuration on this host.
 #[derive(Debug)]
 pub struct Configured {
-    /// What an agent would run with; the default where the file is wrong.
+    /// Configuration of an agent started here; the default if the file is invalid.
     pub config: Config,
-    /// The file and its mistakes, if it has any.
+    /// The file and its mistakes, if it is invalid.
     pub mistakes: Option<(PathBuf, String)>,
 }
 
-/// This host, with or without an agent.
+/// Checks this host, with or without an agent.
 #[must_use]
 pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Report {
     let config = &configured.config;
@@ -97,7 +97,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     Report::new(name.unwrap_or_else(|_| "this host".to_owned()), findings)
 }
 
-/// An agent on another host: what it says of itself and of the graph. The rest is that host's to say.
+/// Checks an agent on another host. Only the agent's own answers are available.
 #[must_use]
 pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     let mut findings = agent::check(answers, place, env!("CARGO_PKG_VERSION"));
@@ -106,13 +106,13 @@ pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     Report::new(place, findings)
 }
 
-/// The graph of a capture.
+/// Checks the graph of a capture.
 #[must_use]
 pub fn examine_capture(answers: &Answers, name: &str) -> Report {
     Report::new(name, graph::check(answers, None))
 }
 
-/// What an agent would see: tried, where that is allowed. Not in other processes' code.
+/// Findings of a trial load of the kernel programs, if permitted. Uprobes are not attached.
 fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     if let Some(missing) = privilege::missing(host.capabilities, settings) {
         return visibility::untried(&format!("lacks {}", missing.needs()));

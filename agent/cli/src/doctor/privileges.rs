@@ -1,5 +1,5 @@
-//! What this process, the running agent and the service may do, and what grants the rest. Which
-//! capabilities are needed is `crate::privilege`'s to say.
+//! Checks of permissions: those of this process, of the running agent and of the service, with the
+//! command that grants missing ones. `crate::privilege` defines the required capabilities.
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
@@ -10,7 +10,7 @@ use ros2probe_daemon::privilege;
 
 const AREA: Area = Area::Privileges;
 const UNIT: &str = "ros2probe.service";
-/// Where units are, in the order in which they count.
+/// Directories of unit files, in systemd's order of precedence.
 const UNITS: [&str; 3] = [
     "/etc/systemd/system",
     "/usr/lib/systemd/system",
@@ -18,16 +18,16 @@ const UNITS: [&str; 3] = [
 ];
 const ENABLED: &str = "/etc/systemd/system/multi-user.target.wants/ros2probe.service";
 const SYSTEMD: &str = "/run/systemd/system";
-/// Where a service's processes are listed, of a hierarchy of control groups v2 and of v1.
+/// Process lists of the service, in control groups v2 and v1.
 const SERVICES: [&str; 3] = [
     "/sys/fs/cgroup/system.slice/ros2probe.service/cgroup.procs",
     "/sys/fs/cgroup/unified/system.slice/ros2probe.service/cgroup.procs",
     "/sys/fs/cgroup/systemd/system.slice/ros2probe.service/cgroup.procs",
 ];
-/// Words in control groups of containers.
+/// Words in paths of control groups that belong to containers.
 const CONTAINERS: [&str; 4] = ["docker", "containerd", "kubepods", "libpod"];
 
-/// All of them.
+/// Findings of all permission checks.
 #[must_use]
 pub fn check(
     host: &HostState,
@@ -53,14 +53,14 @@ fn own(host: &HostState, settings: &CaptureSettings, is_running: bool) -> Findin
         Finding::new(AREA, "capabilities", severity, sentence).seen(&held, "CapEff, this process")
     };
     match privilege::missing(host.capabilities, settings) {
-        None => report(Severity::Ok, "this shell may capture".to_owned()),
+        None => report(Severity::Ok, "this shell can capture".to_owned()),
         Some(_) if is_running => report(
             Severity::Ok,
-            "this shell may not capture; the running agent does".to_owned(),
+            "this shell lacks the capabilities to capture; the running agent has them".to_owned(),
         ),
         Some(missing) => report(
             Severity::Note,
-            format!("this shell may not capture: it lacks {}", missing.needs()),
+            format!("this shell cannot capture: it lacks {}", missing.needs()),
         )
         .remedy("sudo rp run    # or the service ros2probe")
         .remedy(missing.command()),
@@ -87,7 +87,7 @@ fn of_agent(health: &Health) -> Finding {
     )
 }
 
-/// Shared memory of containers is behind `/proc/<pid>/root`.
+/// Finding for shared memory of containers, which is reached through `/proc/<pid>/root`.
 fn containers(answers: &Answers) -> Option<Finding> {
     let has = |name: &str| answers.health.capabilities.iter().any(|held| held == name);
     let looks = answers
@@ -102,7 +102,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     if !looks || !contained || has("CAP_SYS_PTRACE") {
         return None;
     }
-    let sentence = "ROS runs in containers here, but the agent may not read their shared memory";
+    let sentence = "ROS runs in containers here, but the agent cannot read their shared memory";
     let finding = Finding::new(AREA, "containers", Severity::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
     Some(finding.elsewhere(
@@ -110,7 +110,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     ))
 }
 
-/// Exact mode, if it is asked for.
+/// Finding for exact mode, if it is configured.
 fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
@@ -128,19 +128,19 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     ))
 }
 
-/// Whether there is a service to start.
+/// Returns whether the service's unit is installed.
 #[must_use]
 pub fn is_installed(host: &HostState) -> bool {
     host.files.exists(SYSTEMD) && installed(host).is_some()
 }
 
-/// Where its unit is.
+/// Path of the service's unit.
 fn installed(host: &HostState) -> Option<&'static str> {
     let mut places = UNITS.into_iter();
     places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
 }
 
-/// The service, where there is systemd.
+/// Finding about the service, on hosts with systemd.
 fn unit(host: &HostState, is_answering: bool) -> Option<Finding> {
     if !host.files.exists(SYSTEMD) {
         return None;

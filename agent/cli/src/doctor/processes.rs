@@ -1,8 +1,9 @@
-//! ROS processes of this host, as far as this user may look at them: those that differ in what makes
-//! nodes find each other are the classic fault.
+//! Checks of ROS processes on this host, as far as this user can inspect them. Different settings
+//! for discovery are a common fault.
 //!
-//! A process is one of ROS when it maps a DDS or RMW library, or when the agent says that it has a
-//! participant. What a process says of itself is hostile: it is bounded here and escaped when printed.
+//! A process belongs to ROS if it maps a DDS or RMW library, or if the agent knows a participant of
+//! it. Values that a process controls are untrusted: their size is limited here, and they are
+//! escaped in the output.
 
 use std::collections::BTreeMap;
 
@@ -13,43 +14,44 @@ use ros2probe_api::participants::ParticipantList;
 use ros2probe_daemon::host_examination::is_fast_dds;
 
 const AREA: Area = Area::Processes;
-/// Text of a process's map that is read.
+/// Bytes read of a process's memory map.
 const MAX_MAP: u64 = 4 << 20;
-/// Bytes of its command line and of its variables.
+/// Bytes read of its command line and of its variables.
 const MAX_LINE: u64 = 64 << 10;
-/// Letters of a command that are shown.
+/// Characters shown of a command.
 const MAX_COMMAND: usize = 40;
-/// Processes that are named in one sentence, for each group.
+/// Most processes named in one sentence, per group.
 const NAMED: usize = 4;
-/// Processes of ROS that are looked at.
+/// Most ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
-/// One process.
+/// One ROS process.
 #[derive(Clone, Debug)]
 struct Process {
     id: u32,
     command: String,
     variables: Variables,
     implementation: Option<&'static str>,
-    /// The domain that its participant is in.
+    /// Domain of its participant.
     domain_id: Option<u32>,
 }
 
-/// All of them.
+/// ROS processes of this host.
 #[derive(Clone, Debug, Default)]
 pub struct Processes {
     found: Vec<Process>,
-    /// Others that this user may not look at.
+    /// Processes that this user cannot inspect.
     closed: Vec<u32>,
 }
 
 impl Processes {
-    /// Looks for them. `known`: what the agent says of participants.
+    /// Finds ROS processes. `known` is the agent's list of participants.
     #[must_use]
     pub fn find(host: &HostState, known: Option<&ParticipantList<'_>>) -> Self {
         let mut domains = BTreeMap::new();
         for participant in known.into_iter().flat_map(|known| &known.participants) {
-            // Of those with a socket here the number is the process's, and no announced one.
+            // For a participant with a socket on this host, the number is a process id of this
+            // host.
             if let (Some(id), Some(_)) =
                 (participant.process.process_id, &participant.process.cgroup)
             {
@@ -61,7 +63,7 @@ impl Processes {
         for id in host.files.processes() {
             let command = command(host, id);
             if command.is_empty() || id == std::process::id() {
-                // A thread of the kernel, or a process that has ended.
+                // A kernel thread, or a process that has ended.
                 continue;
             }
             let (domain_id, node) = match domains.remove(&id) {
@@ -85,20 +87,20 @@ impl Processes {
         processes
     }
 
-    /// How many there are.
+    /// Number of ROS processes.
     #[must_use]
     pub fn count(&self) -> usize {
         self.found.len()
     }
 
-    /// Some node is to talk to its own host only.
+    /// Returns whether some process is limited to its own host.
     #[must_use]
     pub fn is_any_local(&self) -> bool {
         let mut found = self.found.iter();
         found.any(|process| process.variables.range() == Range::Localhost)
     }
 
-    /// Where they differ from each other and from this shell.
+    /// Findings for differences among the processes and from this shell.
     #[must_use]
     pub fn check(&self, host: &HostState) -> Vec<Finding> {
         let mut findings = vec![self.overview()];
@@ -148,7 +150,7 @@ impl Processes {
         findings
     }
 
-    /// Those that may not be looked at.
+    /// Finding for processes that cannot be inspected.
     fn unseen(&self, is_root: bool) -> Option<Finding> {
         let first = self.closed.first()?;
         let which = match self.closed.len() {
@@ -197,7 +199,7 @@ impl Processes {
         finding
     }
 
-    /// A warning where processes differ in what `key` says of them.
+    /// Warns if processes have different values of `key`.
     fn differing(
         &self,
         check: &'static str,
@@ -214,7 +216,7 @@ impl Processes {
         if groups.len() < 2 {
             return None;
         }
-        // Small groups come first: they stand out.
+        // Small groups come first: they are the likely mistakes.
         let mut groups: Vec<_> = groups.into_iter().collect();
         groups.sort_by_key(|(_, group)| group.len());
         let named: Vec<_> = groups
@@ -232,7 +234,7 @@ impl Processes {
         Some(finding.remedy(remedy))
     }
 
-    /// All processes are in a domain that this shell is not in.
+    /// Warns if no process is in the domain of this shell.
     fn unlike(&self, shell: &Variables) -> Option<Finding> {
         let own = shell.domain().ok().filter(|_| shell.is_ros())?;
         let mut domains: Vec<_> = self.found.iter().map(Process::domain_id).collect();
@@ -271,7 +273,7 @@ impl Process {
     }
 }
 
-/// A process if it is one of ROS.
+/// Reads one process. Returns `None` if it does not belong to ROS.
 fn read_process(
     host: &HostState,
     id: u32,
@@ -293,7 +295,7 @@ fn read_process(
     }))
 }
 
-/// By the libraries that it maps.
+/// RMW implementation, from the mapped libraries.
 fn implementation(map: &str) -> Option<&'static str> {
     const LIBRARIES: [(&str, &str); 7] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
@@ -327,7 +329,7 @@ fn implementation(map: &str) -> Option<&'static str> {
     }
 }
 
-/// What it was started as; a script by its own name. Empty for threads of the kernel.
+/// Name of the program or script. Empty for kernel threads.
 fn command(host: &HostState, id: u32) -> String {
     let line = host.files.bytes(&format!("/proc/{id}/cmdline"), MAX_LINE);
     let line = line.unwrap_or_default();
@@ -377,7 +379,7 @@ mod tests {
     const FAST: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libfastrtps.so.2.14\n";
     const CYCLONE: &str = "7f00-7f01 r-xp 0 fe:00 12 /opt/ros/lib/libddsc.so.0.10.5\n";
 
-    /// Command, variables and map of each.
+    /// Findings for processes given as id, command line, variables and memory map.
     fn found(processes: &[(u32, &str, &str, &str)], shell: &[(&str, &str)]) -> Vec<Finding> {
         let mut files = Vec::new();
         for (id, command, variables, map) in processes {
@@ -493,7 +495,7 @@ mod tests {
         assert_eq!(finding.remedies[0].line, "export ROS_DOMAIN_ID=3");
         let same = found(&one, &[("ROS_DOMAIN_ID", "3")]);
         assert_eq!(sentence(&same, "shell_domain"), None);
-        // Nothing is said of a shell that is none of ROS.
+        // A shell without ROS variables is not compared.
         assert_eq!(sentence(&found(&one, &[]), "shell_domain"), None);
     }
 

@@ -1,26 +1,26 @@
-//! All findings about one host, in the order in which they are read.
+//! Report: all findings about one subject, in print order.
 
 use serde::Serialize;
 
 use super::finding::{Finding, Severity};
 use ros2probe_daemon::escape::visible;
 
-/// A report.
+/// Findings about one subject.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Report {
-    /// Version of this program.
+    /// Version of `rp`.
     pub version: &'static str,
-    /// Whom it is about: a host, an agent elsewhere, a capture.
+    /// Subject of the report: a host, a remote agent or a capture.
     pub subject: String,
-    /// The worst severity of all.
+    /// Worst severity of all findings.
     #[serde(rename = "verdict")]
     pub severity: Severity,
-    /// By area, in the order in which they are printed.
+    /// Findings by area, in print order.
     pub findings: Vec<Finding>,
 }
 
 impl Report {
-    /// About `subject`.
+    /// Creates a report about `subject`.
     #[must_use]
     pub fn new(subject: impl Into<String>, findings: Vec<Finding>) -> Self {
         let worst = findings.iter().map(|finding| finding.severity).max();
@@ -32,13 +32,13 @@ impl Report {
         }
     }
 
-    /// Something is broken.
+    /// Returns whether any finding is a problem.
     #[must_use]
     pub fn has_problems(&self) -> bool {
         self.severity == Severity::Problem
     }
 
-    /// How many of each severity.
+    /// Number of findings of each severity, as text.
     #[must_use]
     pub fn headline(&self) -> String {
         let count = |severity: Severity| {

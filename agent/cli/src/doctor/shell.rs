@@ -1,5 +1,5 @@
-//! The ROS environment of this shell: what nodes and tools started from it will do, and what of that
-//! the agent cannot see.
+//! Checks of this shell's ROS variables: their effect on nodes and tools started from it, and which
+//! of their traffic the agent cannot see.
 
 use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
@@ -8,15 +8,15 @@ use super::variables::{Range, Variables};
 const AREA: Area = Area::Shell;
 const FROM: &str = "this shell";
 const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
-/// RTPS 2.5, 9.6.2.3: ports of a domain begin here, so many apart.
+/// RTPS 2.5, 9.6.2.3: first port of domain 0, and ports per domain.
 const PORT_BASE: u32 = 7400;
 const DOMAIN_GAIN: u32 = 250;
-/// How far from there those of fifty participants on one host reach: 11, and two for each.
+/// Highest offset from that port for fifty participants on one host: 11, plus two each.
 const PORTS_OF_FIFTY: u32 = 11 + 2 * 49;
-/// Bytes of a profile that are read.
+/// Bytes read of an XML profile.
 const MAX_PROFILE: u64 = 256 << 10;
 
-/// All of it.
+/// Findings of all shell checks.
 #[must_use]
 pub fn check(host: &HostState) -> Vec<Finding> {
     let variables = Variables::of(&host.environment);
@@ -81,7 +81,7 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
 }
 
-/// Ports that the kernel gives to sockets that ask for any.
+/// Range of ephemeral ports.
 fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
     let text = host.files.text(PORTS).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);
@@ -183,7 +183,7 @@ fn server(variables: &Variables) -> Option<Finding> {
     Some(finding.remedy("export ROS_SUPER_CLIENT=TRUE    # ros2 tools need it"))
 }
 
-/// Of Fast DDS.
+/// Finding for transports selected by Fast DDS variables.
 fn transports(variables: &Variables) -> Option<Finding> {
     let name = "FASTDDS_BUILTIN_TRANSPORTS";
     let value = variables.shown(name)?;
@@ -243,7 +243,7 @@ fn profiles(host: &HostState, variables: &Variables) -> Vec<Finding> {
     .collect()
 }
 
-/// A file that a variable names, from where this shell is.
+/// Reads a file named by a variable, relative to this shell's directory.
 fn read(host: &HostState, path: &str) -> Result<Vec<u8>, Unread> {
     let path = std::path::absolute(path)?;
     host.files.bytes(&path.to_string_lossy(), MAX_PROFILE)
@@ -258,7 +258,7 @@ fn cyclone(host: &HostState, variables: &Variables) -> Option<Finding> {
             .seen(shown.clone(), format!("{name}, {FROM}"))
     };
     let mut text = String::new();
-    // Files and pieces of XML, with commas between them.
+    // The value is a comma-separated list of files and inline XML.
     for part in value.split(',').map(str::trim) {
         let named = part.strip_prefix("file://");
         let Some(path) = named.or(part.starts_with('/').then_some(part)) else {

@@ -1,6 +1,6 @@
-//! A report for people: grouped, aligned, eighty columns wide, commands on lines of their own.
+//! Report as text: grouped, aligned, eighty columns wide, with commands on their own lines.
 //!
-//! What comes from the network or from other processes reaches the terminal escaped.
+//! Values from the network or from other processes are escaped.
 
 use std::borrow::Cow;
 
@@ -9,25 +9,25 @@ use super::report::Report;
 use ros2probe_daemon::escape::visible;
 
 const WIDTH: usize = 80;
-/// Before sentences: two spaces, a severity, a space.
+/// Columns before a sentence: two spaces, the severity and a space.
 const INDENT: usize = 11;
-/// Lines of evidence of one finding, unless all of it is wanted.
+/// Most lines of evidence for one finding without `--verbose`.
 const EVIDENCE: usize = 3;
-/// Where the configuration is.
+/// Path of the configuration file, as printed after a line of configuration.
 const FILE: &str = "in /etc/ros2probe/ros2probe.yaml";
-/// Letters of one value.
+/// Most characters of one value.
 const MAX_VALUE: usize = 200;
 
-/// How a report is printed.
+/// Options of the output.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Style {
-    /// Evidence also of what is fine, and all of it.
+    /// Print all evidence, also of findings without a problem.
     pub verbose: bool,
-    /// With colours.
+    /// Use colours.
     pub colours: bool,
 }
 
-/// The whole report.
+/// Formats the whole report.
 #[must_use]
 pub fn text(report: &Report, style: Style) -> String {
     let mut page = Page {
@@ -99,7 +99,8 @@ impl Page {
         }
     }
 
-    /// A command is not broken, for it is to be pasted; a long comment goes above it.
+    /// Prints a remedy. A command is never wrapped, since it is to be pasted; a long comment
+    /// precedes it.
     fn remedy(&mut self, remedy: &Remedy) {
         let line = visible(&remedy.line);
         let own = remedy.comment.as_deref().map(visible);
@@ -147,8 +148,8 @@ const fn colour(severity: Severity) -> &'static str {
     }
 }
 
-/// Lines that fit behind the indentation; a word that does not is left whole unless it is no word of
-/// anybody's.
+/// Wraps a text behind the indentation. Longer words stay whole unless they exceed any plausible
+/// length.
 fn wrapped(text: &str) -> Vec<String> {
     let width = WIDTH - INDENT;
     let mut lines = vec![String::new()];

@@ -1,13 +1,14 @@
-//! What the variables of a shell or a process make of ROS: domain, implementation, who is looked for.
+//! ROS settings in the variables of a shell or a process: domain, implementation and discovery
+//! range.
 //!
-//! Only the variables named here are ever shown. Those of security are paths and switches, and no
-//! file that they name is opened.
+//! Only the variables named here are ever shown. Those of DDS security are paths and switches; the
+//! files that they name are not opened.
 
 use std::collections::BTreeMap;
 
-/// Longest value that is shown.
+/// Longest value shown, in characters.
 const MAX_VALUE: usize = 120;
-/// Those that say how ROS talks.
+/// Variables that affect the communication of ROS.
 const NAMES: [&str; 20] = [
     "ROS_DISTRO",
     "RMW_IMPLEMENTATION",
@@ -31,27 +32,27 @@ const NAMES: [&str; 20] = [
     "ROS_VERSION",
 ];
 
-/// Variables about ROS.
+/// ROS variables and their values.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Variables(BTreeMap<&'static str, String>);
 
-/// Whom nodes look for.
+/// Discovery range of nodes.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Range {
-    /// Everybody who is reached by multicast: the default.
+    /// All hosts reached by multicast; the default.
     Subnet,
-    /// Nodes of their own host.
+    /// Nodes of the same host.
     Localhost,
-    /// No host.
+    /// No discovery.
     Off,
-    /// What the implementation's own settings say.
+    /// The settings of the RMW implementation.
     System,
-    /// None of the values that ROS knows, which then takes `LOCALHOST`.
+    /// An unknown value, which ROS treats as `LOCALHOST`.
     Wrong(String),
 }
 
 impl Variables {
-    /// Of a shell.
+    /// ROS variables of a shell.
     #[must_use]
     pub fn of(environment: &BTreeMap<String, String>) -> Self {
         let known = NAMES.into_iter().filter_map(|name| {
@@ -61,7 +62,7 @@ impl Variables {
         Self(known.collect())
     }
 
-    /// Of a process, from `/proc/<pid>/environ`.
+    /// Parses `/proc/<pid>/environ`.
     #[must_use]
     pub fn parse(bytes: &[u8]) -> Self {
         let mut known = BTreeMap::new();
@@ -73,20 +74,20 @@ impl Variables {
             if let Some(name) = NAMES.into_iter().find(|known| *known == name)
                 && !value.is_empty()
             {
-                // Of several the first is what getenv(3) finds.
+                // Among duplicates, getenv(3) returns the first.
                 known.entry(name).or_insert_with(|| value.to_owned());
             }
         }
         Self(known)
     }
 
-    /// One of them.
+    /// Value of a variable.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&str> {
         self.0.get(name).map(String::as_str)
     }
 
-    /// One of them, short enough to be shown.
+    /// Value of a variable, cut to the longest value shown.
     #[must_use]
     pub fn shown(&self, name: &str) -> Option<String> {
         let value = self.get(name)?;
@@ -96,16 +97,17 @@ impl Variables {
         })
     }
 
-    /// ROS was set up here.
+    /// Returns whether a ROS environment is set up.
     #[must_use]
     pub fn is_ros(&self) -> bool {
         self.0.keys().any(|name| *name != "CYCLONEDDS_URI")
     }
 
-    /// The domain; an error where it is none.
+    /// Domain of the environment.
     ///
     /// # Errors
-    /// What stands there instead.
+    ///
+    /// Returns the value of `ROS_DOMAIN_ID` if it is not a valid domain.
     pub fn domain(&self) -> Result<u32, String> {
         let Some(text) = self.get("ROS_DOMAIN_ID") else {
             return Ok(0);
@@ -115,13 +117,13 @@ impl Variables {
         number.ok_or_else(|| self.shown("ROS_DOMAIN_ID").unwrap_or_default())
     }
 
-    /// `ROS_LOCALHOST_ONLY` as rcl reads it.
+    /// Value of `ROS_LOCALHOST_ONLY` as rcl reads it.
     #[must_use]
     pub fn is_localhost_only(&self) -> bool {
         self.get("ROS_LOCALHOST_ONLY") == Some("1")
     }
 
-    /// Whom nodes look for.
+    /// Discovery range.
     #[must_use]
     pub fn range(&self) -> Range {
         if self.is_localhost_only() {
@@ -139,7 +141,7 @@ impl Variables {
         }
     }
 
-    /// DDS security is on.
+    /// Returns whether DDS security is enabled.
     #[must_use]
     pub fn is_secured(&self) -> bool {
         self.get("ROS_SECURITY_ENABLE") == Some("true")
@@ -147,7 +149,7 @@ impl Variables {
 }
 
 impl Range {
-    /// In words.
+    /// Settings as text.
     #[must_use]
     pub fn words(&self) -> String {
         match self {

@@ -1,33 +1,33 @@
-//! What will be seen on this host and what not: as the running agent says of itself, or as a trial
-//! tells where none runs. The reasons are those of `capture`; here they get their consequences.
+//! Checks of visibility on this host: as reported by the running agent, or from a trial without
+//! one. `capture` provides the reasons; this module adds their consequences.
 
 use super::finding::{Area, Finding, Severity};
 use ros2probe_api::health::Health;
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts};
 
 const AREA: Area = Area::Sight;
-/// Where an agent says it.
+/// Source of facts about a running agent.
 pub(super) const ASKED: &str = "GET /health";
-/// Where a trial told.
+/// Source of facts from a trial.
 pub(super) const TRIED: &str = "test load of the BPF programs";
 
-/// What a source can see.
+/// Abilities of a capture source.
 #[derive(Clone, Debug, Default)]
 pub struct Visibility {
     /// `host` or `wire`.
     pub source: String,
-    /// Why it is not the one that sees more.
+    /// Reason why the source with more visibility is not used.
     pub source_reason: Option<String>,
-    /// What it can see.
+    /// Available abilities.
     pub able: Vec<Ability>,
-    /// Why not.
+    /// Unavailable abilities, each with the reason.
     pub reasons: Vec<(Ability, String)>,
-    /// Who says so.
+    /// Origin of these facts.
     pub from: &'static str,
 }
 
 impl Visibility {
-    /// As a running agent says.
+    /// Visibility that a running agent reports.
     #[must_use]
     pub fn of_agent(health: &Health) -> Self {
         let known = |label: &str| Ability::ALL.into_iter().find(|each| each.label() == label);
@@ -45,7 +45,7 @@ impl Visibility {
         }
     }
 
-    /// As a trial told.
+    /// Visibility found by a trial.
     #[must_use]
     pub fn of_trial(facts: AgentFacts) -> Self {
         Self {
@@ -58,7 +58,7 @@ impl Visibility {
     }
 }
 
-/// Why nothing is known: neither does an agent run here, nor may a trial be made.
+/// Finding for a host without an agent and without permission for a trial.
 #[must_use]
 pub fn untried(reason: &str) -> Vec<Finding> {
     let sentence = "kernel support was not tested";
@@ -70,7 +70,7 @@ pub fn untried(reason: &str) -> Vec<Finding> {
     ]
 }
 
-/// A trial that failed.
+/// Finding for a trial that failed.
 #[must_use]
 pub fn failed(error: &str) -> Vec<Finding> {
     let sentence = format!("the agent cannot observe this host: {error}");
@@ -82,7 +82,7 @@ pub fn failed(error: &str) -> Vec<Finding> {
     ]
 }
 
-/// What it sees, and each thing that it does not.
+/// One finding for the source, and one for each unavailable ability.
 #[must_use]
 pub fn check(visibility: &Visibility) -> Vec<Finding> {
     let mut findings = vec![source(visibility)];
@@ -130,7 +130,7 @@ fn source(visibility: &Visibility) -> Finding {
     finding.seen(&visibility.source, visibility.from)
 }
 
-/// What is seen.
+/// Text for an available ability.
 const fn words(ability: Ability) -> &'static str {
     match ability {
         Ability::Subscribers => "what each subscriber received",
@@ -145,7 +145,7 @@ const fn words(ability: Ability) -> &'static str {
     }
 }
 
-/// What is not seen, unless the source's own line says it.
+/// Finding for an unavailable ability. `None` if the source's own line covers it.
 fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
     let reason = visibility
         .reasons
@@ -157,7 +157,7 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
         Ability::Subscribers if is_host => {
             (Severity::Warning, format!("not {}", words(ability)), None)
         }
-        // The wire has none of these, which the source's line says.
+        // The wire source has none of these; the source's line covers them.
         Ability::Subscribers
         | Ability::SocketLosses
         | Ability::ReassemblyLosses
@@ -236,14 +236,14 @@ mod tests {
         let mut able = Ability::ALL.to_vec();
         able.retain(|each| *each != Ability::ReassemblyLosses);
         let mut visibility = host(&able);
-        let reason = "the kernel does not tell".to_owned();
+        let reason = "the kernel has no tracepoint".to_owned();
         visibility.reasons = vec![(Ability::ReassemblyLosses, reason)];
         let findings = check(&visibility);
         let found = find(&findings, "reassembly_losses").unwrap();
         assert_eq!(found.severity, Severity::Warning);
         assert_eq!(
             found.sentence,
-            "not messages lost in IP reassembly: the kernel does not tell"
+            "not messages lost in IP reassembly: the kernel has no tracepoint"
         );
     }
 

@@ -1,5 +1,5 @@
-//! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. An action is what has a
-//! topic of feedback, as the original sees it.
+//! `ros2 action`: `list` and `info`; `type` and `find` are those of topics. As in the original, an
+//! action exists if its feedback topic exists.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -9,24 +9,24 @@ use ros2probe_api::names::TopicName;
 use ros2probe_api::nodes::Named;
 use ros2probe_api::topics::Topic;
 
-/// What an action's name is followed by.
+/// Suffix of the feedback topic's name.
 const FEEDBACK: &str = "/_action/feedback";
-/// What its type is followed by.
+/// Suffix of the feedback topic's type.
 const MESSAGE: &str = "_FeedbackMessage";
 
-/// The topic by which an action is known.
+/// Name of an action's feedback topic.
 #[must_use]
 pub fn feedback_of(name: &str) -> String {
     format!("{name}{FEEDBACK}")
 }
 
-/// Actions among topics, hidden ones included.
+/// Actions among topics, including hidden ones.
 pub fn of_topics(topics: &[TopicName<'_>]) -> impl Iterator<Item = Named<'static>> {
     let actions = topics.iter();
     actions.filter_map(|topic| of_name(&topic.name, &topic.types))
 }
 
-/// Actions by the topics of feedback that a node has.
+/// Actions whose feedback topics are among a node's topics.
 pub(super) fn of_feedback(topics: &[Named<'_>]) -> Vec<Named<'static>> {
     let actions = topics.iter();
     actions
@@ -41,7 +41,7 @@ fn of_name(name: &str, types: &[Cow<'_, str>]) -> Option<Named<'static>> {
     (!types.is_empty()).then_some(Named { name, types })
 }
 
-/// `action list`.
+/// Text of `action list`.
 #[must_use]
 pub fn list<'a>(actions: impl Iterator<Item = Named<'a>>, show_types: bool, count: bool) -> String {
     if count {
@@ -58,7 +58,7 @@ pub fn list<'a>(actions: impl Iterator<Item = Named<'a>>, show_types: bool, coun
     text
 }
 
-/// `action info`, by the action's topic of feedback where there is one.
+/// Text of `action info`, from the feedback topic if it exists.
 #[must_use]
 pub fn info(name: &str, feedback: Option<&Topic<'_>>, show_types: bool, count: bool) -> String {
     let mut text = format!("Action: {name}\n");
@@ -86,7 +86,8 @@ pub fn info(name: &str, feedback: Option<&Topic<'_>>, show_types: bool, count: b
     text
 }
 
-/// Each node once with its types, in the order of GIDs. Who has no node is none for the original.
+/// Each node once with its types, in the order of GIDs. As in the original, endpoints without a
+/// node are left out.
 fn nodes<'a>(endpoints: &'a [Endpoint<'_>]) -> Vec<(&'a str, Vec<&'a str>)> {
     let mut endpoints: Vec<_> = endpoints.iter().collect();
     endpoints.sort_unstable_by_key(|endpoint| &endpoint.guid);

@@ -1,4 +1,4 @@
-//! `ros2 bag info`, by dialect: a bag's facts in, text out.
+//! Text of `ros2 bag info`, by dialect.
 
 use std::fmt::Write as _;
 
@@ -9,7 +9,7 @@ use ros2probe_bag::info::{Bag, Details, SERVICE_EVENT};
 use ros2probe_bag::metadata::Topic;
 use ros2probe_daemon::escape::visible;
 
-/// The order of topics.
+/// Sort order of topics.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default, clap::ValueEnum)]
 pub enum Sort {
     /// By name.
@@ -21,7 +21,7 @@ pub enum Sort {
     Count,
 }
 
-/// `ros2 bag info`: everything, in the time zone of this host; with details as `-v` prints it.
+/// Text of `ros2 bag info` in the time zone of this host. With `details`, as `-v` prints it.
 #[must_use]
 pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) -> String {
     let zone = &TimeZone::system();
@@ -75,7 +75,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
         parts.write_services(&mut text, details);
     }
     if dialect > Dialect::Jazzy {
-        // Lines of services end, and `-v` adds one.
+        // The list of services ends with a line break; `-v` adds another.
         if parts.services.is_empty() || details.is_some() {
             text.push('\n');
         }
@@ -87,7 +87,7 @@ pub fn info(bag: &Bag, dialect: Dialect, sort: Sort, details: Option<&Details>) 
     text
 }
 
-/// `ros2 bag info -t`: names alone, without those of services and actions.
+/// Text of `ros2 bag info -t`: topic names without those of services and actions.
 #[must_use]
 pub fn names(bag: &Bag, dialect: Dialect, sort: Sort) -> String {
     let parts = Parts::of(&bag.metadata.topics, dialect, sort);
@@ -98,9 +98,9 @@ pub fn names(bag: &Bag, dialect: Dialect, sort: Sort) -> String {
         .collect()
 }
 
-/// Where values begin.
+/// Column at which values begin.
 const LABEL: usize = 19;
-/// The topics of an action, and how the type of each is made of the action's.
+/// Topics of an action, and the suffix that each adds to the action's type.
 const ACTION: [(&str, &str); 5] = [
     ("/_action/feedback", "_FeedbackMessage"),
     ("/_action/status", ""),
@@ -109,12 +109,12 @@ const ACTION: [(&str, &str); 5] = [
     ("/_action/get_result/_service_event", "_GetResult_Event"),
 ];
 
-/// Topics, services and actions apart, each sorted.
+/// Topics, services and actions, each sorted.
 struct Parts<'a> {
     topics: Vec<&'a Topic>,
     services: Vec<&'a Topic>,
     actions: Vec<Action<'a>>,
-    /// Messages that are not of topics.
+    /// Messages of services and actions.
     apart: u64,
 }
 
@@ -122,7 +122,7 @@ struct Action<'a> {
     name: &'a str,
     type_name: String,
     format: &'a str,
-    /// By the order of [`ACTION`].
+    /// Message counts in the order of [`ACTION`].
     counts: [u64; ACTION.len()],
 }
 
@@ -285,12 +285,12 @@ fn topic_line(topic: &Topic, details: Option<&Details>) -> String {
     )
 }
 
-/// One below the other, where values begin.
+/// Lines one below the other, indented to the column of values.
 fn lines_of(lines: &[String]) -> String {
     lines.join(&format!("\n{:LABEL$}", ""))
 }
 
-/// Bytes in the unit that makes the number less than 1024.
+/// Size in the largest unit that keeps the number below 1024.
 #[expect(clippy::cast_precision_loss, reason = "one decimal is printed")]
 fn size(bytes: u64) -> String {
     if bytes < 1024 {

@@ -1,10 +1,10 @@
-//! The distribution whose command line is printed, as an option of ours names it.
+//! Distribution whose output is printed, as the value of `--distro`.
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use super::Dialect;
 
-/// Reads the value of `--distro`.
+/// Parser of `--distro`.
 #[must_use]
 pub fn parser() -> impl TypedValueParser<Value = Dialect> {
     let values = [

@@ -1,7 +1,6 @@
-//! What `ros2 topic echo` prints of messages, `ros2 service echo` of service events and
-//! `ros2 action echo` of what an action's parts say.
+//! Text of `ros2 topic echo`, `ros2 service echo` and `ros2 action echo`.
 //!
-//! A payload and its type go in, text comes out; nothing is asked for, and no clock is read.
+//! The input is a payload and its type; this module sends no request and reads no clock.
 
 mod field;
 mod lost;
@@ -19,9 +18,9 @@ use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
 use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
 
-/// Writers whose unreadable messages are counted apart.
+/// Most writers whose unreadable messages are counted separately.
 const MAX_WRITERS: usize = 256;
-/// `service_msgs/msg/ServiceEventInfo`, in the order of its constants.
+/// Event types of `service_msgs/msg/ServiceEventInfo`, in the order of its constants.
 const EVENTS: [&str; 4] = [
     "REQUEST_SENT",
     "REQUEST_RECEIVED",
@@ -29,24 +28,24 @@ const EVENTS: [&str; 4] = [
     "RESPONSE_RECEIVED",
 ];
 
-/// How messages are printed.
+/// Options for printing messages.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Whose output.
+    /// Dialect of the output.
     pub dialect: Dialect,
-    /// A line of values each instead of YAML.
+    /// Print values in one line instead of YAML.
     pub csv: bool,
-    /// YAML in one line.
+    /// Style of YAML.
     pub style: Style,
-    /// What of arrays and strings.
+    /// Truncation of arrays and strings.
     pub shown: Truncation,
-    /// The payload's bytes instead of the message.
+    /// Print the payload's bytes instead of the message.
     pub raw: bool,
-    /// Parts instead of the whole.
+    /// Print these fields instead of the whole message.
     pub fields: Vec<FieldPath>,
-    /// Which messages.
+    /// Print only messages that match.
     pub filter: Option<Filter>,
-    /// Times and numbers before each message.
+    /// Print times and sequence numbers before each message.
     pub include_info: bool,
 }
 
@@ -68,24 +67,24 @@ impl Default for Options {
     }
 }
 
-/// Prints messages, and remembers whose it could not read.
+/// Prints messages, and counts unreadable ones.
 #[derive(Debug)]
 pub struct Echo {
     options: Options,
     unreadable: HashMap<String, u64>,
 }
 
-/// The text for one message.
+/// Text for one message.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct MessageText {
-    /// For stdout; `None` where the message did not pass the filter or cannot be read.
+    /// For stdout. `None` if the message did not pass the filter or cannot be read.
     pub out: Option<String>,
     /// For stderr, whole lines.
     pub err: String,
 }
 
 impl Echo {
-    /// Prints this way.
+    /// Creates a printer with these options.
     #[must_use]
     pub fn new(options: Options) -> Self {
         Self {
@@ -94,10 +93,11 @@ impl Echo {
         }
     }
 
-    /// A message as `topic echo` prints it. With `raw` no type is needed.
+    /// Text of a message as `topic echo` prints it. With `raw` no type is needed.
     ///
     /// # Errors
-    /// A field that is not there, or a filter without a value.
+    ///
+    /// A selected field does not exist, or the filter has no value.
     pub fn message(
         &mut self,
         sample: &Sample,
@@ -127,8 +127,8 @@ impl Echo {
         Ok(MessageText { out, err })
     }
 
-    /// An event of a service as `service echo` prints it; `interface` is the part of an action that
-    /// `action echo` names above it.
+    /// Text of a service event as `service echo` prints it. `interface` is the part of an action
+    /// that `action echo` prints above it.
     #[must_use]
     pub fn event(
         &mut self,
@@ -156,7 +156,7 @@ impl Echo {
         }
     }
 
-    /// How many messages could not be read, if any.
+    /// Number of messages that could not be read.
     #[must_use]
     pub fn unreadable(&self) -> u64 {
         self.unreadable.values().sum()
@@ -231,7 +231,7 @@ impl Echo {
         for field in &self.options.fields {
             parts.push(field.select(message)?);
         }
-        // With one field that is `m`, as in the original.
+        // With one field, `m` is that field, as in the original.
         let subject = match parts.as_slice() {
             [one] => one.subject(),
             _ => Subject::Message(message),
@@ -291,7 +291,7 @@ impl Echo {
     }
 }
 
-/// What the original says on stdout where publishers differ in what they offer.
+/// The original's warning on stdout about publishers with different QoS.
 #[must_use]
 pub fn mixed_offers(publishers: &[Endpoint<'_>]) -> String {
     let some = |offers: &dyn Fn(&Endpoint<'_>) -> bool| {
@@ -322,7 +322,8 @@ pub fn mixed_offers(publishers: &[Endpoint<'_>]) -> String {
     text
 }
 
-/// Neither middleware numbers what it receives: the original prints `null`.
+/// Times and sequence numbers. The middleware provides no reception number; the original prints
+/// `null`.
 fn info_document(sample: &Sample) -> String {
     let Sample {
         sequence_number,
@@ -357,7 +358,7 @@ fn info_around(sample: &Sample) -> String {
     )
 }
 
-/// The first number of an event is its kind, which is printed as its name.
+/// Replaces the first number of an event, its type, by the type's name.
 fn with_name_of_event(document: String) -> String {
     for (number, name) in EVENTS.iter().enumerate() {
         let start = format!("info:\n  event_type: {number}\n");

@@ -1,4 +1,4 @@
-//! One writer or reader in `topic info -v`.
+//! Block of one writer or reader in `topic info -v`.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -7,14 +7,14 @@ use ros2probe_api::endpoints::{Endpoint, Qos};
 
 use super::Dialect;
 
-/// What the original calls the node of an endpoint that its participant has not told of yet.
+/// The original's node name for an endpoint whose participant has not announced its nodes yet.
 const UNKNOWN: [&str; 2] = ["_NODE_NAME_UNKNOWN_", "_NODE_NAMESPACE_UNKNOWN_"];
-/// Likewise of a participant that is no ROS one.
+/// The original's node name for an endpoint of a participant without ROS.
 const BARE: [&str; 2] = ["_CREATED_BY_BARE_DDS_APP_"; 2];
-/// A GID of Humble has room for more than a GUID.
+/// Trailing zero bytes of a GID in Humble, which is longer than a GUID.
 const PADDING: usize = 8;
 
-/// The block, without the empty line behind it.
+/// The block without the empty line behind it.
 #[must_use]
 pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     let mut text = String::new();
@@ -33,7 +33,7 @@ pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
     text
 }
 
-/// Name and namespace of its node.
+/// Name and namespace of the endpoint's node.
 fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
     match (&endpoint.node, &endpoint.enclave) {
         (Some(node), _) => match node.rsplit_once('/') {
@@ -46,7 +46,7 @@ fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
     }
 }
 
-/// Bytes with points between.
+/// Bytes of a GID with points between.
 fn gid(guid: &str, dialect: Dialect) -> String {
     let digits: Vec<char> = guid.chars().filter(|digit| *digit != '.').collect();
     let mut bytes: Vec<String> = digits.chunks(2).map(|byte| byte.iter().collect()).collect();

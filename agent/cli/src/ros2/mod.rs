@@ -1,7 +1,7 @@
-//! What `rp topic`, `rp node`, `rp service`, `rp action` and `rp bag info` print: the text of the `ros2` command
-//! line in the dialect of a distribution.
+//! Text of `rp topic`, `rp node`, `rp service`, `rp action` and `rp bag info`: the format of the
+//! `ros2` command line in the dialect of a distribution.
 //!
-//! Pure: facts in, text out. Nothing here asks an agent, reads a clock or prints.
+//! Pure functions: no requests, no clock, no output.
 
 pub mod action;
 pub mod bag;

@@ -1,12 +1,12 @@
-//! Names of topics as they are typed.
+//! Topic names on the command line.
 
 use super::Refused;
 
-/// The full name of a topic; a relative one is in the root namespace, as the original's own node
-/// is.
+/// Full name of a topic. A relative name is in the root namespace, like the original's own node.
 ///
 /// # Errors
-/// No topic can have this name; the text points at what is wrong, as the original's does.
+///
+/// The name is invalid. The text marks the invalid character, as the original's does.
 pub fn full_name(typed: &str) -> Result<String, Refused> {
     let name = if typed.is_empty() || typed.starts_with('/') {
         typed.to_owned()
@@ -22,13 +22,14 @@ pub fn full_name(typed: &str) -> Result<String, Refused> {
     }
 }
 
-/// Any token begins with an underscore: shown only when asked for.
+/// Returns whether a part of the name begins with an underscore. Such names are shown only with an
+/// option.
 #[must_use]
 pub fn is_hidden(name: &str) -> bool {
     name.split('/').any(|token| token.starts_with('_'))
 }
 
-/// A node is hidden by its own name, whatever its namespace is called.
+/// Returns whether the node's own name begins with an underscore; its namespace does not matter.
 #[must_use]
 pub fn is_hidden_node(name: &str) -> bool {
     name.rsplit('/')
@@ -36,7 +37,7 @@ pub fn is_hidden_node(name: &str) -> bool {
         .is_some_and(|name| name.starts_with('_'))
 }
 
-/// What is wrong, and the character where.
+/// The first mistake of a name, with the index of its character.
 fn mistake(name: &str) -> Option<(&'static str, usize)> {
     if name.is_empty() {
         return Some(("topic name must not be empty", 0));

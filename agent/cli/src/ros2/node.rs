@@ -8,16 +8,16 @@ use super::name::{is_hidden, is_hidden_node};
 use ros2probe_api::names::NodeName;
 use ros2probe_api::nodes::{Named, Node};
 
-/// What goes to stdout, and a warning for stderr.
+/// Output of a verb on nodes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NodeText {
     /// For stdout.
     pub text: String,
-    /// For stderr, where there is reason.
+    /// Warning for stderr.
     pub warning: Option<String>,
 }
 
-/// `node list`.
+/// Text of `node list`.
 #[must_use]
 pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
     let shown = || {
@@ -45,10 +45,11 @@ pub fn list(nodes: &[NodeName<'_>], all: bool, count: bool) -> NodeText {
     NodeText { text, warning }
 }
 
-/// `node info`; `None` where there is no such node.
+/// Text of `node info`. Pass `None` as `node` if it does not exist.
 ///
 /// # Errors
-/// There is none, or it is hidden and hidden ones are not wanted.
+///
+/// The node does not exist, or it is hidden and `hidden` is `false`.
 pub fn info(name: &str, node: Option<&Node<'_>>, hidden: bool) -> Result<NodeText, Refused> {
     let node = node.filter(|node| node.name == name && (hidden || !is_hidden_node(name)));
     let node = node.ok_or_else(|| Refused(format!("Unable to find node '{name}'")))?;

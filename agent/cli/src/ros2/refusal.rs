@@ -1,6 +1,6 @@
-//! What the original answers on stderr instead of on stdout.
+//! Errors that the original prints on stderr.
 
-/// A line for stderr as it is; the exit code is 1.
+/// Text printed on stderr without a prefix; the exit code is 1.
 #[derive(Clone, Debug, thiserror::Error, PartialEq, Eq)]
 #[error("{0}")]
 pub struct Refused(pub String);

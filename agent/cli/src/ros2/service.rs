@@ -9,13 +9,13 @@ use super::{Dialect, Refused};
 /// Options of `service list`.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct List {
-    /// With types.
+    /// Print types.
     pub show_types: bool,
-    /// Only how many.
+    /// Print only the number of services.
     pub count: bool,
 }
 
-/// `service list`, of those services that are to be shown.
+/// Text of `service list` for these services.
 #[must_use]
 pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName<'a>>, options: List) -> String {
     if options.count {
@@ -32,11 +32,12 @@ pub fn list<'a>(services: impl Iterator<Item = &'a ServiceName<'a>>, options: Li
     text
 }
 
-/// `service info`. What counts as a server differs: its writer of replies, later its reader of
-/// requests.
+/// Text of `service info`. A server is counted by its reply writer, in later distributions by its
+/// request reader.
 ///
 /// # Errors
-/// There is no such service.
+///
+/// The service does not exist.
 pub fn info<'a>(
     name: &str,
     mut services: impl Iterator<Item = &'a ServiceName<'a>>,

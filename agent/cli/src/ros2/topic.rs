@@ -11,15 +11,15 @@ use super::{Dialect, Refused, endpoint};
 /// Options of `topic list`.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct List {
-    /// With types.
+    /// Print types.
     pub show_types: bool,
-    /// Only how many.
+    /// Print only the number of topics.
     pub count: bool,
-    /// By publishers and subscribers.
+    /// Group by publishers and subscribers.
     pub verbose: bool,
 }
 
-/// `topic list`, of those topics that are to be shown.
+/// Text of `topic list` for these topics.
 #[must_use]
 pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName<'a>>, options: List) -> String {
     let mut text = String::new();
@@ -45,10 +45,11 @@ pub fn list<'a>(topics: impl Iterator<Item = &'a TopicName<'a>>, options: List) 
     text
 }
 
-/// `topic info`; `None` where there is no such topic.
+/// Text of `topic info`. Pass `None` as `topic` if it does not exist.
 ///
 /// # Errors
-/// There is none.
+///
+/// The topic does not exist.
 pub fn info(
     name: &str,
     topic: Option<&Topic<'_>>,
@@ -86,8 +87,8 @@ fn types(types: &[Cow<'_, str>]) -> String {
     }
 }
 
-/// `topic type` and `service type` and `action type`: one to a line; `None` where there is none,
-/// which the exit code alone reports.
+/// Text of `topic type`, `service type` and `action type`, one type a line. `None` if the name is
+/// unknown, which only the exit code reports.
 #[must_use]
 pub fn type_of<'a>(
     name: &str,
@@ -97,7 +98,7 @@ pub fn type_of<'a>(
     Some(types.iter().map(|each| format!("{each}\n")).collect())
 }
 
-/// `topic find` and `service find` and `action find`: names one to a line, or how many.
+/// Text of `topic find`, `service find` and `action find`: names one a line, or their number.
 #[must_use]
 pub fn find<'a>(
     wanted: &str,

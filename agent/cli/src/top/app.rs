@@ -1,4 +1,4 @@
-//! What `rp top` shows and how keys change it: keys and facts come in, the model and a few wishes
+//! State of `rp top`, and its changes by keys and facts. Keys and facts come in; state and commands
 //! go out. It draws nothing, sends no request and reads no clock.
 
 use std::collections::{BTreeMap, HashMap};
@@ -14,81 +14,81 @@ use ros2probe_api::events::{Event, Lagged};
 use ros2probe_api::health::Health;
 use ros2probe_api::topics::{TopicDetails, TopicList};
 
-/// What is dropped is called recent for this long.
+/// Time for which a drop counts as recent.
 const RECENT: Duration = Duration::from_secs(30);
-/// How long an answer to a key stays on the screen.
+/// Time for which the answer to a key stays on the screen.
 const SAID: Duration = Duration::from_secs(8);
 
-/// What comes from the agent.
+/// Facts received from the agent.
 #[derive(Debug)]
 pub enum Fact {
     /// All topics.
     Topics(Box<TopicList<'static>>),
-    /// How the agent is.
+    /// State of the agent.
     Health(Box<Health>),
-    /// The selected topic with every detail; `None` when there is no such topic any more.
+    /// The selected topic with all details. `None` if it no longer exists.
     Details(Key, Option<Box<TopicDetails<'static>>>),
-    /// Something happened.
+    /// An event.
     Event(Box<Event<'static>>),
-    /// Events are missing.
+    /// A gap in the events.
     Lagged(Lagged),
-    /// The agent does not answer, and why.
+    /// The agent does not answer, for this reason.
     Gone(String),
-    /// What became of a wish.
+    /// Result of a command.
     Status(String),
-    /// Topics that are measured because this program asks for it.
+    /// Topics that are measured on behalf of this program.
     Measured(BTreeMap<Key, MeasuredBy>),
 }
 
-/// What keeps a topic measured for this program.
+/// Means by which a topic is measured on behalf of this program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MeasuredBy {
-    /// Until it ends.
+    /// A stream, until the program ends.
     Session,
-    /// Also after that.
+    /// A watch, which outlives the program.
     Watch,
 }
 
-/// A command for the program.
+/// Command for the program.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// End.
+    /// End the program.
     Quit,
-    /// Details of this topic from now on.
+    /// Request details of this topic, or of none.
     Select(Option<Key>),
-    /// Also hidden topics.
+    /// Whether to request hidden topics.
     Hidden(bool),
-    /// Have it measured, or no longer.
+    /// Start or stop measuring a topic.
     Toggle(Key, String),
-    /// Have it measured also after the end.
+    /// Measure a topic permanently.
     Keep(Key, String),
 }
 
-/// A part of the screen.
+/// Part of the screen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pane {
-    /// The table.
+    /// Table of topics.
     #[default]
     Topics,
-    /// The selected topic.
+    /// Details of the selected topic.
     Details,
-    /// What happens.
+    /// Latest events.
     Events,
 }
 
-/// Which topics are shown.
+/// Filter of the table.
 #[derive(Clone, Debug, Default)]
 pub struct Filter {
-    /// Part of the name, the type or the state.
+    /// Text in the name, type or state.
     pub text: String,
-    /// Only those with problems.
+    /// Only topics with problems.
     pub problems: bool,
-    /// Only those that are measured.
+    /// Only measured topics.
     pub measured: bool,
 }
 
 impl Filter {
-    /// Whether it leaves anything out.
+    /// Returns whether any condition is set.
     #[must_use]
     pub fn is_set(&self) -> bool {
         !self.text.is_empty() || self.problems || self.measured
@@ -103,61 +103,61 @@ impl Filter {
     }
 }
 
-/// All that is shown.
+/// State of the screen.
 #[derive(Debug, Default)]
 pub struct App {
-    /// Only this domain is asked for.
+    /// Domain to request; `None` for all.
     pub domain_id: Option<u32>,
-    /// Where the agent is, where it does not say its host.
+    /// Address of the agent, shown if the agent does not report its host.
     pub place: String,
-    /// By what the table is sorted.
+    /// Column by which the table is sorted.
     pub sort: Column,
-    /// The other way round.
+    /// Whether the order is reversed.
     pub reverse: bool,
-    /// Which topics are shown.
+    /// Filter of the table.
     pub filter: Filter,
-    /// The filter's text as it was before it is edited; `None` while it is not.
+    /// Text of the filter before the edit in progress. `None` outside of an edit.
     pub editing: Option<String>,
-    /// Which pane the arrows move.
+    /// Pane that the arrow keys move.
     pub focus: Pane,
-    /// The details are open.
+    /// Whether the details are open.
     pub details_open: bool,
-    /// The events are open.
+    /// Whether the events are open.
     pub events_open: bool,
-    /// The pane in focus has the whole screen.
+    /// Whether the focused pane fills the screen.
     pub zoomed: bool,
-    /// The keys are explained.
+    /// Whether the help is open.
     pub help: bool,
-    /// Hidden topics are asked for.
+    /// Whether hidden topics are requested.
     pub hidden: bool,
-    /// Every topic, sorted.
+    /// All topics, sorted.
     rows: Vec<Row>,
-    /// Places in `rows` of those that are shown.
+    /// Indices into `rows` of the topics that pass the filter.
     shown: Vec<usize>,
-    /// Facts of the selected topic.
+    /// Details of the selected topic.
     pub details: Option<Box<TopicDetails<'static>>>,
-    /// The topic that is selected.
+    /// The selected topic.
     pub selected: Option<Key>,
     /// The latest events.
     pub news: EventPane,
-    /// First line of the details that is shown.
+    /// First visible line of the details.
     pub details_scroll: usize,
-    /// How many of the latest events are below the pane.
+    /// Number of newer events below the visible ones.
     pub events_back: usize,
-    /// First topic that is shown.
+    /// First visible topic.
     pub offset: usize,
-    /// How many lines each pane has, as it was drawn last.
+    /// Lines of each pane when last drawn.
     pub heights: Heights,
-    /// How the agent is, and when it said so.
+    /// State of the agent, and the time of its receipt.
     pub health: Option<(Health, Instant)>,
-    /// When it does not answer: since when, and why.
+    /// Start and reason of the agent's silence, while it does not answer.
     pub gone: Option<(Instant, String)>,
-    /// When topics were told last.
+    /// Time of the last topic list.
     pub updated: Option<Instant>,
-    /// When more was dropped than before.
+    /// Time of the last increase of a drop counter.
     dropped_at: Option<Instant>,
     past: HashMap<Key, Past>,
-    /// Topics that are measured for this program.
+    /// Topics that are measured on behalf of this program.
     pub holds: BTreeMap<Key, MeasuredBy>,
     status: Option<(Instant, String)>,
 }
@@ -165,18 +165,18 @@ pub struct App {
 /// Lines of each pane.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Heights {
-    /// Of the table, without its heading.
+    /// Lines of the table without its heading.
     pub topics: usize,
-    /// Of the details.
+    /// Visible lines of the details.
     pub details: usize,
-    /// How many the details would need.
+    /// Total lines of the details.
     pub details_needed: usize,
-    /// Of the events.
+    /// Visible lines of the events.
     pub events: usize,
 }
 
 impl App {
-    /// Nothing is known yet of the agent at `place`.
+    /// Initial state for the agent at `place`.
     #[must_use]
     pub fn new(options: &Options, place: String) -> Self {
         Self {
@@ -194,21 +194,21 @@ impl App {
         }
     }
 
-    /// Topics in the table, in their order.
+    /// Topics that pass the filter, in order.
     pub fn shown(&self) -> impl ExactSizeIterator<Item = &Row> {
-        // Places are made with the rows.
+        // Indices are computed with the rows.
         let rows = |at: &usize| self.rows.get(*at);
         let shown: Vec<_> = self.shown.iter().filter_map(rows).collect();
         shown.into_iter()
     }
 
-    /// Every topic that is known.
+    /// All known topics.
     #[must_use]
     pub fn rows(&self) -> &[Row] {
         &self.rows
     }
 
-    /// The place of the selected topic in the table.
+    /// Index of the selected topic in the table.
     #[must_use]
     pub fn place_of_selected(&self) -> Option<usize> {
         let selected = self.selected.as_ref()?;
@@ -216,21 +216,21 @@ impl App {
         rows.position(|row| row.key == *selected)
     }
 
-    /// The answer to the last key, while it is news.
+    /// The answer to the last key, while it is recent.
     #[must_use]
     pub fn status(&self, now: Instant) -> Option<&str> {
         let (at, text) = self.status.as_ref()?;
         (now.saturating_duration_since(*at) < SAID).then_some(text.as_str())
     }
 
-    /// Whether anything was dropped lately.
+    /// Returns whether the agent dropped data recently.
     #[must_use]
     pub fn is_dropping(&self, now: Instant) -> bool {
         let dropped_at = self.dropped_at;
         dropped_at.is_some_and(|at| now.saturating_duration_since(at) < RECENT)
     }
 
-    /// Age of what is shown; `None` while nothing is.
+    /// Age of the topic list. `None` before the first.
     #[must_use]
     pub fn age(&self, now: Instant) -> Option<Duration> {
         let told = now.saturating_duration_since(self.updated?);
@@ -240,7 +240,7 @@ impl App {
         Some(told + Duration::from_secs_f64(before.unwrap_or_default()))
     }
 
-    /// Takes in what the agent says.
+    /// Processes a fact from the agent.
     pub fn take(&mut self, fact: Fact, now: Instant) -> Vec<Command> {
         match fact {
             Fact::Topics(topics) => {
@@ -278,7 +278,7 @@ impl App {
         Vec::new()
     }
 
-    /// Who scrolled back keeps what is on the screen.
+    /// Keeps the visible lines in place after the user has scrolled back.
     fn stay(&mut self, before: usize) {
         if self.events_back > 0 {
             let more = self.news.shown().count().saturating_sub(before);
@@ -302,7 +302,8 @@ impl App {
         self.arrange()
     }
 
-    /// Sorts and filters; the selected topic stays selected, else the one in its place is.
+    /// Sorts and filters. The selected topic stays selected; if it has gone, the topic in its place
+    /// is selected.
     pub fn arrange(&mut self) -> Vec<Command> {
         let place = self.place_of_selected().unwrap_or(0);
         let (sort, reverse) = (self.sort, self.reverse);
@@ -333,7 +334,7 @@ impl App {
         vec![Command::Select(key)]
     }
 
-    /// Keeps the selected topic on the screen, which has had [`Heights`] at last.
+    /// Scrolls so that the selected topic is visible, given the current [`Heights`].
     pub fn scroll(&mut self) {
         let height = self.heights.topics.max(1);
         let place = self.place_of_selected().unwrap_or(0);
@@ -348,7 +349,7 @@ impl App {
         self.events_back = self.events_back.min(last);
     }
 
-    /// What a key does.
+    /// Processes a key.
     pub fn key(&mut self, key: KeyEvent) -> Vec<Command> {
         if key.kind == KeyEventKind::Release {
             return Vec::new();
@@ -389,7 +390,7 @@ impl App {
         }
     }
 
-    /// Keys that change what is shown.
+    /// Processes keys that change the view.
     fn switch(&mut self, code: KeyCode) -> Vec<Command> {
         match code {
             KeyCode::Enter | KeyCode::Char('d') => {
@@ -468,7 +469,7 @@ impl App {
         self.reverse = false;
     }
 
-    /// A pane that opens is in focus, one that closes is not.
+    /// Focuses a pane that opens, and unfocuses one that closes.
     fn settle(&mut self, pane: Pane, is_open: bool) {
         match is_open {
             true if self.zoomed => self.focus = pane,
@@ -490,7 +491,7 @@ impl App {
         self.focus = open.get(next).copied().unwrap_or_default();
     }
 
-    /// One step out: of the zoom, the focus, the details, the filter.
+    /// Leaves the zoom, the focus, the details or the filter, whichever is innermost.
     fn back(&mut self) {
         if self.zoomed {
             self.zoomed = false;
@@ -530,7 +531,7 @@ impl App {
         Vec::new()
     }
 
-    /// What the details are headed by.
+    /// Heading of the details.
     #[must_use]
     pub fn selected_name(&self) -> Option<String> {
         let details = self

@@ -1,5 +1,5 @@
-//! The details of one topic as lines: what is expected, what is wrong and why, how its messages come,
-//! and what each writer and each subscriber has to do with it.
+//! Details of one topic as lines: expectations, problems with their causes, delivery, and each
+//! writer and subscriber.
 
 use std::collections::BTreeMap;
 
@@ -14,15 +14,15 @@ use super::row::{is_measured, shown_name};
 use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
 use super::theme::{Kind, Theme};
 
-/// Receivers and destinations that no reader is known for.
+/// Most receivers and destinations without a known reader.
 const MAX_OTHERS: usize = 16;
 /// Columns of a node's name.
 const NODE: usize = 24;
 
-/// A line and what it is.
+/// A line and its style.
 pub type Styled = (String, Kind);
 
-/// All lines; longer ones are cut where they are drawn.
+/// All lines. Drawing cuts longer ones.
 #[must_use]
 pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styled> {
     let topic = &details.topic;
@@ -202,7 +202,7 @@ fn delivered(it: &Delivered) -> String {
     }
 }
 
-/// Where messages were lost.
+/// Causes of lost messages, as text.
 fn causes(it: &Delivered) -> String {
     let causes = [
         ("before this host", it.lost_before_host_messages),
@@ -256,7 +256,7 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
             let reason = safe(unmatched(reason));
             format!("{} has no matching publisher ({reason})", name(reader))
         }
-        // Of nodes, not of a topic.
+        // Findings about nodes, not topics.
         Open::Known(Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. }) => {
             finding.kind().to_owned()
         }
@@ -268,7 +268,7 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
     }
 }
 
-/// The reason of `unheard_publisher` and `unfed_subscriber`, in words.
+/// Text for the reason of `unheard_publisher` and `unfed_subscriber`.
 fn unmatched(reason: &str) -> &str {
     match reason {
         "qos" => "incompatible QoS",
@@ -332,7 +332,7 @@ fn histograms(details: &TopicDetails<'_>, width: usize, theme: Theme, lines: &mu
     }
 }
 
-/// A line for each bucket, from the first to the last that is not empty.
+/// One line for each bucket, from the first to the last that is not empty.
 #[must_use]
 pub fn bars(buckets: &[Bucket], width: usize, theme: Theme) -> Vec<String> {
     let is_filled = |bucket: &Bucket| bucket.count > 0;
@@ -439,7 +439,7 @@ fn subscribers(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>
     }
 }
 
-/// Where messages arrive without a reader that is known, and where they leave to.
+/// Lines for receivers without a known reader, and for other destinations.
 fn others(details: &TopicDetails<'_>, theme: Theme, lines: &mut Vec<Styled>) {
     let mut others: BTreeMap<String, Delivered> = BTreeMap::new();
     for delivery in &details.deliveries {

@@ -1,4 +1,4 @@
-//! What happens to the robot, as lines of the events pane: bounded, oldest first, safe to show.
+//! Events as lines of the events pane: bounded, oldest first, escaped.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -7,28 +7,28 @@ use super::text::safe;
 use ros2probe_api::attributes::Value;
 use ros2probe_api::events::{Event, Lagged};
 
-/// Events that are kept to scroll through.
+/// Most events kept for scrolling.
 const KEPT: usize = 1_000;
 
-/// One event.
+/// Line of one event.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Line {
-    /// Worth attention.
+    /// Whether the severity is a warning or worse.
     pub is_warning: bool,
     /// `14:02:11 WARN message.lost /points count=3`.
     pub text: String,
 }
 
-/// The latest events.
+/// Latest events.
 #[derive(Clone, Debug, Default)]
 pub struct EventPane {
     lines: VecDeque<Line>,
-    /// Only warnings are shown.
+    /// Whether only warnings are shown.
     pub only_warnings: bool,
 }
 
 impl EventPane {
-    /// Takes in one event, unless it is of another domain than this.
+    /// Adds an event, unless it belongs to another domain than `domain_id`.
     pub fn add(&mut self, event: &Event<'_>, domain_id: Option<u32>) {
         let own = event.attributes.get("domain_id");
         if let (Some(Value::Number(own)), Some(wanted)) = (own, domain_id)
@@ -54,7 +54,7 @@ impl EventPane {
                 text.push_str(&shown(value));
             }
         }
-        // Identities are long and say least.
+        // Identities are long and of least interest.
         let mut attributes: Vec<_> = event.attributes.0.iter().collect();
         attributes.sort_unstable_by_key(|(key, _)| key);
         for is_identity in [false, true] {
@@ -74,11 +74,11 @@ impl EventPane {
         });
     }
 
-    /// Says that events are missing here.
+    /// Adds a line about missing events.
     pub fn lag(&mut self, lagged: &Lagged) {
         let text = match lagged.missed {
             Some(missed) => format!("-------- {missed} events are missing here"),
-            None => "-------- the agent was started again".to_owned(),
+            None => "-------- the agent has restarted".to_owned(),
         };
         self.push(Line {
             is_warning: true,
@@ -86,7 +86,7 @@ impl EventPane {
         });
     }
 
-    /// What is shown, oldest first.
+    /// Lines to show, oldest first.
     pub fn shown(&self) -> impl DoubleEndedIterator<Item = &Line> {
         let lines = self.lines.iter();
         lines.filter(|line| line.is_warning || !self.only_warnings)
@@ -100,14 +100,14 @@ impl EventPane {
     }
 }
 
-/// The time of day of `2026-11-20T14:02:11.123456789Z`.
+/// Time of day in `2026-11-20T14:02:11.123456789Z`.
 fn clock(time: &str) -> String {
     let time = safe(time);
     let (_, clock) = time.split_once('T').unwrap_or_default();
     clock.chars().take(8).collect()
 }
 
-/// A value of an event, or of what is wrong with the graph.
+/// Value of an attribute as text.
 #[must_use]
 pub fn shown(value: &Value<'_>) -> String {
     match value {
@@ -119,7 +119,7 @@ pub fn shown(value: &Value<'_>) -> String {
     }
 }
 
-/// Texts with commas between.
+/// Texts separated by commas.
 #[must_use]
 pub fn shown_list(texts: &[Cow<'_, str>]) -> String {
     let texts: Vec<_> = texts.iter().map(|text| safe(text)).collect();

@@ -1,5 +1,5 @@
-//! The lines on top: which robot, how its agent is, and above all what the agent does not see. It
-//! never looks healthy while the agent is blind.
+//! Header lines: the robot, the state of its agent, and what the agent cannot see. A blind agent
+//! must never look healthy.
 
 use ros2probe_api::health::Health;
 use std::collections::BTreeSet;
@@ -11,10 +11,10 @@ use super::row::Standing;
 use super::text::{counted, safe};
 use super::theme::{Kind, Theme};
 
-/// What is shown should not be older: the agent itself calls this stale.
+/// Age above which the table is stale, as in the agent itself.
 const FRESH: Duration = Duration::from_secs(5);
 
-/// At most `most` lines; a width of 0 is as wide as they are.
+/// At most `most` lines. With a `width` of 0, lines are as wide as their text.
 #[must_use]
 pub fn lines(app: &App, width: usize, most: usize, theme: Theme, now: Instant) -> Vec<Styled> {
     let mut lines = vec![
@@ -85,11 +85,11 @@ fn robot(app: &App, width: usize, now: Instant) -> String {
     format!("{age}  {left}")
 }
 
-/// How the agent is, and how the table is made.
+/// Line about the agent, and about the table's sorting and filter.
 fn agent(app: &App) -> String {
     let state = match (&app.health, &app.gone) {
         (_, Some(_)) => "AGENT GONE".to_owned(),
-        (None, None) => "asking the agent".to_owned(),
+        (None, None) => "waiting for the agent".to_owned(),
         (Some((health, _)), None) if !health.ready => "AGENT NOT READY".to_owned(),
         (Some((health, _)), None) => {
             let source = match health.source.as_ref() {
@@ -129,7 +129,7 @@ fn agent(app: &App) -> String {
     line
 }
 
-/// What was dropped, by kind.
+/// Dropped data by kind.
 fn dropped(health: &Health) -> String {
     let kinds = [
         (health.dropped_packets, "packets"),

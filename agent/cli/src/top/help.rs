@@ -1,4 +1,4 @@
-//! The keys, explained on one screen of 80x24.
+//! Help about keys, on one screen of 80x24.
 
 use super::details::Styled;
 use super::theme::Kind;
@@ -27,7 +27,7 @@ rp top: a robot's topics as its agent sees them     any key goes back
             gone; with !: slow fast late loss silent against what is expected,
             qos type hash: endpoints do not match; unseen: agent is blind here";
 
-/// Its lines.
+/// Lines of the help.
 #[must_use]
 pub fn lines() -> Vec<Styled> {
     let kind = |at: usize| if at == 0 { Kind::Heading } else { Kind::Plain };

@@ -1,5 +1,5 @@
-//! Topics that are measured at the press of a key: until the program ends, by a connection
-//! that goes with the process however it ends, or also after that, by a watch.
+//! Topics that are measured at the press of a key: by a connection that closes with the process, or
+//! by a watch that outlives it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,12 +16,12 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::watches::{Watch, WatchRequest};
 
-/// How often a connection looks whether it is still wanted.
+/// Interval at which a connection checks whether it is still needed.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
-/// Looks between two attempts to open it again.
+/// Checks between two attempts to reopen a connection.
 const PAUSE: u32 = 10;
 
-/// All of them.
+/// All topics measured on behalf of this program.
 #[derive(Debug)]
 pub(super) struct MeasureRequests {
     agent: Arc<Agent>,
@@ -31,7 +31,7 @@ pub(super) struct MeasureRequests {
 
 #[derive(Debug)]
 enum MeasureRequest {
-    /// By a connection, until this is set.
+    /// By a connection, until this flag is set.
     Stream(Arc<AtomicBool>),
     /// By a watch of this name.
     Watch(String),
@@ -46,7 +46,7 @@ impl MeasureRequests {
         }
     }
 
-    /// As the table marks them.
+    /// Topics and the mark of each in the table.
     pub(super) fn shown(&self) -> BTreeMap<Key, MeasuredBy> {
         let hold = |held: &MeasureRequest| match held {
             MeasureRequest::Stream(_) => MeasuredBy::Session,
@@ -56,7 +56,7 @@ impl MeasureRequests {
         all.map(|(key, held)| (key.clone(), hold(held))).collect()
     }
 
-    /// Has a topic measured while this program runs, or no longer.
+    /// Starts or stops measuring a topic while this program runs. Returns the status line.
     pub(super) fn toggle(&mut self, key: &Key, name: &str) -> String {
         match self.all.remove(key) {
             Some(MeasureRequest::Stream(stop)) => {
@@ -67,7 +67,7 @@ impl MeasureRequests {
                 Ok(()) => format!("{name}: the watch is removed"),
                 Err(error) => {
                     let status = format!("{name}: {error}");
-                    // Another client may have removed it; else it is still there.
+                    // Another client may have removed the watch; otherwise it still exists.
                     if !error.is(Code::NoSuchWatch) {
                         self.all.insert(key.clone(), MeasureRequest::Watch(path));
                     }
@@ -81,10 +81,10 @@ impl MeasureRequests {
         }
     }
 
-    /// Has a topic measured also after the end.
+    /// Creates a watch that measures a topic permanently. Returns the status line.
     pub(super) fn keep(&mut self, key: &Key, name: &str) -> String {
         if let Some(MeasureRequest::Watch(_)) = self.all.get(key) {
-            return format!("{name}: is kept already; w removes the watch");
+            return format!("{name}: already has a watch; w removes it");
         }
         let path = format!("/watch{}?domain_id={}", encoded(name), key.domain_id);
         if !name.starts_with('/') {
@@ -102,7 +102,7 @@ impl MeasureRequests {
         }
     }
 
-    /// A connection could not be opened.
+    /// Removes a topic whose connection failed. Returns the status line.
     pub(super) fn lost(&mut self, key: &Key, why: String) -> String {
         self.all.remove(key);
         why
@@ -128,7 +128,7 @@ impl MeasureRequests {
     }
 }
 
-/// A connection that has a topic measured as long as it is open.
+/// Connection that keeps a topic measured while it is open.
 #[derive(Debug)]
 struct Stream {
     agent: Arc<Agent>,
@@ -139,7 +139,7 @@ struct Stream {
 }
 
 impl Stream {
-    /// Reads and discards what comes, and opens the stream again when it breaks.
+    /// Reads and discards the stream, and reopens it after a break.
     fn run(self) {
         while !self.is_over() {
             match self.agent.stream(&self.path) {

@@ -1,8 +1,8 @@
-//! `rp top`: a live table of topics in a terminal, or once as text.
+//! `rp top`: a live table of topics in a terminal, or one table as text.
 //!
-//! It shows what the agent's API says and decides nothing by itself. Names from the network reach the
-//! terminal escaped (`text`); the terminal is given back clean however it ends (`terminal`). Topics
-//! that it has measured are measured no longer once it has gone, unless `W` keeps them.
+//! It shows the answers of the agent's API. Names from the network are escaped (`text`), and the
+//! terminal is restored on every exit (`terminal`). Topics that it measures are released at its
+//! end, unless `W` keeps them.
 
 mod app;
 mod details;
@@ -31,25 +31,25 @@ use table::Table;
 use terminal::Screen;
 use theme::Theme;
 
-/// The screen is drawn anew after this time, for the age of what is shown.
+/// Longest time between two drawings, which update the shown age.
 const TICK: Duration = Duration::from_millis(500);
-/// Between two drawings, whatever comes; keys are answered at once.
+/// Least time between two drawings caused by facts. Keys redraw at once.
 const CALM: Duration = Duration::from_millis(100);
-/// Keys and facts that wait for a terminal that takes its time; who has more to say waits, too.
+/// Most keys and facts that wait for a slow terminal. Senders block beyond that.
 const MAX_WAITING: usize = 64;
-/// Lines of the header in text without scrolling.
+/// Most lines of the header in text without scrolling.
 const MAX_HEADER: usize = 16;
 
-/// What is shown at first.
+/// Initial view.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Only this domain.
+    /// Domain to show; `None` for all.
     pub domain_id: Option<u32>,
-    /// By what the table is sorted.
+    /// Column by which the table is sorted.
     pub sort: Column,
-    /// The other way round.
+    /// Whether the order is reversed.
     pub reverse: bool,
-    /// Only topics with this in name, type or state.
+    /// Text in the name, type or state of shown topics.
     pub filter: String,
     /// Only topics with problems.
     pub problems: bool,
@@ -57,10 +57,11 @@ pub struct Options {
     pub hidden: bool,
 }
 
-/// The table as text: as it is now, all columns, as wide as they are.
+/// Returns the current table as text, with all columns in full width.
 ///
 /// # Errors
-/// The agent is gone or refuses.
+///
+/// The agent is unreachable or refuses.
 pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
     let (health, topics) = poller::ask(agent, options.domain_id, options.hidden)?;
     let (mut app, now) = (App::new(options, agent.place()), Instant::now());
@@ -81,10 +82,12 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
     Ok(text)
 }
 
-/// The table in the terminal, requested anew every `interval`, until a key ends it; returns the exit code.
+/// Shows the table in the terminal and requests it every `interval`, until a key ends it. Returns
+/// the exit code.
 ///
 /// # Errors
-/// There is no terminal, or no thread can be started.
+///
+/// Standard output is no terminal, or a thread cannot be started.
 pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u8> {
     let theme = Theme::of(|name| std::env::var(name).ok());
     let mut app = App::new(options, agent.place());
@@ -106,7 +109,7 @@ pub fn live(agent: Agent, options: &Options, interval: Duration) -> io::Result<u
     }
 }
 
-/// Waits for what changes the screen and takes it in; the exit code when that was the end.
+/// Waits for input and processes it. Returns the exit code if it ends the program.
 fn handle_input(app: &mut App, poller: &Poller, input: &Receiver<Input>) -> Option<u8> {
     let begun = Instant::now();
     let mut is_news = false;

@@ -1,5 +1,5 @@
-//! Reads the agent's API on threads of its own, so that a slow agent never holds up a key, and goes
-//! on asking when the agent is gone. Facts go into a channel; it shows nothing.
+//! Polls the agent's API on its own threads, so that a slow agent never delays a key. It continues
+//! while the agent is unreachable. Facts go into a channel.
 
 use std::io;
 use std::sync::Arc;
@@ -20,37 +20,37 @@ use ros2probe_api::health::Health;
 use ros2probe_api::path::encoded;
 use ros2probe_api::topics::{TopicDetails, TopicList};
 
-/// Pause before a stream of events that broke is opened again.
+/// Pause before a broken stream of events is reopened.
 const RETRY: Duration = Duration::from_secs(2);
 
-/// What the program waits for.
+/// Input of the program.
 #[derive(Debug)]
 pub enum Input {
-    /// The agent answered.
+    /// An answer of the agent.
     Fact(Fact),
-    /// A key was pressed.
+    /// A key.
     Key(ratatui::crossterm::event::KeyEvent),
-    /// The terminal has another size.
+    /// A new terminal size.
     Resized,
-    /// The program is to end with this code.
+    /// The end of the program with this code.
     End(u8),
 }
 
-/// A request to the polling thread.
+/// Request to the polling thread.
 #[derive(Debug)]
 pub(super) enum Request {
     Command(Command),
-    /// A topic is measured no longer, and why.
+    /// Measuring a topic failed, for this reason.
     Lost(Key, String),
 }
 
-/// The threads that read.
+/// The polling threads.
 #[derive(Debug)]
 pub struct Poller {
     requests: Sender<Request>,
 }
 
-/// What is asked for again and again.
+/// State of the polling thread.
 #[derive(Debug)]
 struct Poll {
     agent: Arc<Agent>,
@@ -63,10 +63,11 @@ struct Poll {
 }
 
 impl Poller {
-    /// Begins to ask, every `interval`, about one domain or all of them.
+    /// Starts to poll every `interval`, for one domain or all of them.
     ///
     /// # Errors
-    /// No thread can be started.
+    ///
+    /// A thread cannot be started.
     pub fn start(
         agent: Agent,
         domain_id: Option<u32>,
@@ -94,15 +95,16 @@ impl Poller {
 
     /// Executes a command.
     pub fn command(&self, command: Command) {
-        // The thread lives as long as the program: a panic of it ends both.
+        // The thread lives as long as the program: its panic ends both.
         let _ = self.requests.send(Request::Command(command));
     }
 }
 
-/// All topics and the agent's state, once.
+/// Requests all topics and the agent's state once.
 ///
 /// # Errors
-/// The agent is gone or refuses.
+///
+/// The agent is unreachable or refuses.
 pub fn ask(
     agent: &Agent,
     domain_id: Option<u32>,
@@ -159,7 +161,7 @@ impl Poll {
         match self.agent.get::<TopicDetails<'_>>(&path) {
             Ok(topic) => self.send(Fact::Details(key, Some(Box::new(topic)))),
             Err(ClientError::Refused(_)) => self.send(Fact::Details(key, None)),
-            // The next round tells that the agent is gone.
+            // The next round detects that the agent is unreachable.
             Err(_) => {}
         }
     }
@@ -197,7 +199,7 @@ impl Poll {
     }
 }
 
-/// Follows the agent's events from the oldest it has, through every break.
+/// Follows the agent's events from the oldest available one, and reconnects after each break.
 fn follow_events(agent: &Agent, inputs: &SyncSender<Input>) {
     let mut messages = Messages::default();
     let mut is_refused = false;
@@ -234,7 +236,7 @@ fn fact(event: &str, data: &str) -> Option<Fact> {
         return Some(Fact::Lagged(lagged));
     }
     let read = serde_json::from_str::<Event<'_>>(data).or_else(|_| {
-        // Shown rather than dropped.
+        // Unknown events are shown rather than dropped.
         serde_json::from_str::<Value>(data).map(|_| Event {
             name: safe(event).into(),
             ..Event::default()

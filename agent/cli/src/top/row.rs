@@ -1,5 +1,5 @@
-//! One line of the table: what is shown of a topic, what is wrong with it, and how lines are sorted.
-//! Made from the agent's facts and those of some seconds ago; it computes nothing the agent knows.
+//! One line of the table: the shown values of a topic, its problems, and the sort order. It derives
+//! them from the agent's current facts and those of the last seconds.
 
 use std::cmp::Ordering;
 use std::collections::VecDeque;
@@ -10,45 +10,45 @@ use ros2probe_api::Open;
 use ros2probe_api::measurement::Delivered;
 use ros2probe_api::topics::{ReasonCode, Topic};
 
-/// Losses in the table are of this time, so that an old loss does not hide a new one.
+/// Time span of losses in the table, so that an old loss does not hide a new one.
 const WINDOW: Duration = Duration::from_secs(30);
-/// Least time between two notes of the counters.
+/// Least time between two samples of the counters.
 const STEP: Duration = Duration::from_millis(900);
 
-/// A topic of one domain.
+/// Identity of a topic within all domains.
 #[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Key {
-    /// Its domain.
+    /// Domain of the topic.
     pub domain_id: u32,
-    /// Its DDS name, as the agent writes it.
+    /// DDS name as reported by the agent.
     pub dds_name: String,
 }
 
-/// How a topic stands, the worst first.
+/// State of a topic, the worst first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Standing {
-    /// An expectation is broken.
+    /// An expectation is violated.
     Violated,
-    /// Published, and nothing comes.
+    /// Published, but without messages.
     Silent,
     /// Watched by its name, without a publisher.
     NotPublished,
-    /// Messages cannot be seen, for a reason that is known.
+    /// Messages are invisible, for a known reason.
     Unseen,
     /// Published without a subscriber.
     NoSubscriber,
-    /// Measured without expectations, and nothing came lately.
+    /// Measured without expectations, and without recent messages.
     Quiet,
-    /// Messages flow, and as expected.
+    /// Messages arrive as expected.
     Ok,
-    /// No watch or subscription has it measured.
+    /// No watch or subscription measures it.
     Unwatched,
     /// Its last endpoint has gone.
     Gone,
 }
 
 impl Standing {
-    /// In the table.
+    /// Label in the table.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -65,40 +65,41 @@ impl Standing {
     }
 }
 
-/// One topic in the table. Names are safe to show.
+/// One topic in the table. Names are escaped.
 #[derive(Clone, Debug)]
 pub struct Row {
-    /// Which.
+    /// Identity of the topic.
     pub key: Key,
     /// ROS name.
     pub name: String,
     /// ROS types.
     pub message_type: String,
-    /// Messages are counted.
+    /// Whether messages are counted.
     pub is_measured: bool,
     /// Messages a second.
     pub rate: Option<f64>,
-    /// Least and most that is expected.
+    /// Lowest and highest expected rate, in messages a second.
     pub wanted: (Option<f64>, Option<f64>),
     /// Payload bytes a second.
     pub bandwidth: Option<f64>,
-    /// Lost of those that were sent: by the writers or on the way to a receiver, whichever is worse.
+    /// Ratio of lost to sent messages: lost by writers or on the way to a receiver, whichever is
+    /// larger.
     pub loss: Option<f64>,
-    /// Half of the messages took longer.
+    /// Median latency in seconds.
     pub median: Option<f64>,
-    /// One of a hundred messages took longer.
+    /// 99th percentile of the latency in seconds.
     pub p99: Option<f64>,
-    /// How many writers.
+    /// Number of writers.
     pub publishers: usize,
-    /// How many readers.
+    /// Number of readers.
     pub subscriptions: usize,
-    /// How it stands.
+    /// State of the topic.
     pub standing: Standing,
-    /// What deserves attention, in a word each.
+    /// Problems, in one word each.
     pub problems: Vec<&'static str>,
 }
 
-/// The counters that losses are made of.
+/// Counters from which losses are computed.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counters {
     sent: (u64, u64),
@@ -112,8 +113,8 @@ pub struct Past {
 }
 
 impl Past {
-    /// Lost of those that were sent lately; where nothing was lately, ever. And whether any was lost
-    /// lately.
+    /// Loss ratio of the last [`WINDOW`], or in total if nothing was sent in it. The flag is
+    /// whether messages were lost in the window.
     fn loss(&mut self, topic: &Topic<'_>, now: Instant) -> (Option<f64>, bool) {
         let latest = Counters::of(topic);
         let first = self.notes.front().map(|(_, counters)| *counters);
@@ -146,8 +147,8 @@ impl Counters {
         }
     }
 
-    /// The worse of both ratios, and whether anything was lost; `None` while nothing was sent, or
-    /// when the counters began anew.
+    /// The larger of both ratios, and whether messages were lost. `None` if nothing was sent, or
+    /// the counters restarted.
     #[expect(
         clippy::cast_precision_loss,
         reason = "a ratio of counts far below 2^52"
@@ -166,7 +167,7 @@ impl Counters {
 }
 
 impl Row {
-    /// What is shown of `topic`.
+    /// Creates the row of `topic`.
     #[must_use]
     pub fn new(topic: &Topic<'_>, past: &mut Past, now: Instant) -> Self {
         let is_measured = is_measured(topic);
@@ -199,7 +200,7 @@ impl Row {
         }
     }
 
-    /// The state in words: what is wrong, else how it stands.
+    /// State as text: the problems, or the label of the state.
     #[must_use]
     pub fn state(&self) -> String {
         if self.problems.is_empty() {
@@ -212,7 +213,7 @@ impl Row {
     }
 }
 
-/// The name people know it by: of a service's topics that is the DDS name.
+/// Displayed name: the ROS name, or the DDS name for topics of a service.
 #[must_use]
 pub fn shown_name(topic: &Topic<'_>) -> String {
     match topic.kind.as_ref() {
@@ -221,7 +222,7 @@ pub fn shown_name(topic: &Topic<'_>) -> String {
     }
 }
 
-/// Whether messages are counted now; numbers stay when that ends.
+/// Returns whether messages are counted now. Values remain after the measurement ends.
 #[must_use]
 pub fn is_measured(topic: &Topic<'_>) -> bool {
     let mut publishers = topic.publishers.iter();
@@ -229,7 +230,7 @@ pub fn is_measured(topic: &Topic<'_>) -> bool {
         && (!topic.watches.is_empty() || publishers.any(|it| it.measurement.is_some()))
 }
 
-/// The tightest of all that is expected of its rate.
+/// Tightest of all expectations about the topic's rate.
 fn wanted(topic: &Topic<'_>) -> (Option<f64>, Option<f64>) {
     let watches = || topic.watches.iter();
     (
@@ -300,7 +301,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
         }
         Standing::Silent => say("silent"),
         Standing::Unseen => say("unseen"),
-        // Subscribers without a publisher are usual; who named the topic expects one.
+        // Subscribers without a publisher are common, but a watch on the exact name expects one.
         Standing::NotPublished if topic.watches.iter().any(|it| !it.watch.contains('*')) => {
             say("no pub");
         }
@@ -314,7 +315,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "qos_incompatible" => say("qos"),
             "type_conflict" => say("type"),
             "type_hash_conflict" => say("hash"),
-            // Usual: a tool that publishes without a subscriber.
+            // Common: a tool that publishes without a subscriber.
             "unheard_publisher" | "unfed_subscriber" | "" => {}
             _ => say("graph"),
         }
@@ -322,7 +323,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
     problems
 }
 
-/// By what the table is sorted.
+/// Column by which the table is sorted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Column {
     /// Name, then domain.
@@ -345,7 +346,7 @@ pub enum Column {
 }
 
 impl Column {
-    /// In the table's order.
+    /// All columns, in the table's order.
     pub const ALL: [Self; 8] = [
         Self::Name,
         Self::Rate,
@@ -357,7 +358,7 @@ impl Column {
         Self::State,
     ];
 
-    /// In words.
+    /// Name of the column in the header.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -372,7 +373,7 @@ impl Column {
         }
     }
 
-    /// Which of two topics comes first; what is not known comes last, also in `reverse`.
+    /// Compares two topics. Unknown values come last, also in reverse order.
     #[must_use]
     pub fn order(self, reverse: bool, one: &Row, other: &Row) -> Ordering {
         let turn = |order: Ordering| if reverse { order.reverse() } else { order };
@@ -420,7 +421,7 @@ mod tests {
             (unwatched.rate, unwatched.loss, unwatched.state()),
             (None, None, "unwatched".to_owned())
         );
-        // What was counted before is kept by the agent and is no rate of 0.
+        // Counters persist after the measurement; the rate is unknown, not 0.
         let before = row(json!({
             "publishers": both, "measurement": {"messages": 9, "rate_hertz": 0.0}
         }));
@@ -480,7 +481,7 @@ mod tests {
             let row = Row::new(facts, &mut past, at(seconds));
             (row.loss, row.problems)
         };
-        // What was lost before it was looked at is shown and is no news.
+        // Earlier losses are shown, but not as a recent problem.
         assert_eq!(seen(0, &facts(100, 100, 0)), (Some(0.5), vec![]));
         assert_eq!(seen(1, &facts(200, 100, 0)), (Some(0.0), vec![]));
         let (loss, problems) = seen(2, &facts(280, 120, 50));
@@ -490,7 +491,7 @@ mod tests {
             seen(second, &facts(280 + second, 120, 50));
         }
         assert_eq!(seen(40, &facts(400, 120, 50)), (Some(0.0), vec![]));
-        // The agent was started again.
+        // The agent has restarted.
         assert_eq!(seen(41, &facts(10, 0, 0)), (Some(0.0), vec![]));
     }
 

@@ -1,24 +1,25 @@
 //! Server-sent events, read line by line (WHATWG HTML, 9.2.6).
 
-/// One message.
+/// One event.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Message {
-    /// What it is.
+    /// Type of the event.
     pub event: String,
-    /// What it says.
+    /// Data of the event.
     pub data: String,
 }
 
-/// Puts lines together to messages. The client bounds lines; a message has one of data here.
+/// Assembles lines into events. The client limits the length of a line; an event here has one line
+/// of data.
 #[derive(Debug, Default)]
 pub struct Messages {
     next: Message,
-    /// Where to go on after a break.
+    /// Id of the last event, from which to resume after a break.
     pub last_id: Option<String>,
 }
 
 impl Messages {
-    /// Takes in one line, without its end.
+    /// Adds a line without its end. Returns the event that it completes.
     pub fn line(&mut self, line: &[u8]) -> Option<Message> {
         let line = String::from_utf8_lossy(line);
         let line = line.trim_end_matches('\r');
@@ -37,7 +38,7 @@ impl Messages {
         None
     }
 
-    /// The connection broke: what was begun will come again.
+    /// Discards an incomplete event after a break; the server sends it again.
     pub fn cut(&mut self) {
         self.next = Message::default();
     }

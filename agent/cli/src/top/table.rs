@@ -1,17 +1,16 @@
-//! The table as text, on the screen and in a pipe: which columns there is room for, and what stands
-//! in them.
+//! Table as text, for the screen and for pipes: selection of columns and format of cells.
 
 use std::collections::BTreeSet;
 
 use super::row::{Column, Row};
 use super::text;
 
-/// A name keeps at least so many columns.
+/// Least width of the name column.
 const NAME: usize = 20;
-/// More would only be empty.
+/// Largest width of the state column.
 const MAX_STATE: usize = 28;
 
-/// A column of the table.
+/// Column of the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Field {
     Name,
@@ -27,7 +26,7 @@ enum Field {
     State,
 }
 
-/// Columns with their widths.
+/// Selected columns with their widths.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Table {
     columns: Vec<(Field, usize)>,
@@ -65,7 +64,7 @@ impl Field {
         }
     }
 
-    /// Least width.
+    /// Least width of the column.
     const fn width(self) -> usize {
         match self {
             Self::Name => NAME,
@@ -119,7 +118,7 @@ impl Field {
 }
 
 impl Table {
-    /// The columns that `width` has room for, the more important ones first.
+    /// Selects the columns that fit into `width`, in order of importance.
     #[must_use]
     pub fn plan(width: usize, rows: &[&Row], cut: char) -> Self {
         let domains: BTreeSet<_> = rows.iter().map(|row| row.key.domain_id).collect();
@@ -162,7 +161,7 @@ impl Table {
             message_type = grown(Field::Type, longest(Field::Type), &mut left);
             columns.push(Field::Type);
         }
-        // A narrow screen leaves the name what there is.
+        // On a narrow screen, the name takes the remaining width.
         let least = NAME + 6 + 9 + 2;
         let name = if width < least {
             NAME.saturating_sub(least - width)
@@ -182,7 +181,7 @@ impl Table {
         }
     }
 
-    /// Every column as wide as it needs to be.
+    /// All columns, each as wide as its widest cell.
     #[must_use]
     pub fn whole(rows: &[&Row], cut: char) -> Self {
         let is_expected = rows.iter().any(|row| row.wanted != (None, None));
@@ -199,7 +198,7 @@ impl Table {
         }
     }
 
-    /// The heading, and where in it the sorted column stands.
+    /// The heading, and the range of the sorted column in it.
     #[must_use]
     pub fn heading(&self, sort: Column) -> (String, Option<(usize, usize)>) {
         let (mut line, mut sorted) = (String::new(), None);
@@ -215,7 +214,7 @@ impl Table {
         (line, sorted)
     }
 
-    /// One topic.
+    /// Line of one topic.
     #[must_use]
     pub fn line(&self, row: &Row) -> String {
         let mut line = String::new();
@@ -230,7 +229,7 @@ impl Table {
 
     fn cell(&self, field: Field, width: usize, value: &str) -> String {
         match field {
-            // What tells names and types apart is at their ends.
+            // Names and types differ most at their ends.
             Field::Name | Field::Type => {
                 format!("{:<width$}", text::end(value, width, self.cut))
             }

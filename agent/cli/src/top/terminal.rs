@@ -1,5 +1,5 @@
-//! The terminal while it is ours: raw, on its alternate screen, and given back as it was, also after
-//! a panic of any thread.
+//! Terminal in raw mode on its alternate screen. It is restored at the end, also after a panic of
+//! any thread.
 
 use std::io::{self, BufWriter, IsTerminal as _, Stdout, Write as _};
 use std::panic;
@@ -19,28 +19,29 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::poller::Input;
 
-/// What the exit code of a panic is.
+/// Exit code of a panic.
 const PANICKED: i32 = 101;
-/// What a shell adds to a signal's number.
+/// Offset that a shell adds to the number of a signal.
 const SIGNALLED: u8 = 128;
 
-/// How long drawing may take before a signal ends the program without it.
+/// Longest drawing; a signal then ends the program without waiting for it.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// The terminal is ours.
+/// Whether the terminal is in raw mode.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
-/// The terminal, until this is dropped.
+/// Terminal in raw mode, until this is dropped.
 #[derive(Debug)]
 pub struct Screen {
     terminal: Terminal<CrosstermBackend<BufWriter<Stdout>>>,
 }
 
 impl Screen {
-    /// Takes the terminal.
+    /// Puts the terminal into raw mode.
     ///
     /// # Errors
-    /// There is none, or it cannot be had.
+    ///
+    /// The terminal is missing or cannot be configured.
     pub fn open() -> io::Result<Self> {
         if !io::stdout().is_terminal() {
             let reason = "rp top needs a terminal; `rp top --once` prints the table and ends";
@@ -50,7 +51,7 @@ impl Screen {
         panic::set_hook(Box::new(move |panic| {
             give_back();
             before(panic);
-            // A thread that reads is gone: what is shown would be old for ever.
+            // A reading thread has panicked: the screen would never update again.
             std::process::exit(PANICKED);
         }));
         TAKEN.store(true, Ordering::Relaxed);
@@ -66,7 +67,7 @@ impl Screen {
         }
     }
 
-    /// Where to draw.
+    /// The terminal to draw on.
     pub const fn terminal(&mut self) -> &mut Terminal<CrosstermBackend<BufWriter<Stdout>>> {
         &mut self.terminal
     }
@@ -78,8 +79,7 @@ impl Drop for Screen {
     }
 }
 
-/// Leaves the terminal as it was. What cannot be done any more, as on a line that was hung up, is
-/// left out.
+/// Restores the terminal. Failures, for example after a hangup, are ignored.
 fn give_back() {
     if TAKEN.swap(false, Ordering::Relaxed) {
         let _ = disable_raw_mode();
@@ -88,10 +88,11 @@ fn give_back() {
     }
 }
 
-/// Passes on keys and sizes.
+/// Starts a thread that passes on keys and sizes.
 ///
 /// # Errors
-/// No thread can be started.
+///
+/// The thread cannot be started.
 pub fn listen(inputs: SyncSender<Input>) -> io::Result<()> {
     let thread = thread::Builder::new().name("keys".to_owned());
     let read = move || {
@@ -112,10 +113,11 @@ pub fn listen(inputs: SyncSender<Input>) -> io::Result<()> {
     thread.spawn(read).map(drop)
 }
 
-/// Passes on the signals that ask a program to end.
+/// Passes on signals that end a program.
 ///
 /// # Errors
-/// Signals cannot be listened to.
+///
+/// The signal handlers cannot be installed.
 pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
@@ -142,7 +144,7 @@ pub fn listen_to_signals(inputs: SyncSender<Input>) -> io::Result<()> {
         let code = SIGNALLED.saturating_add(number);
         let _ = inputs.try_send(Input::End(code));
         thread::sleep(TIMEOUT);
-        // The terminal takes nothing, and drawing waits for it: only its settings can be put back.
+        // The terminal is blocked and drawing waits for it: only its settings can be restored.
         let _ = disable_raw_mode();
         std::process::exit(code.into());
     };
@@ -158,13 +160,13 @@ mod tests {
 
     use super::*;
 
-    /// What [`a_panic_of_any_thread_gives_the_terminal_back`] starts.
+    /// Test that [`a_panic_of_any_thread_gives_the_terminal_back`] starts as a process.
     const PANICS: &str = "top::terminal::tests::panics_on_a_screen";
 
     #[test]
     #[ignore = "started by another test, on a terminal of its own"]
     fn panics_on_a_screen() {
-        // Whoever runs all tests has no such terminal.
+        // A plain test run has no such terminal.
         if std::env::var_os("PANICS_ON_A_SCREEN").is_some() {
             let _screen = Screen::open().unwrap();
             let reader = thread::spawn(|| panic!("the reason"));

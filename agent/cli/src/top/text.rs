@@ -1,11 +1,12 @@
-//! Text and numbers as they may go to a terminal. Names come from the network: nothing but printable
-//! ASCII leaves here, so that no name can move a cursor, colour a line or hide itself, and every
-//! character is one column wide.
+//! Text and numbers that are safe to print on a terminal.
+//!
+//! Names come from the network, so only printable ASCII passes. No name can move the cursor or
+//! change colours, and every character is one column wide.
 
-/// Longer names are cut: a terminal line is short.
+/// Longest name, in characters; longer ones are cut.
 const MAX_CHARACTERS: usize = 256;
 
-/// Text from outside, with everything escaped that is not printable ASCII.
+/// Escapes all characters of `text` other than printable ASCII.
 #[must_use]
 pub fn safe(text: &str) -> String {
     let mut shown = String::with_capacity(text.len().min(MAX_CHARACTERS));
@@ -22,7 +23,7 @@ pub fn safe(text: &str) -> String {
     shown
 }
 
-/// The beginning of `text` in at most `width` columns; `mark` stands for what is missing.
+/// Beginning of `text` in at most `width` columns; `mark` replaces the cut part.
 #[must_use]
 pub fn beginning(text: &str, width: usize, mark: char) -> String {
     if text.chars().count() <= width {
@@ -35,7 +36,7 @@ pub fn beginning(text: &str, width: usize, mark: char) -> String {
     cut
 }
 
-/// The end of `text` in at most `width` columns: what tells topics apart is there.
+/// End of `text` in at most `width` columns: names differ most at their ends.
 #[must_use]
 pub fn end(text: &str, width: usize, mark: char) -> String {
     let length = text.chars().count();
@@ -49,7 +50,7 @@ pub fn end(text: &str, width: usize, mark: char) -> String {
     marks.into_iter().chain(kept).take(width).collect()
 }
 
-/// A rate in at most six columns.
+/// Rate in at most six columns.
 #[must_use]
 pub fn rate(hertz: f64) -> String {
     match hertz {
@@ -61,7 +62,7 @@ pub fn rate(hertz: f64) -> String {
     }
 }
 
-/// An expected rate, without needless digits.
+/// Expected rate, without needless digits.
 #[must_use]
 pub fn bound(hertz: f64) -> String {
     let text = format!("{hertz:.2}");
@@ -69,7 +70,7 @@ pub fn bound(hertz: f64) -> String {
     text.to_owned()
 }
 
-/// Bytes, or bytes a second, in at most six columns: decimal units, as `ros2 topic bw` has them.
+/// Bytes, or bytes a second, in at most six columns, in decimal units as in `ros2 topic bw`.
 #[must_use]
 pub fn bytes(bytes: f64) -> String {
     if bytes < 999.5 {
@@ -85,7 +86,7 @@ pub fn bytes(bytes: f64) -> String {
     format!("{:.0}T", scaled / 1e3)
 }
 
-/// A time in at most five columns.
+/// Duration in at most five columns.
 #[must_use]
 pub fn seconds(seconds: f64) -> String {
     match seconds {
@@ -100,7 +101,7 @@ pub fn seconds(seconds: f64) -> String {
     }
 }
 
-/// A ratio in at most five columns. Only nothing is `0%` and only all is `100%`.
+/// Ratio in at most five columns. Only 0 is `0%`, and only 1 is `100%`.
 #[must_use]
 pub fn ratio(ratio: f64) -> String {
     match ratio {
@@ -112,7 +113,7 @@ pub fn ratio(ratio: f64) -> String {
     }
 }
 
-/// A count with its noun.
+/// Count with its noun.
 #[must_use]
 pub fn counted(count: u64, noun: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };

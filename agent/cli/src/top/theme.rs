@@ -1,35 +1,35 @@
-//! How things look on this terminal: with or without colours, in UTF-8 or ASCII. What matters is said
-//! in words; attributes and colours only repeat it.
+//! Appearance on this terminal: with or without colours, in UTF-8 or ASCII. The text carries all
+//! information; colours and attributes only emphasize it.
 
 use ratatui::style::{Color, Modifier, Style};
 
-/// What the terminal can show.
+/// Abilities of the terminal.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Theme {
-    /// Characters beyond ASCII.
+    /// Whether characters beyond ASCII are shown.
     pub unicode: bool,
-    /// Colours.
+    /// Whether colours are shown.
     pub colours: bool,
 }
 
-/// What a piece of text is.
+/// Style of a piece of text.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Kind {
-    /// As it is.
+    /// Plain text.
     #[default]
     Plain,
-    /// Names what is below.
+    /// Heading of the lines below.
     Heading,
-    /// Deserves attention.
+    /// Problem that needs attention.
     Problem,
-    /// Of less interest.
+    /// Text of lesser interest.
     Faint,
-    /// Where the keys go.
+    /// Selected line.
     Selected,
 }
 
 impl Theme {
-    /// By the environment, given as a function: locale as libc finds it, and <https://no-color.org>.
+    /// Theme from environment variables: the locale as libc finds it, and <https://no-color.org>.
     #[must_use]
     pub fn of(variable: impl Fn(&str) -> Option<String>) -> Self {
         let set = |name: &&str| variable(name).is_some_and(|value| !value.is_empty());
@@ -45,13 +45,13 @@ impl Theme {
         }
     }
 
-    /// Stands for text that is cut off.
+    /// Character that replaces cut text.
     #[must_use]
     pub const fn cut(self) -> char {
         if self.unicode { '…' } else { '~' }
     }
 
-    /// A line over a pane.
+    /// Character of the line above a pane.
     #[must_use]
     pub const fn rule(self, is_focused: bool) -> char {
         match (self.unicode, is_focused) {
@@ -62,7 +62,7 @@ impl Theme {
         }
     }
 
-    /// A bar of `part` of `width` columns: at least a sign of what is more than nothing.
+    /// Bar of `part` of `width` columns, with at least one character unless `part` is 0.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -83,7 +83,7 @@ impl Theme {
         "█".repeat(eighths / 8) + rest
     }
 
-    /// How text of this kind is drawn.
+    /// Style of this kind of text.
     #[must_use]
     pub const fn style(self, kind: Kind) -> Style {
         let style = Style::new();

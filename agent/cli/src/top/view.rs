@@ -1,4 +1,4 @@
-//! The screen: header, panes, footer, drawn from the model and nothing else.
+//! Screen: header, panes and footer, drawn from the state.
 
 use std::time::Instant;
 
@@ -15,12 +15,12 @@ use super::table::Table;
 use super::text::{beginning, safe};
 use super::theme::{Kind, Theme};
 
-/// Smaller than this, nothing can be read.
+/// Least usable size: columns and lines.
 pub const LEAST: (u16, u16) = (40, 8);
-/// Columns in front of each topic: selected, and measured for this program.
+/// Columns before each topic for two marks: selected, and measured on behalf of this program.
 const MARKS: usize = 2;
 
-/// Draws the screen and tells the model how much of it there is.
+/// Draws the screen, and stores the heights of the panes in the state.
 pub fn draw(app: &mut App, frame: &mut Frame<'_>, theme: Theme, now: Instant) {
     let area = frame.area();
     if area.width < LEAST.0 || area.height < LEAST.1 {
@@ -71,7 +71,7 @@ pub fn draw(app: &mut App, frame: &mut Frame<'_>, theme: Theme, now: Instant) {
     footer(app, frame, area, theme, now);
 }
 
-/// Where the panes are; each has a line of its own on top.
+/// Areas of the panes; each has a title line on top.
 #[derive(Clone, Copy, Debug, Default)]
 struct Panes {
     topics: Option<Rect>,
@@ -163,7 +163,7 @@ fn topics(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme) {
     }
 }
 
-/// Why the table is empty.
+/// Reason for an empty table.
 fn nothing(app: &App) -> &'static str {
     match (app.updated, app.rows().is_empty()) {
         (None, _) => "  waiting for the agent",
@@ -222,7 +222,7 @@ fn footer(app: &App, frame: &mut Frame<'_>, area: Rect, theme: Theme, now: Insta
     put(frame, area, last, keys, theme, Kind::Faint);
 }
 
-/// The line on top of a pane.
+/// Draws the title line of a pane.
 fn rule(frame: &mut Frame<'_>, area: Rect, title: &str, is_focused: bool, theme: Theme) {
     let line = theme.rule(is_focused);
     let width = usize::from(area.width);
@@ -250,14 +250,14 @@ const fn below(area: Rect) -> Rect {
     }
 }
 
-/// As many lines as there is room for, from `first` on.
+/// Draws lines from `first` on, as many as fit.
 fn write(frame: &mut Frame<'_>, area: Rect, lines: &[Styled], theme: Theme, first: usize) {
     for ((text, kind), at) in lines.iter().skip(first).zip(0..area.height) {
         put(frame, area, at, text, theme, *kind);
     }
 }
 
-/// One line, cut where the area ends.
+/// Draws one line, cut at the end of the area.
 fn put(frame: &mut Frame<'_>, area: Rect, at: u16, text: &str, theme: Theme, kind: Kind) {
     if at >= area.height {
         return;

@@ -161,7 +161,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
     agent.wait_ready(PATIENCE)?;
     assert!(able(&agent, "shared_memory")?);
     let health = get(&host.network, "http://127.0.0.1:17401/health")?;
-    assert!(health.contains("the cgroup was made anew"), "{health}");
+    assert!(health.contains("the cgroup was recreated"), "{health}");
 
     // Polling finds the participants of the new one, and no loss is reported.
     let stream = Stream {

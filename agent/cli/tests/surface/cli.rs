@@ -190,7 +190,7 @@ fn a_cut_capture_is_reported_up_to_the_cut_and_fails() {
     let path = directory.path().join("cut.pcap.gz");
     std::fs::write(&path, &whole[..whole.len() / 2]).unwrap();
     let output = run(&["run", "--replay", path.to_str().unwrap(), "--report"]);
-    fails_with(&output, 1, &["the capture was replayed up to a fault"]);
+    fails_with(&output, 1, &["the rest of the capture is unreadable"]);
     let page = String::from_utf8(output.stdout).unwrap();
     let packets = metric(
         &page,

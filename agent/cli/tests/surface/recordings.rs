@@ -336,10 +336,10 @@ fn snapshots_without_a_place_are_a_mistake_only_where_none_was_asked_for() {
     // A replay has no state directory, as an agent whose disk is not there.
     let (code, length, said) = run("");
     assert_eq!(code, Some(0), "{said}");
-    assert!(length > 1000 && said.contains("no snapshots are kept"));
+    assert!(length > 1000 && said.contains("snapshots are disabled"));
     let (code, _, said) = run("state_directory: off\n");
     assert_eq!(code, Some(1), "{said}");
-    assert!(said.contains("the agent has no place for recordings"));
+    assert!(said.contains("the agent has no directory for recordings"));
 }
 
 /// Returns the output of `rp bag convert` for a capture, its exit code and the report in the bag.

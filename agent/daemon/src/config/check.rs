@@ -1,8 +1,8 @@
-//! Compares a document with the schema and reports every difference with its place.
+//! Compares a document with the schema, and reports every difference with its position.
 //!
-//! serde stops at its first error; an operator wants all of them. The schema is the generated one
-//! (see `shape`), so names, types and ranges exist once. It knows the few keywords that schemars
-//! writes for our shapes and nothing else of JSON Schema.
+//! serde stops at its first error, but an operator needs all of them. The schema is the generated
+//! one (see `shape`), so names, types and ranges are declared once. Only the JSON Schema keywords
+//! that schemars emits for these shapes are supported.
 
 use serde_json::Value;
 
@@ -10,7 +10,7 @@ use super::document::{Content, Key, Node, Scalar, item_path, key_path};
 use super::meaning::check_text;
 use super::mistake::Mistakes;
 
-/// What people write for keys that are called otherwise: old names first, then likely guesses.
+/// Common wrong keys and their correct names: former names first, then likely guesses.
 const RENAMED: &[(&str, &str)] = &[
     ("watchlist", "watch"),
     ("watches", "watch"),
@@ -27,7 +27,7 @@ const RENAMED: &[(&str, &str)] = &[
     ("port", "listen"),
 ];
 
-/// Adds what `node` at `path` does wrong by `schema`; `root` holds the definitions.
+/// Adds the mistakes of `node` at `path` under `schema`; `root` holds the definitions.
 pub(super) fn check(node: &Node, path: &str, schema: &Value, root: &Value, found: &mut Mistakes) {
     let schema = resolve(schema, root);
     if let Some(choices) = any_of(schema) {
@@ -75,7 +75,7 @@ fn check_map(
     for (key, value) in entries {
         let path = key_path(path, &key.name);
         let own = properties.and_then(|all| all.get(&key.name));
-        // A map of names that the operator chooses.
+        // A map with keys chosen by the operator.
         let any = schema
             .get("additionalProperties")
             .filter(|any| any.is_object());
@@ -147,7 +147,7 @@ fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> 
         .map(|(_, new)| *new)
         .find(has);
     if let Some(new) = renamed {
-        return format!("unknown key; it is called `{new}`");
+        return format!("unknown key; its name is `{new}`");
     }
     let near = known
         .clone()
@@ -176,7 +176,7 @@ fn any_of(schema: &Value) -> Option<&Vec<Value>> {
     schema.get("anyOf").and_then(Value::as_array)
 }
 
-/// The JSON type names a schema allows.
+/// JSON types that a schema allows.
 fn kinds(schema: &Value) -> Vec<&str> {
     match schema.get("type") {
         Some(Value::String(kind)) => vec![kind.as_str()],
@@ -200,7 +200,7 @@ fn allows(schema: &Value, node: &Node) -> bool {
     }
 }
 
-/// The allowed kinds in words; leaving a section empty goes without saying.
+/// Names of the allowed kinds. Empty sections are always allowed and not listed.
 fn expected(schema: &Value) -> Vec<&'static str> {
     let words = |kind: &&str| match *kind {
         "array" => Some("a list"),
@@ -214,7 +214,7 @@ fn expected(schema: &Value) -> Vec<&'static str> {
     kinds(schema).iter().filter_map(words).collect()
 }
 
-/// The words of an enumeration.
+/// Values of an enumeration.
 fn words(schema: &Value) -> impl Iterator<Item = &str> {
     let listed = schema
         .get("enum")
@@ -231,7 +231,7 @@ fn words(schema: &Value) -> impl Iterator<Item = &str> {
         .filter_map(Value::as_str)
 }
 
-/// Edits from one word to the other; the same letters in another order are one.
+/// Edit distance of two words; words with the same letters in another order have distance one.
 fn distance(one: &str, other: &str) -> usize {
     if one != other && sorted(one) == sorted(other) {
         return 1;

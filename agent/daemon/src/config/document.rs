@@ -1,7 +1,7 @@
-//! The YAML text as a tree in which every key and value knows its place.
+//! YAML text as a tree with the position of every key and value.
 //!
-//! Bounded on purpose: one document, no aliases (and so no alias bombs), limited depth and size.
-//! It knows nothing of what the keys mean.
+//! Deliberately bounded: one document, no aliases (hence no alias bombs), limited depth and size.
+//! This module does not interpret keys.
 
 use std::collections::BTreeMap;
 
@@ -9,12 +9,12 @@ use saphyr_parser::{Event, Marker, Parser, ScalarStyle};
 
 use super::mistake::{Mistakes, Position};
 
-/// Deeper than any sensible configuration.
+/// Deepest nesting; no sensible configuration exceeds it.
 const MAX_DEPTH: usize = 16;
-/// More values than a watchlist of thousands needs.
+/// Most values; enough for a watchlist of thousands.
 const MAX_VALUES: usize = 50_000;
 
-/// A value and where it begins.
+/// A value and the position of its first character.
 #[derive(Debug)]
 pub(super) struct Node {
     pub(super) position: Position,
@@ -34,7 +34,7 @@ pub(super) struct Key {
     pub(super) position: Position,
 }
 
-/// What a plain scalar means in the YAML 1.2 core schema.
+/// A plain scalar in the YAML 1.2 core schema.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Scalar {
     Null,
@@ -44,14 +44,14 @@ pub(super) enum Scalar {
     Text,
 }
 
-/// A container that is still open.
+/// An open container.
 enum Open {
     List(Position, Vec<Node>),
     Map(Position, Vec<(Key, Node)>, Option<Key>),
 }
 
 impl Node {
-    /// Reads the one document in `source`.
+    /// Parses the single document in `source`.
     pub(super) fn parse(source: &str) -> Result<Self, Mistakes> {
         let mut mistakes = Mistakes::default();
         let mut open: Vec<Open> = Vec::new();
@@ -94,15 +94,11 @@ impl Node {
                 }
                 Event::SequenceEnd | Event::MappingEnd => open.pop().map(Open::close),
                 Event::Alias(_) => {
-                    mistakes.add(
-                        at,
-                        "",
-                        "aliases are not supported here: write the value out",
-                    );
+                    mistakes.add(at, "", "aliases are not supported: repeat the value");
                     break;
                 }
                 Event::DocumentStart(_) if root.is_some() => {
-                    mistakes.add(at, "", "only one document is read");
+                    mistakes.add(at, "", "the file has several documents: keep one");
                     break;
                 }
                 _ => None,
@@ -126,7 +122,8 @@ impl Node {
     /// Puts a complete value into the innermost open container.
     ///
     /// # Errors
-    /// Returns its position if it is the key of a map and no scalar.
+    ///
+    /// Returns the value's position if it is a map's key and not a scalar.
     fn put(self, open: &mut [Open], root: &mut Option<Self>) -> Result<(), Position> {
         match open.last_mut() {
             None => *root = Some(self),
@@ -146,12 +143,12 @@ impl Node {
         Ok(())
     }
 
-    /// Nothing but comments.
+    /// Returns whether the document consists of comments alone.
     pub(super) fn is_empty(&self) -> bool {
         self.scalar() == Some(Scalar::Null)
     }
 
-    /// Where each value stands, by its key path; and keys that are written twice.
+    /// Position of each value by its key path. Reports duplicate keys.
     pub(super) fn index(&self, mistakes: &mut Mistakes) -> BTreeMap<String, Position> {
         let mut places = BTreeMap::new();
         self.index_into("", &mut places, mistakes);
@@ -186,7 +183,7 @@ impl Node {
         }
     }
 
-    /// The whole number that the file names as its version, and where.
+    /// Version of the file as a whole number, with its position.
     pub(super) fn version(&self) -> Option<(i128, Position)> {
         let Content::Map(entries) = &self.content else {
             return None;
@@ -198,7 +195,7 @@ impl Node {
         }
     }
 
-    /// What a scalar stands for; `None` for lists and maps.
+    /// Meaning of a scalar. `None` for lists and maps.
     pub(super) fn scalar(&self) -> Option<Scalar> {
         let Content::Scalar { text, plain } = &self.content else {
             return None;
@@ -214,7 +211,7 @@ impl Node {
             ".nan" | ".NaN" | ".NAN" => Scalar::Number(f64::NAN),
             text => match (integer(text), text.parse::<f64>()) {
                 (Some(value), _) => Scalar::Integer(value),
-                // Rust also reads `inf` and `nan`, which YAML takes for text.
+                // Rust also parses `inf` and `nan`, which are text in YAML.
                 (None, Ok(value)) if text.contains(|c: char| c.is_ascii_digit()) => {
                     Scalar::Number(value)
                 }
@@ -223,7 +220,7 @@ impl Node {
         })
     }
 
-    /// The value as a message shows it.
+    /// The value as messages show it.
     pub(super) fn describe(&self) -> String {
         let shown = |text: &str| -> String {
             let mut shown: String = text.chars().take(40).collect();
@@ -252,7 +249,8 @@ impl Open {
                 content: Content::List(items),
             },
             Self::Map(position, entries, _) => {
-                // The parser sees a block mapping only at its first colon; it begins at its key.
+                // The parser reports a block mapping at its first colon; it begins at its first
+                // key.
                 let first = entries.first().map_or(position, |(key, _)| key.position);
                 Node {
                     position: position.min(first),
@@ -263,7 +261,7 @@ impl Open {
     }
 }
 
-/// `path.key`.
+/// Path of a key: `path.key`.
 pub(super) fn key_path(path: &str, key: &str) -> String {
     if path.is_empty() {
         key.to_owned()
@@ -272,7 +270,7 @@ pub(super) fn key_path(path: &str, key: &str) -> String {
     }
 }
 
-/// `path[index]`.
+/// Path of a list item: `path[index]`.
 pub(super) fn item_path(path: &str, index: usize) -> String {
     format!("{path}[{index}]")
 }

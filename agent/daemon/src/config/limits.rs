@@ -1,4 +1,4 @@
-//! The section `limits`: its keys, its schema and its table, all from the list of caps.
+//! The section `limits`: its keys, its schema and its table, generated from the list of caps.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;

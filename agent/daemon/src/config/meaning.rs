@@ -1,4 +1,4 @@
-//! From shape to meaning: what the types and ranges of the shape cannot say.
+//! Converts the shape into its meaning, and checks conditions that types and ranges cannot express.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
@@ -23,10 +23,10 @@ use super::{
     StateChoice,
 };
 
-/// Each keeps memory and a thread.
+/// Most configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
 
-/// The whole way from bytes to a configuration.
+/// Parses and checks a configuration.
 pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
     let mut mistakes = Mistakes::default();
     let source = match std::str::from_utf8(bytes) {
@@ -54,12 +54,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
     read(source, &document)
 }
 
-/// What reads each version of the file, the oldest first.
+/// Readers of each version of the file, the oldest first.
 const READERS: &[(u32, Read)] = &[(1, read_1)];
 type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
 
-/// What reads the version that the file names; the first if it names none. For a newer
-/// version this is the only mistake: the meaning of its other keys is unknown here.
+/// Reader for the version of the file, which defaults to the first. A newer version is the only
+/// mistake reported, since the meaning of its other keys is unknown.
 fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
     let newest = READERS.last().map_or(0, |(version, _)| *version);
     let Some((version, position)) = document.version() else {
@@ -83,7 +83,7 @@ fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
     known.map(|(_, read)| *read)
 }
 
-/// Version 1.
+/// Reads version 1.
 fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
     let mut mistakes = Mistakes::default();
     let schema = Config::schema();
@@ -99,7 +99,7 @@ fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
             let config = reader.config(shape);
             reader.mistakes.none_or(config)
         }
-        // The two YAML readers disagree: rare, and still said with its place.
+        // The two YAML readers disagree: rare, and still reported with a position.
         Err(error) => {
             let place = error.location().map(|at| Position {
                 line: at.line(),
@@ -113,7 +113,7 @@ fn read_1(source: &str, document: &Node) -> Result<Config, Mistakes> {
     }
 }
 
-/// Where values stand, and what was found wrong with them.
+/// Positions of values, and mistakes found.
 struct Reader {
     places: BTreeMap<String, Position>,
     mistakes: Mistakes,
@@ -155,10 +155,16 @@ impl Reader {
         for (index, shape) in shapes.into_iter().enumerate() {
             let key = format!("recordings.snapshots[{index}]");
             if snapshots.iter().any(|other| other.name == shape.name) {
-                self.wrong(&format!("{key}.name"), "is another snapshot's already");
+                self.wrong(
+                    &format!("{key}.name"),
+                    "is already the name of another snapshot",
+                );
             }
             if shape.topics.is_empty() {
-                self.wrong(&format!("{key}.topics"), "names no topic");
+                self.wrong(
+                    &format!("{key}.topics"),
+                    "is empty: list at least one topic",
+                );
             }
             snapshots.push(SnapshotSettings {
                 name: shape.name,
@@ -243,19 +249,19 @@ impl Reader {
         }
     }
 
-    /// Who can reach an address beyond this host has to prove that he may change what is watched.
+    /// An address beyond this host requires a token, because clients can change watches.
     fn api(&mut self, shape: ApiShape) -> ApiSettings {
         let listen: Option<SocketAddr> = shape.listen.parse().ok();
         let open = listen.filter(|address| !address.ip().is_loopback());
         if let (Some(address), None) = (open, &shape.token_file) {
             let message = format!(
-                "is {address}, which others can reach: that needs `token_file` too, or use \
+                "is {address}, which other hosts can reach: set `token_file`, or use \
                  127.0.0.1"
             );
             self.wrong("api.listen", message);
         }
         ApiSettings {
-            // Text that is no address is `off`: everything else was refused before.
+            // Text other than an address is `off`; the check of texts has refused the rest.
             listen,
             socket: match shape.socket.as_str() {
                 "auto" => SocketChoice::Auto,
@@ -292,7 +298,7 @@ impl Reader {
         settings
     }
 
-    /// Keys that have a meaning for one source alone.
+    /// Reports keys that do not apply to the selected source.
     fn check_source(&mut self, settings: &CaptureSettings) {
         let set = |keys: [(&'static str, bool); 2]| {
             let set = keys.into_iter().filter(|(_, set)| *set);
@@ -315,12 +321,12 @@ impl Reader {
         for key in &of_wire {
             let message = match (settings.source, of_host.first()) {
                 (SourceChoice::Host, _) => {
-                    "selects frames on a wire, which `source: host` does not look at; use \
+                    "selects interfaces, which `source: host` does not capture; use \
                      mirror_interfaces or `source: wire`"
                         .to_owned()
                 }
                 (SourceChoice::Auto, Some(other)) => {
-                    format!("makes the wire the source, for which {other} has no meaning")
+                    format!("selects `source: wire`, to which {other} does not apply")
                 }
                 _ => continue,
             };
@@ -328,14 +334,14 @@ impl Reader {
         }
         if settings.source == SourceChoice::Wire {
             for key in of_host {
-                let message = "has no meaning for `source: wire`";
+                let message = "does not apply to `source: wire`";
                 self.wrong(&format!("capture.{key}"), message);
             }
         }
     }
 }
 
-/// What text at this key must be, where any text will not do.
+/// Checks the text at a key with restricted values.
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
     match without_indices(key).as_str() {
         "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => {
@@ -399,13 +405,13 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
     }
 }
 
-/// What a file may be called anywhere.
+/// Returns whether the name is a valid file name on every system.
 fn is_plain(name: &str) -> bool {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-');
     (1..=64).contains(&name.len()) && name.chars().all(plain)
 }
 
-/// `watch[2].topic` as `watch[].topic`.
+/// Replaces indices: `watch[2].topic` becomes `watch[].topic`.
 fn without_indices(key: &str) -> String {
     let mut inside = false;
     let mut shown = |c: char| {
@@ -426,7 +432,7 @@ fn state(text: &str) -> StateChoice {
 
 fn metrics(shape: MetricsShape) -> MetricsSettings {
     MetricsSettings {
-        // Text that is no address is `off`: everything else was refused before.
+        // Text other than an address is `off`; the check of texts has refused the rest.
         listen: shape.listen.parse().ok(),
         histograms: shape.histograms,
         per_writer: shape.per_writer,

@@ -1,15 +1,15 @@
-//! What is wrong with a configuration, and exactly where.
+//! Mistakes in a configuration, with their positions.
 
 use std::fmt;
 
 use crate::escape::visible;
 
-/// A place in the file, both counted from one.
+/// Position in the file, counted from one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Position {
-    /// Line.
+    /// Line number.
     pub line: usize,
-    /// Column, in characters.
+    /// Column in characters.
     pub column: usize,
 }
 
@@ -22,11 +22,11 @@ impl fmt::Display for Position {
 /// One mistake.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Mistake {
-    /// Where.
+    /// Position of the mistake.
     pub position: Position,
     /// The key with its parents, `watch[2].min_rate_hz`; empty for the document itself.
     pub key: String,
-    /// What is wrong and what would be right.
+    /// The mistake, and the accepted values.
     pub message: String,
 }
 
@@ -46,10 +46,10 @@ impl fmt::Display for Mistake {
 pub struct Mistakes(Vec<Mistake>);
 
 impl Mistakes {
-    /// More than these do not help anybody.
+    /// Most mistakes printed.
     const SHOWN: usize = 50;
 
-    /// Adds one.
+    /// Adds a mistake.
     pub fn add(&mut self, position: Position, key: &str, message: impl Into<String>) {
         self.0.push(Mistake {
             position,
@@ -58,10 +58,11 @@ impl Mistakes {
         });
     }
 
-    /// `value` if nothing is wrong, all mistakes in file order otherwise.
+    /// Returns `value` if there are no mistakes.
     ///
     /// # Errors
-    /// When there is at least one mistake.
+    ///
+    /// Returns all mistakes in file order.
     pub fn none_or<T>(mut self, value: T) -> Result<T, Self> {
         if self.0.is_empty() {
             return Ok(value);
@@ -71,18 +72,18 @@ impl Mistakes {
         Err(self)
     }
 
-    /// Nothing wrong so far.
+    /// Returns whether there are no mistakes.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Each mistake.
+    /// All mistakes.
     pub fn iter(&self) -> impl Iterator<Item = &Mistake> {
         self.0.iter()
     }
 
-    /// One line each, as compilers write them: `file:line:column: key: message`.
+    /// One line per mistake in the format of compilers: `file:line:column: key: message`.
     #[must_use]
     pub fn report(&self, file: &str) -> String {
         let mut lines: Vec<String> = self

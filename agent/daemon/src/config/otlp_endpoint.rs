@@ -2,10 +2,11 @@
 
 use tonic::codegen::http::Uri;
 
-/// Where receivers listen.
+/// Default port of receivers.
 const PORT: u16 = 4317;
 
-/// An URL as gRPC takes it: scheme and authority. What comes after them is OTLP over HTTP's.
+/// Parses a URL for gRPC: scheme and authority. A path after them belongs to OTLP over HTTP and is
+/// dropped.
 #[must_use]
 pub fn otlp_endpoint(text: &str) -> Option<Uri> {
     let uri: Uri = text.parse().ok()?;

@@ -108,7 +108,7 @@ pub(super) struct WatchEntryShape {
 #[schemars(rename = "Retain")]
 #[serde(rename_all = "lowercase")]
 pub(super) enum RetainShape {
-    /// None.
+    /// No message.
     #[default]
     None,
     /// The last message of each transient-local writer.

@@ -1,4 +1,4 @@
-//! What a participant announced when it was asked.
+//! Announcements that a participant repeated on request.
 
 use ros2probe_model::naming::Naming;
 use ros2probe_wire::discovery::Role;
@@ -13,21 +13,21 @@ pub struct Announcements {
     pub writers: Vec<AnnouncedEndpoint>,
     /// Its readers, by GUID.
     pub readers: Vec<AnnouncedEndpoint>,
-    /// Fully qualified names of its nodes; `None` if the list did not come.
+    /// Fully qualified names of its nodes. `None` if the list did not arrive.
     pub nodes: Option<Vec<String>>,
 }
 
 /// A writer or reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct AnnouncedEndpoint {
-    /// ROS name, or the DDS name if it follows no ROS convention.
+    /// ROS name, or the DDS name if it does not follow the ROS convention.
     pub topic: String,
     /// ROS type.
     pub message_type: String,
 }
 
 impl Announcements {
-    /// What the session received so far.
+    /// Announcements received by the session.
     #[must_use]
     pub fn of(session: &Session) -> Self {
         let with = |role| {

@@ -1,4 +1,4 @@
-//! One builtin writer of a participant, and which of its announcements came.
+//! One builtin writer of a participant, with its received and missing announcements.
 
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
@@ -9,19 +9,19 @@ use ros2probe_wire::record::Gap;
 
 use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
 
-/// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
+/// Most announcements of one kind, independent of the range in a HEARTBEAT.
 pub(super) const MOST_ANNOUNCEMENTS: u64 = 4096;
 
-/// A writer of announcements, and what came of it.
+/// A writer of announcements and its state.
 #[derive(Debug)]
 pub(super) struct Announcer {
     pub(super) writer: EntityId,
     pub(super) reader: EntityId,
     pub(super) role: Role,
-    /// First and last number, by HEARTBEAT.
+    /// First and last sequence number in its HEARTBEAT.
     pub(super) available: Option<RangeInclusive<u64>>,
     pub(super) received: BTreeSet<u64>,
-    /// Asked for last.
+    /// Sequence numbers of the last request.
     requested: BTreeSet<u64>,
 }
 
@@ -41,7 +41,7 @@ impl Announcer {
         }
     }
 
-    /// Numbers that are there and have not come, lowest first.
+    /// Available sequence numbers that have not arrived, lowest first.
     pub(super) fn missing(&self) -> impl Iterator<Item = u64> + '_ {
         let (first, last) = match &self.available {
             Some(range) => (*range.start(), *range.end()),
@@ -52,7 +52,7 @@ impl Announcer {
         (first..=last).filter(|number| !self.received.contains(number))
     }
 
-    /// The next numbers to ask for, as many as one request holds.
+    /// Sequence numbers for the next request, as many as one request holds.
     pub(super) fn next_request(&mut self) -> BTreeSet<u64> {
         let first = self.missing().next().unwrap_or(0);
         let wanted: BTreeSet<_> = self
@@ -63,12 +63,12 @@ impl Announcer {
         wanted
     }
 
-    /// Whether all that was asked for has come.
+    /// Returns whether all requested samples have arrived.
     pub(super) fn is_answered(&self) -> bool {
         self.requested.is_subset(&self.received)
     }
 
-    /// A GAP: these will never come.
+    /// Handles a GAP: these samples will never arrive.
     pub(super) fn skip(&mut self, gap: Gap<'_>) {
         let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
         let listed: BTreeSet<u64> = list.iter().collect();

@@ -1,7 +1,7 @@
 //! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
 //!
-//! The only encoder in the product. It can announce a bare participant, one reader of
-//! `ros_discovery_info`, ask for samples, and say goodbye; nothing else, and only in its own name.
+//! The only encoder in the product. It announces a bare participant and one reader of
+//! `ros_discovery_info`, requests samples, and says goodbye. All messages carry its own identity.
 
 use std::net::SocketAddrV4;
 
@@ -10,9 +10,9 @@ use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::rtps::{LocatorKind, SubmessageFlags, SubmessageId, VendorId};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
-/// Believed to be unassigned; both vendors take it for a stranger's and use no extensions.
+/// Vendor id, believed to be unassigned. Both vendors treat it as foreign and use no extensions.
 pub const VENDOR: VendorId = VendorId([0x01, 0x7f]);
-/// The reader of `ros_discovery_info`: a user's, without key.
+/// Entity id of the reader of `ros_discovery_info`: user-defined, without key.
 pub const NODES_READER: EntityId = EntityId([0x00, 0x00, 0x0a, 0x04]);
 /// Reader of SEDP publication announcements.
 pub const PUBLICATIONS_READER: EntityId = EntityId([0x00, 0x00, 0x03, 0xc7]);
@@ -20,28 +20,28 @@ pub const PUBLICATIONS_READER: EntityId = EntityId([0x00, 0x00, 0x03, 0xc7]);
 pub const SUBSCRIPTIONS_READER: EntityId = EntityId([0x00, 0x00, 0x04, 0xc7]);
 const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
 
-/// Where the discovery of every domain meets (RTPS 2.5, 9.6.1.4).
+/// Multicast address of discovery in all domains (RTPS 2.5, 9.6.1.4).
 const MULTICAST: [u8; 4] = [239, 255, 0, 1];
-/// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS takes a
-/// goodbye only from participants that have the first.
+/// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS accepts a
+/// goodbye only from participants with the first.
 const BUILTIN_ENDPOINTS: u32 = 0x39;
-/// Should the goodbye be lost.
+/// Lease of the participant, for the case that the goodbye is lost.
 const LEASE_SECONDS: u32 = 3;
-/// Numbers that one ACKNACK can ask for (RTPS 2.5, 9.4.2.6).
+/// Most sequence numbers in one ACKNACK (RTPS 2.5, 9.4.2.6).
 pub const MOST_NUMBERS: u64 = 256;
 
-/// No flag besides E.
+/// Only flag E.
 const NONE: SubmessageFlags = SubmessageFlags(0);
 const PL_CDR_LE: [u8; 4] = [0x00, 0x03, 0x00, 0x00];
-/// Disposed and unregistered; STATUS_INFO is big-endian always (RTPS 2.5, 9.6.4.9).
+/// Disposed and unregistered; STATUS_INFO is always big-endian (RTPS 2.5, 9.6.4.9).
 const GONE: [u8; 4] = [0, 0, 0, 3];
 
-/// The participant that sends.
+/// The participant of this process.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LocalParticipant {
     /// Its GUID prefix.
     pub prefix: GuidPrefix,
-    /// Its one socket.
+    /// Address of its only socket.
     pub address: SocketAddrV4,
     /// Its domain.
     pub domain_id: u16,
@@ -52,21 +52,22 @@ pub struct LocalParticipant {
 pub struct Message(Vec<u8>);
 
 impl Message {
-    /// From the local participant to this participant alone.
+    /// Begins a message from the local participant to one participant.
     #[must_use]
     pub fn new(local: LocalParticipant, target: GuidPrefix) -> Self {
         let header = [&b"RTPS\x02\x03"[..], &VENDOR.0, &local.prefix.0];
         Self(header.concat()).submessage(SubmessageId::INFO_DST, NONE, &[&target.0])
     }
 
-    /// SPDP: here I am. Without user data it is no ROS participant, so that no node list and no
-    /// graph shows it. Cyclone DDS forgets the address after the goodbye only if there is a
-    /// multicast locator.
+    /// Adds the SPDP announcement.
+    ///
+    /// Without user data it is not a ROS participant, so no node list or graph shows it. Cyclone
+    /// DDS forgets the address after the goodbye only if there is a multicast locator.
     #[must_use]
     pub fn announce(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
         let unicast = locator(*local.address.ip(), local.address.port());
-        // 7400 + 250 d (RTPS 2.5, 9.6.1.1); beyond domain 232 there are no ports.
+        // 7400 + 250 d (RTPS 2.5, 9.6.1.1); no ports exist beyond domain 232.
         let port = local.domain_id.saturating_mul(250).saturating_add(7400);
         let multicast = locator(MULTICAST.into(), port);
         let payload = Parameters::default()
@@ -88,7 +89,7 @@ impl Message {
         self.data(SPDP_READER, EntityId::SPDP_WRITER, 1, &payload)
     }
 
-    /// SPDP: here I was.
+    /// Adds the SPDP goodbye.
     #[must_use]
     pub fn goodbye(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
@@ -104,7 +105,7 @@ impl Message {
         )
     }
 
-    /// SEDP: I read `ros_discovery_info`, and that is all I have.
+    /// Adds the SEDP announcement of the reader of `ros_discovery_info`, the only endpoint.
     #[must_use]
     pub fn read_nodes(self, local: LocalParticipant) -> Self {
         let own = Guid::new(local.prefix, EntityId::PARTICIPANT);
@@ -136,8 +137,8 @@ impl Message {
         )
     }
 
-    /// ACKNACK: of this writer, everything before `base` is here and these numbers are missing. At
-    /// most [`MOST_NUMBERS`] from `base` on can be asked for; others are left out.
+    /// Adds an ACKNACK: all samples of this writer before `base` are received, and these numbers
+    /// are missing. Numbers beyond [`MOST_NUMBERS`] from `base` are left out.
     #[must_use]
     pub fn acknack(
         self,
@@ -153,8 +154,8 @@ impl Message {
         self.submessage(SubmessageId::ACKNACK, SubmessageFlags::FINAL, &body)
     }
 
-    /// NACK_FRAG: of this sample, these fragments are missing (RTPS 2.5, 9.4.5.14). Asked for a
-    /// sample, Cyclone DDS repeats its first fragment and waits for this.
+    /// Adds a NACK_FRAG: these fragments of this sample are missing (RTPS 2.5, 9.4.5.14). Cyclone
+    /// DDS repeats only the first fragment of a requested sample, and waits for this.
     #[must_use]
     pub fn nack_frag(
         self,
@@ -180,7 +181,7 @@ impl Message {
         self.submessage(SubmessageId::NACK_FRAG, NONE, &body)
     }
 
-    /// As it is sent.
+    /// Bytes of the message.
     #[must_use]
     pub fn bytes(self) -> Vec<u8> {
         self.0
@@ -194,7 +195,7 @@ impl Message {
 
     fn submessage(mut self, id: SubmessageId, flags: SubmessageFlags, body: &[&[u8]]) -> Self {
         let body = body.concat();
-        // Bodies here are some hundred bytes at most.
+        // Bodies here have a few hundred bytes at most.
         let length = u16::try_from(body.len()).unwrap_or(0);
         let flags = flags.with(SubmessageFlags::ENDIANNESS);
         self.0.extend_from_slice(&[id.0, flags.0]);
@@ -204,7 +205,7 @@ impl Message {
     }
 }
 
-/// What begins a DATA submessage (RTPS 2.5, 9.4.5.4).
+/// Fixed first part of a DATA submessage (RTPS 2.5, 9.4.5.4).
 fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8> {
     // extraFlags, octetsToInlineQos.
     let fixed = [0, 0, 16, 0];
@@ -212,7 +213,7 @@ fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8
     [&fixed[..], &reader.0, &writer.0, &number].concat()
 }
 
-/// numBits and bitmap of a set of numbers from `base` on (RTPS 2.5, 9.4.2.6).
+/// numBits and bitmap of a set of sequence numbers from `base` on (RTPS 2.5, 9.4.2.6).
 fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
     let mut words = [0u32; 8];
     let mut bits = 0u32;
@@ -231,7 +232,7 @@ fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
     words.flat_map(|word| word.to_le_bytes()).collect()
 }
 
-/// A sequence number: high word, low word (RTPS 2.5, 9.3.2.5).
+/// Encodes a sequence number: high word, low word (RTPS 2.5, 9.3.2.5).
 fn number(number: u64) -> [u8; 8] {
     number.rotate_left(32).to_le_bytes()
 }
@@ -242,13 +243,13 @@ fn locator(address: std::net::Ipv4Addr, port: u16) -> Vec<u8> {
     [&kind[..], &port, &[0; 12], &address.octets()].concat()
 }
 
-/// A CDR string.
+/// Encodes a CDR string.
 fn text(text: &[u8]) -> Vec<u8> {
     let length = u32::try_from(text.len() + 1).unwrap_or(0);
     [&length.to_le_bytes()[..], text, &[0]].concat()
 }
 
-/// A parameter list (RTPS 2.5, 9.4.2.11).
+/// Parameter list (RTPS 2.5, 9.4.2.11).
 #[derive(Default)]
 struct Parameters(Vec<u8>);
 
@@ -410,7 +411,7 @@ mod tests {
         let bytes = message()
             .nack_frag(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
             .bytes();
-        // Behind the header and INFO_DST (RTPS 2.5, 9.4.5.14).
+        // After the header and INFO_DST (RTPS 2.5, 9.4.5.14).
         let nack_frag = [
             &[0x12, 0x01, 32, 0][..],
             &NODES_READER.0,

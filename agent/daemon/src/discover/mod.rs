@@ -1,9 +1,10 @@
-//! `rp discover`: asks running participants to repeat what they announced once.
+//! `rp discover`: requests that running participants repeat their announcements.
 //!
-//! The only thing in the product that sends, and only when somebody asks for it: a bare participant
-//! of a few milliseconds introduces itself to one running participant at a time, by unicast, asks
-//! for its announcements, and says goodbye. At most [`session::MOST_PACKETS`] packets each; nobody
-//! else hears of it, it has no user endpoint, and nothing of it stays.
+//! This is the only part of the product that sends, and it runs only on request. A bare participant
+//! exists for a few milliseconds. It announces itself by unicast to one running participant at a
+//! time, requests its announcements, and says goodbye. A conversation has at most
+//! [`session::MOST_PACKETS`] packets. No other participant receives them; no user endpoint is
+//! created, and no trace remains.
 
 pub mod announcements;
 mod announcer;
@@ -23,53 +24,54 @@ use self::message::{LocalParticipant, VENDOR};
 use self::session::{Outgoing, Session, Target};
 use ros2probe_model::snapshot::ParticipantFacts;
 
-/// How often the session advances while nothing comes.
+/// Interval at which the session advances without input.
 const SLICE: Duration = Duration::from_millis(5);
-/// After the goodbye, what is still under way is let in: a closed port would make the kernel answer.
+/// Wait after the goodbye for packets in flight; a closed port would make the kernel answer them.
 const LINGER: Duration = Duration::from_millis(50);
-/// Largest UDP payload.
+/// Largest UDP payload in bytes.
 const DATAGRAM: usize = 65_507;
 
-/// Why a participant is not asked.
+/// Reason why a participant receives no request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refusal {
-    /// It would not talk to a stranger, and its secrets are not ours to ask for.
+    /// DDS security is enabled: it ignores unauthenticated participants.
     Secured,
     /// It announces no IPv4 address for discovery.
     NoAddress,
-    /// Another one that asks.
+    /// It is another running `rp discover`.
     Asking,
 }
 
-/// Why asking failed.
+/// A request failed.
 #[derive(Debug, thiserror::Error)]
 pub enum DiscoverError {
-    /// No socket.
-    #[error("cannot open a socket towards {target}")]
+    /// The socket cannot be opened.
+    #[error("cannot open a socket for {target}")]
     Open {
-        /// Where to.
+        /// Address of the participant.
         target: SocketAddrV4,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// No identity.
+    /// No random numbers for a GUID prefix are available.
     #[error("cannot read random numbers")]
     Random(#[source] io::Error),
-    /// The network refuses.
-    #[error("cannot talk to {target}")]
+    /// A packet cannot be sent or received.
+    #[error("cannot exchange packets with {target}")]
     Talk {
-        /// Whom.
+        /// Address of the participant.
         target: SocketAddrV4,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
 }
 
 impl Target {
-    /// This participant, if it can and may be asked.
+    /// Target for a participant.
     ///
     /// # Errors
-    /// Why not.
+    ///
+    /// Returns the reason why the participant receives no request.
     pub fn of(participant: &ParticipantFacts) -> Result<Self, Refusal> {
         if participant.secured {
             return Err(Refusal::Secured);
@@ -80,7 +82,7 @@ impl Target {
         let addresses = &participant.addresses;
         let metatraffic = reachable(&addresses.metatraffic).ok_or(Refusal::NoAddress)?;
         let default = &addresses.default;
-        // Of several, the one on the same interface as the other.
+        // Among several addresses, prefers one on the same interface as the other address.
         let same = default.iter().filter(|it| it.ip() == *metatraffic.ip());
         let same: Vec<SocketAddr> = same.copied().collect();
         let default = reachable(&same).or_else(|| reachable(default));
@@ -93,21 +95,23 @@ impl Target {
 }
 
 impl Refusal {
-    /// In words.
+    /// Text of the reason.
     #[must_use]
     pub const fn reason(self) -> &'static str {
         match self {
-            Self::Secured => "announces security: not asked",
+            Self::Secured => "uses DDS security: receives no requests",
             Self::NoAddress => "announces no IPv4 address for discovery",
             Self::Asking => "is another rp discover",
         }
     }
 }
 
-/// Who speaks to this target: a new identity, at the address that leads there. Nothing is sent.
+/// Creates a participant with a new identity, and its socket on the route to the target. Sends
+/// nothing.
 ///
 /// # Errors
-/// No socket or no random numbers.
+///
+/// The socket cannot be opened, or random numbers are unavailable.
 pub fn local_participant(
     target: &Target,
     domain_id: u32,
@@ -138,13 +142,14 @@ pub fn local_participant(
     Ok((local, socket))
 }
 
-/// Holds the conversation, goodbye included; how long it took.
+/// Runs the session up to its goodbye. Returns the duration.
 ///
 /// # Errors
-/// When the network refuses; then, too, goodbye was tried.
+///
+/// The network fails; a goodbye is attempted nevertheless.
 pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, DiscoverError> {
     let began = Instant::now();
-    // The session's time begins with 1: 0 is before everything.
+    // The session's time begins at 1, since 0 precedes all events.
     let now = || {
         let elapsed = u64::try_from(began.elapsed().as_nanos()).unwrap_or(u64::MAX);
         Timestamp(elapsed.saturating_add(1))
@@ -167,7 +172,7 @@ pub fn converse(session: &mut Session, socket: &UdpSocket) -> Result<Duration, D
     Ok(took)
 }
 
-/// Waits a moment for a datagram.
+/// Waits briefly for a datagram.
 fn listen(
     session: &mut Session,
     socket: &UdpSocket,
@@ -176,7 +181,8 @@ fn listen(
 ) -> Result<(), DiscoverError> {
     match socket.recv_from(buffer) {
         Ok((length, _)) => session.datagram(now(), buffer.get(..length).unwrap_or_default()),
-        // Refused: an earlier packet met a closed port. The session notices by itself.
+        // Connection refused: an earlier packet reached a closed port. The session handles the
+        // silence.
         Err(error) if is_passing(&error) => {}
         Err(source) => {
             let target = session.target().metatraffic;
@@ -205,8 +211,8 @@ fn send(socket: &UdpSocket, outgoing: &[Outgoing]) -> Result<(), DiscoverError> 
     Ok(())
 }
 
-/// The first IPv4 address that a route leads to; a loopback address only if there is no other, for
-/// RustDDS announces its own to everybody.
+/// First IPv4 address with a route. A loopback address only if there is no other, because RustDDS
+/// announces its own to all hosts.
 fn reachable(addresses: &[SocketAddr]) -> Option<SocketAddrV4> {
     let mut candidates: Vec<SocketAddrV4> = addresses
         .iter()
@@ -223,7 +229,7 @@ fn reachable(addresses: &[SocketAddr]) -> Option<SocketAddrV4> {
         .find(|address| leaving(*address).is_ok())
 }
 
-/// By which of our addresses a packet for there would leave. Connecting a UDP socket sends nothing.
+/// Local address of packets to the target. Connecting a UDP socket sends nothing.
 fn leaving(target: SocketAddrV4) -> io::Result<Ipv4Addr> {
     let probe = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
     probe.connect(target)?;

@@ -1,4 +1,4 @@
-//! Participants that announce themselves, found by listening as the agent does. Nothing is sent.
+//! Finds participants by their periodic announcements, with the agent's capture. Nothing is sent.
 
 use std::time::{Duration, Instant};
 
@@ -19,16 +19,16 @@ use crate::privilege;
 /// The polling period while listening.
 const POLL_INTERVAL: Duration = Duration::from_millis(250);
 
-/// Where and for how long to listen, and for which participants.
+/// Sources, duration and filter of listening.
 #[derive(Clone, Debug)]
 pub struct Listening {
-    /// The wire of this interface instead of the configured sources.
+    /// Interface to capture instead of the configured sources.
     pub interface: Option<String>,
-    /// The domain; `None` = any.
+    /// Domain; `None` for any.
     pub domain_id: Option<u32>,
-    /// The participant, whose first announcement ends the listening; `None` = any.
+    /// Participant whose first announcement ends the listening; `None` for any.
     pub participant: Option<GuidPrefix>,
-    /// How long to listen.
+    /// Duration of listening.
     pub time: Duration,
 }
 
@@ -37,25 +37,26 @@ pub struct Listening {
 pub struct HeardParticipant {
     /// The participant's GUID prefix.
     pub prefix: GuidPrefix,
-    /// Domain.
+    /// Domain of the participant.
     pub domain_id: u32,
-    /// Implementation of DDS.
+    /// DDS implementation.
     pub vendor: String,
-    /// Name of its process, if it is known.
+    /// Name of its process, if known.
     pub process: Option<String>,
-    /// Id of its process, if it is known.
+    /// Id of its process, if known.
     pub process_id: Option<u32>,
-    /// Host, if it is known.
+    /// Host, if known.
     pub host: Option<String>,
-    /// How to ask it, or why it is not asked.
+    /// Target of requests, or the reason why it receives none.
     pub target: Result<Target, Refusal>,
 }
 
-/// Opens the configured sources, gives up the privileges of this thread, and listens.
+/// Opens the configured sources, drops the privileges of this thread, and listens.
 ///
 /// # Errors
-/// Returns [`privilege::Missing`] if a capability is missing, or why a source cannot be opened or
-/// read.
+///
+/// Returns [`privilege::Missing`] if a capability is missing, or the error of a source that cannot
+/// be opened or read.
 pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<HeardParticipant>> {
     let capture = capture(configured, listening.interface.as_deref());
     privilege::check(&capture)?;
@@ -82,8 +83,8 @@ pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<
     }
 }
 
-/// Reads a GUID prefix of 24 hexadecimal digits. The `participant` label of metrics adds the entity
-/// id of a participant, which may stay.
+/// Parses a GUID prefix of 24 hexadecimal digits. The entity id that the `participant` label of
+/// metrics appends is accepted.
 #[must_use]
 pub fn prefix(text: &str) -> Option<GuidPrefix> {
     let text = text.strip_suffix(".000001c1").unwrap_or(text);
@@ -108,7 +109,7 @@ impl HeardParticipant {
     }
 }
 
-/// The configured capture, or the wire of one interface.
+/// Configured capture, or the capture of one interface.
 fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
     // Participants announce themselves on the network.
     configured.shm.mode = ShmMode::Off;

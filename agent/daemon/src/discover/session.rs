@@ -1,9 +1,9 @@
-//! One conversation with one participant: introduce, ask, say goodbye. A plain state machine: time
-//! and datagrams in, datagrams out; no socket, no clock.
+//! One conversation with one participant: announcement, requests, goodbye.
 //!
-//! Whatever the other side does, at most [`MOST_PACKETS`] packets are sent and the last one is the
-//! goodbye. HEARTBEATs are never answered one by one: Fast DDS sends several while it repeats
-//! itself, and each answer would make it begin anew.
+//! A state machine without socket and clock: time and datagrams in, datagrams out. It sends at most
+//! [`MOST_PACKETS`] packets whatever the participant does, and the last one is the goodbye.
+//! HEARTBEATs are not answered individually: Fast DDS sends several while it repeats itself, and
+//! restarts after each answer.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddrV4;
@@ -24,54 +24,54 @@ use super::message::{
 };
 use ros2probe_model::discovery_fragments::DiscoveryFragments;
 
-/// Packets sent to one participant, goodbye included.
+/// Most packets sent to one participant, including the goodbye.
 pub const MOST_PACKETS: u32 = 6;
 
-/// Both announce themselves within 2 ms; when nothing comes for this long, the introduction is
-/// repeated once.
+/// Silence after which the announcement is repeated once, in nanoseconds. Both vendors announce
+/// themselves within 2 ms.
 const SILENCE: u64 = 500 * MILLISECOND;
-/// Between the first HEARTBEAT and asking, for the second one.
+/// Time from the first HEARTBEAT to the request, for the second one to arrive.
 const GATHER: u64 = 20 * MILLISECOND;
-/// What was asked for comes within this, or it is asked for again.
+/// Longest wait for requested samples before another request.
 const TIMEOUT: u64 = 300 * MILLISECOND;
-/// How long the node list may take after everything else.
+/// Longest wait for the node list after everything else.
 const NODES_TIMEOUT: u64 = 500 * MILLISECOND;
-/// The whole conversation.
+/// Longest conversation.
 const LIMIT: u64 = 3_000 * MILLISECOND;
-/// Samples waited for that come in fragments.
+/// Most fragmented samples in assembly.
 const MOST_PARTIAL: usize = 8;
-/// User writers whose HEARTBEAT is remembered until it is known which one tells of nodes.
+/// Most user writers whose HEARTBEAT is kept until the writer of the node list is known.
 const MOST_WRITERS: usize = 256;
 const NODES_TOPIC: &str = "ros_discovery_info";
 
-/// Whom to ask, and where it is reached.
+/// Participant that receives requests, and its addresses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Target {
-    /// Its GUID prefix.
+    /// GUID prefix of the participant.
     pub prefix: GuidPrefix,
-    /// Where its discovery endpoints are.
+    /// Address of its discovery endpoints.
     pub metatraffic: SocketAddrV4,
-    /// Where its other endpoints are.
+    /// Address of its other endpoints.
     pub default: SocketAddrV4,
 }
 
 /// A datagram to send.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Outgoing {
-    /// Where to.
+    /// Destination address.
     pub to: SocketAddrV4,
-    /// What it is for, for people.
+    /// Purpose, for people.
     pub what: &'static str,
-    /// The datagram.
+    /// Bytes of the datagram.
     pub bytes: Vec<u8>,
 }
 
-/// Packets and their bytes (UDP payload).
+/// Number of packets, and bytes of their UDP payload.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traffic {
-    /// Packets.
+    /// Number of packets.
     pub packets: u32,
-    /// Bytes.
+    /// Bytes of UDP payload.
     pub bytes: u64,
 }
 
@@ -85,16 +85,16 @@ pub struct Session {
     announced: Timestamp,
     publications: Announcer,
     subscriptions: Announcer,
-    /// When the first HEARTBEAT of either came.
+    /// Time of the first HEARTBEAT of either writer.
     heard: Option<Timestamp>,
-    /// When something was last asked for, and how often.
+    /// Time of the last request, and number of requests.
     asked: Option<Timestamp>,
     requests: u32,
     discovery_fragments: DiscoveryFragments,
-    /// Samples of which some fragments have come, and when the last one did.
+    /// Incomplete samples, each with the time of its last fragment.
     partial: BTreeMap<(EntityId, u64), Timestamp>,
     endpoints: BTreeMap<Guid, EndpointAnnouncement>,
-    /// First and last number of user writers, by HEARTBEAT.
+    /// First and last sequence number of user writers, from their HEARTBEATs.
     user_writers: BTreeMap<EntityId, RangeInclusive<u64>>,
     nodes: Nodes,
     sent: Traffic,
@@ -104,18 +104,18 @@ pub struct Session {
 
 #[derive(Debug)]
 enum Nodes {
-    /// Not asked for, since when.
+    /// Not requested, since this time.
     Open { since: Option<Timestamp> },
-    /// Asked for.
+    /// Requested at this time.
     Requested(Timestamp),
-    /// This is the list.
+    /// Received.
     Listed(Vec<NodeEntities>),
-    /// It cannot be had.
+    /// Unavailable.
     Missing,
 }
 
 impl Session {
-    /// Ready to speak; [`Self::advance`] begins.
+    /// Creates a session; [`Self::advance`] starts it.
     #[must_use]
     pub fn new(local: LocalParticipant, target: Target, wants_nodes: bool) -> Self {
         Self {
@@ -140,7 +140,7 @@ impl Session {
         }
     }
 
-    /// The packets that are sent when all goes well, the requests as large as they can be.
+    /// Packets of a conversation without losses, with requests of maximal size.
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
         let full = || (1, 1..=MOST_NUMBERS);
@@ -157,7 +157,7 @@ impl Session {
         plan
     }
 
-    /// Takes in a datagram that came to the local participant's socket.
+    /// Processes a datagram received at the local participant's socket.
     pub fn datagram(&mut self, now: Timestamp, bytes: &[u8]) {
         self.received.add(bytes.len());
         let vendor = bytes.get(6..8).and_then(|vendor| vendor.try_into().ok());
@@ -173,7 +173,7 @@ impl Session {
         });
     }
 
-    /// Says what time it is; what is to be sent now.
+    /// Advances the time. Returns the datagrams to send now.
     pub fn advance(&mut self, now: Timestamp) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
         if self.over {
@@ -199,7 +199,7 @@ impl Session {
         outgoing
     }
 
-    /// Says goodbye now, if that was not done.
+    /// Returns the goodbye, if it has not been sent.
     pub fn say_goodbye(&mut self) -> Vec<Outgoing> {
         let mut outgoing = Vec::new();
         if !self.over && self.sent.packets > 0 {
@@ -208,25 +208,25 @@ impl Session {
         outgoing
     }
 
-    /// Whom it is with.
+    /// The target of the session.
     #[must_use]
     pub const fn target(&self) -> &Target {
         &self.target
     }
 
-    /// Whether everything was said.
+    /// Returns whether the session has ended.
     #[must_use]
     pub const fn is_over(&self) -> bool {
         self.over
     }
 
-    /// Whether the participant answered at all.
+    /// Returns whether the participant answered at all.
     #[must_use]
     pub const fn was_answered(&self) -> bool {
         self.heard.is_some()
     }
 
-    /// Announcements that did not come although they are there.
+    /// Number of available announcements that did not arrive.
     #[must_use]
     pub fn missing(&self) -> usize {
         let both = [&self.publications, &self.subscriptions];
@@ -235,13 +235,13 @@ impl Session {
             .sum()
     }
 
-    /// The endpoints it has.
+    /// Endpoints of the participant.
     #[must_use]
     pub const fn endpoints(&self) -> &BTreeMap<Guid, EndpointAnnouncement> {
         &self.endpoints
     }
 
-    /// Its nodes; `None` if it did not tell.
+    /// Nodes of the participant. `None` if the list did not arrive.
     #[must_use]
     pub fn nodes(&self) -> Option<&[NodeEntities]> {
         match &self.nodes {
@@ -250,13 +250,13 @@ impl Session {
         }
     }
 
-    /// Whether it tells of nodes, and was asked to.
+    /// Returns whether the participant has a node list and the session requests it.
     #[must_use]
     pub fn expects_nodes(&self) -> bool {
         self.wants_nodes && self.nodes_writer().is_some()
     }
 
-    /// What was sent, and what came.
+    /// Sent traffic, and received traffic.
     #[must_use]
     pub const fn cost(&self) -> (Traffic, Traffic) {
         (self.sent, self.received)
@@ -310,7 +310,7 @@ impl Session {
         }
     }
 
-    /// The payload of a sample that is complete.
+    /// Payload of a complete sample.
     fn complete_payload<'a>(
         &mut self,
         now: Timestamp,
@@ -337,7 +337,7 @@ impl Session {
         Some((SamplePayload::Joined(bytes), qos))
     }
 
-    /// An announcement of an endpoint.
+    /// Processes the announcement of an endpoint.
     fn endpoint_announced(
         &mut self,
         entity: EntityId,
@@ -372,7 +372,7 @@ impl Session {
         }
     }
 
-    /// The writer that tells of nodes, once it is announced.
+    /// Writer of the node list, after its announcement.
     fn nodes_writer(&self) -> Option<EntityId> {
         let mut endpoints = self.endpoints.values();
         let writer = endpoints.find(|endpoint| {
@@ -387,8 +387,8 @@ impl Session {
         self.send(self.to_discovery("introduction", message), outgoing);
     }
 
-    /// Asks for announcements: once both writers have said what there is, again when all that was
-    /// asked for has come and there is more, or when it does not come.
+    /// Requests announcements after both writers have sent a HEARTBEAT. Repeats the request for
+    /// further samples, or after a timeout.
     fn request_announcements(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         let Some(heard) = self.heard else { return };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
@@ -399,7 +399,7 @@ impl Session {
                 came || since(asked, now) >= TIMEOUT
             }
         };
-        // Of the packets left, one is the node request and one the goodbye.
+        // One of the remaining packets is for the node request and one for the goodbye.
         let reserved = 1 + u32::from(self.wants_nodes && matches!(self.nodes, Nodes::Open { .. }));
         if !due || self.missing() == 0 || self.sent.packets + reserved >= MOST_PACKETS {
             return;
@@ -414,7 +414,7 @@ impl Session {
         self.send(self.to_discovery("request", message), outgoing);
     }
 
-    /// Asks for the list of nodes: the last sample of the writer that tells it.
+    /// Requests the node list: the last sample of its writer.
     fn request_nodes(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         if !self.wants_nodes || !matches!(self.nodes, Nodes::Open { .. }) {
             return;
@@ -436,7 +436,7 @@ impl Session {
         self.send(self.to_user("node request", message), outgoing);
     }
 
-    /// Asks for the rest of samples of which fragments came and others did not follow.
+    /// Requests missing fragments of incomplete samples.
     fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         let due = |(_, at): &(&(EntityId, u64), &Timestamp)| since(**at, now) >= GATHER;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
@@ -472,21 +472,21 @@ impl Session {
             };
             self.send(datagram, outgoing);
         }
-        // They have as long as anything that was asked for.
+        // They have the same timeout as other requests.
         let later = Timestamp(now.0.saturating_add(TIMEOUT - GATHER));
         for at in self.partial.values_mut() {
             *at = later;
         }
     }
 
-    /// Whether nothing more is to be had.
+    /// Returns whether all available answers have arrived.
     fn is_complete(&mut self, now: Timestamp) -> bool {
         let Some(heard) = self.heard else {
             return false;
         };
         let settled = match self.asked {
             Some(asked) => self.missing() == 0 || since(asked, now) >= TIMEOUT,
-            // A participant without endpoints says so: 1..0.
+            // A participant without endpoints announces the empty range 1..0.
             None => since(heard, now) >= GATHER && self.missing() == 0,
         };
         if !settled {
@@ -512,7 +512,8 @@ impl Session {
         Message::new(self.local, self.target.prefix)
     }
 
-    /// Asks for these numbers from their bases on; the first request introduces the reader of nodes.
+    /// Request for these sequence numbers from their bases on. The first request announces the
+    /// reader of the node list.
     fn request<N: IntoIterator<Item = u64>>(&self, wanted: [(u64, N); 2]) -> Message {
         let mut message = self.message();
         if self.wants_nodes && self.asked.is_none() {
@@ -550,7 +551,7 @@ impl Session {
     }
 }
 
-/// The payload of a sample, as it came or put together.
+/// Payload of a sample, borrowed or reassembled.
 enum SamplePayload<'a> {
     Borrowed(Payload<'a>),
     Joined(Vec<u8>),

@@ -1,5 +1,5 @@
-//! One event in words: what streams and log records carry. Made from the facts when somebody reads
-//! it, so that an event nobody reads costs no formatting.
+//! One event with its attributes, as streams and log records carry it. It is built from the facts
+//! when it is read, so unread events cost no formatting.
 
 use std::borrow::Cow;
 use std::fmt::{Display, Write as _};
@@ -20,94 +20,94 @@ use ros2probe_model::snapshot::WatchState;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
 
-/// What happened to the robot or the agent.
+/// An event of the robot or of the agent.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Occurrence {
     Robot(EventKind),
     Agent(AgentEvent),
 }
 
-/// What happened to the agent.
+/// An event of the agent.
 #[derive(Clone, Debug, PartialEq)]
 pub enum AgentEvent {
-    /// It started.
+    /// The agent started.
     Started {
-        /// Where packets come from.
+        /// Kind of the packet source.
         source: SourceKind,
     },
-    /// It lost what it should have looked at.
+    /// Packets or records were lost before the model.
     Dropped {
-        /// `packets`, `records`, `datagrams`, `contended`.
+        /// `packets`, `records`, `datagrams` or `contended`.
         what: &'static str,
-        /// How many since the last such event.
+        /// Number lost since the last such event.
         count: u64,
     },
-    /// It does not see.
+    /// The agent stopped observing.
     Blind {
-        /// Why.
+        /// Reason of the failure.
         reason: String,
     },
-    /// It sees again.
+    /// The agent observes again.
     Seeing {
-        /// For how long it did not.
+        /// Duration of the failure in seconds.
         blind_seconds: f64,
     },
-    /// A configuration was taken over.
+    /// A configuration was applied.
     Reloaded {
-        /// Entries of the watchlist that is in force now.
+        /// Number of entries in the watchlist.
         watches: usize,
     },
-    /// A configuration was refused.
+    /// A configuration was rejected.
     ReloadFailed {
-        /// Why.
+        /// Error of the configuration.
         error: String,
     },
-    /// The API was asked to watch.
+    /// A client of the API added a watch.
     WatchAdded {
-        /// The pattern.
+        /// Pattern of the watch.
         watch: String,
-        /// Only in this domain.
+        /// Domain of the watch; `None` for all.
         domain_id: Option<u32>,
     },
-    /// The API was asked to watch no more.
+    /// A client of the API removed a watch.
     WatchRemoved {
-        /// The pattern.
+        /// Pattern of the watch.
         watch: String,
-        /// Only in this domain.
+        /// Domain of the watch; `None` for all.
         domain_id: Option<u32>,
     },
     /// A recording began.
     RecordingStarted {
-        /// Its name.
+        /// Name of the recording.
         recording: String,
     },
-    /// It ended.
+    /// A recording ended.
     RecordingEnded {
-        /// Its name.
+        /// Name of the recording.
         recording: String,
         /// Messages in the bag.
         messages: u64,
-        /// Messages that were sent and are not in it.
+        /// Messages that were sent and are not in the bag.
         missing: u64,
-        /// Why it ended, if no client ended it.
+        /// Reason of the end, unless a client ended it.
         reason: Option<String>,
     },
-    /// What came before an incident was written, or could not be.
+    /// A snapshot was written, or writing it failed.
     SnapshotTaken {
-        /// Its name in the configuration.
+        /// Name of the snapshot in the configuration.
         snapshot: String,
-        /// The bag.
+        /// Name of the bag.
         recording: String,
-        /// Messages in it.
+        /// Messages in the bag.
         messages: u64,
-        /// Why it was not written.
+        /// Reason of the failure.
         reason: Option<String>,
     },
-    /// Too many of one kind.
+    /// Too many events of one kind were suppressed.
     Suppressed {
-        /// Name of the events, or what the names have in common and `*`.
+        /// Name of the events, or their common prefix and `*`.
         event: &'static str,
-        /// How many are only counted.
+        /// Number of suppressed events.
         count: u64,
     },
 }
@@ -115,42 +115,42 @@ pub enum AgentEvent {
 /// One event as streams and exports carry it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Record {
-    /// Its number in this run of the agent.
+    /// Number of the event in this run of the agent.
     pub number: u64,
-    /// When it happened, in the source's time.
+    /// Time of the event, by the source's clock.
     pub at: Timestamp,
-    /// When the agent told it, in this host's time.
+    /// Time of its record, by this host's clock.
     pub observed: Timestamp,
-    /// What it is.
+    /// Definition of the event.
     pub definition: &'static Definition,
-    /// How bad.
+    /// Severity of the event.
     pub severity: Severity,
-    /// Attributes of the definition with their values, in its order.
+    /// Attributes with their values, in the order of the definition.
     pub attributes: Vec<(&'static str, Value)>,
 }
 
 /// Value of an attribute.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Value {
-    /// Text, bounded.
+    /// Text of bounded length.
     Text(String),
-    /// A count, a number of something.
+    /// A count or another whole number.
     Number(u64),
-    /// A quantity.
+    /// A real number.
     Real(f64),
     /// Several texts.
     List(Vec<String>),
 }
 
 impl Record {
-    /// The value of one attribute, if it has one.
+    /// Value of an attribute. `None` if it is absent.
     #[must_use]
     pub fn attribute(&self, name: &str) -> Option<&Value> {
         let mut attributes = self.attributes.iter();
         attributes.find_map(|(key, value)| (*key == name).then_some(value))
     }
 
-    /// When it happened, as RFC 3339 writes it.
+    /// Time of the event in RFC 3339 format.
     #[must_use]
     pub fn time(&self) -> String {
         rfc3339(self.at)
@@ -158,7 +158,7 @@ impl Record {
 }
 
 impl Occurrence {
-    /// Its entry of the table.
+    /// Definition of the event.
     pub(super) const fn definition(&self) -> &'static Definition {
         use churn::Event::{Appeared, Cascaded, Changed, Disposed, Expired};
         match self {
@@ -207,7 +207,7 @@ impl Occurrence {
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
-            // Usual while nodes start, and with tools that publish without a subscriber.
+            // Common while nodes start, and with tools that publish without a subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
                 finding,
                 Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
@@ -225,7 +225,7 @@ impl Occurrence {
         }
     }
 
-    /// Attributes by name, in any order; `None` = not known.
+    /// Attributes by name, in any order. `None` if unknown.
     fn values(&self, at: Timestamp) -> Values {
         match self {
             Self::Robot(kind) => robot(kind, at),
@@ -233,7 +233,7 @@ impl Occurrence {
         }
     }
 
-    /// Attributes in the table's order, each that is known.
+    /// Known attributes in the table's order.
     pub(super) fn attributes(&self, at: Timestamp) -> Vec<(&'static str, Value)> {
         let mut values = self.values(at);
         let names = self.definition().attributes.iter();
@@ -336,7 +336,7 @@ fn domain(domain_id: DomainId) -> (&'static str, Option<Value>) {
     ("domain_id", number(domain_id.0))
 }
 
-/// How an entity went, if it did.
+/// Cause of an entity's departure, if it departed.
 fn cause(change: &churn::Event) -> (&'static str, Option<Value>) {
     use churn::Event::{Cascaded, Disposed, Expired};
     let went = matches!(change, Disposed | Expired | Cascaded);
@@ -480,7 +480,7 @@ fn naming(topic: &str) -> Option<Naming> {
     DdsTopic::parse(topic).ok().map(|topic| Naming::of(&topic))
 }
 
-/// The topic as the metrics name it.
+/// Topic name as in the metrics.
 fn series<'a>(naming: Option<&'a Naming>, topic: &'a str) -> Cow<'a, str> {
     naming.map_or(Cow::Borrowed(topic), |naming| {
         series_name(naming.kind, &naming.name, &naming.dds_name)
@@ -513,8 +513,8 @@ fn seconds(at: Timestamp, last: Timestamp) -> f64 {
     at.nanoseconds_since(last) as f64 / 1e9
 }
 
-/// UTC with nanoseconds (RFC 3339, 5.6). The calendar's arithmetic counts days from 1 March of the
-/// year 0, so that the leap day is a year's last.
+/// UTC with nanoseconds (RFC 3339, 5.6). Days are counted from 1 March of the year 0, so that the
+/// leap day is the last day of a year.
 fn rfc3339(at: Timestamp) -> String {
     let (days, rest) = (
         at.0 / SECOND / SECONDS_OF_A_DAY,

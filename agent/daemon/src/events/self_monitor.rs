@@ -1,15 +1,15 @@
-//! Watches what the agent knows of itself and makes events of it: it lost something,
-//! it does not see any more, it sees again. Each says a thing once.
+//! Derives events from the agent's facts about itself: losses, and the loss and return of
+//! visibility. Each change is reported once.
 
 use std::time::{Duration, Instant};
 
 use super::AgentEvent;
 use crate::agent_facts::AgentFacts;
 
-/// Losses are reported at most this often.
+/// Least time between two reports of losses.
 const PAUSE: Duration = Duration::from_secs(1);
 
-/// What was lost on the way to the model.
+/// Detects losses before the model.
 #[derive(Debug, Default)]
 pub struct DropMonitor {
     reported: Losses,
@@ -18,17 +18,17 @@ pub struct DropMonitor {
 
 type Losses = [(&'static str, u64); 4];
 
-/// Whether the agent sees.
+/// Detects whether the agent observes.
 #[derive(Debug, Default)]
 pub struct SourceMonitor {
     blind_since: Option<Instant>,
-    /// When it was last looked at and saw. Until then it is starting, not blind.
+    /// Time of the last successful check. Before it, the agent is starting, not blind.
     saw: Option<Instant>,
     attached_anew: u64,
 }
 
 impl DropMonitor {
-    /// What was lost since the last report.
+    /// Events about losses since the last report.
     pub fn check(&mut self, facts: &AgentFacts, now: Instant) -> Vec<AgentEvent> {
         let early = |at: Instant| now.saturating_duration_since(at) < PAUSE;
         if self.at.is_some_and(early) {
@@ -63,9 +63,9 @@ fn losses(facts: &AgentFacts) -> Losses {
 }
 
 impl SourceMonitor {
-    /// Whether it sees at `now`, or why not, and how often the hook was attached anew; the events if
-    /// that is news. A control group that went and came between two looks makes both events, with the
-    /// time between the looks.
+    /// Events about changes of visibility at `now`. `ready` has the reason of a failure, and
+    /// `attached_anew` the number of times the hook was attached. If a control group went and came
+    /// between two checks, both events are returned, with the time between the checks.
     pub fn check(
         &mut self,
         ready: &Result<(), String>,
@@ -78,7 +78,7 @@ impl SourceMonitor {
             Ok(()) => {
                 let saw = self.saw.replace(now).filter(|_| is_anew);
                 if self.blind_since.is_none() && saw.is_some() {
-                    let reason = "the cgroup was removed and made anew".to_owned();
+                    let reason = "the cgroup was removed and recreated".to_owned();
                     events.push(AgentEvent::Blind { reason });
                 }
                 if let Some(since) = self.blind_since.take().or(saw) {
@@ -153,12 +153,12 @@ mod tests {
         let mut sight = SourceMonitor::default();
         assert_eq!(sight.check(&Ok(()), 0, start), []);
         let events = sight.check(&Ok(()), 1, second(2));
-        let reason = "the cgroup was removed and made anew".to_owned();
+        let reason = "the cgroup was removed and recreated".to_owned();
         let seeing = |blind_seconds| AgentEvent::Seeing { blind_seconds };
         assert_eq!(events, [AgentEvent::Blind { reason }, seeing(2.0)]);
         assert_eq!(sight.check(&Ok(()), 1, second(4)), []);
 
-        // Noticed while it was gone: that is told already.
+        // The check while it was gone has reported it.
         let gone = Err("the cgroup /robot was removed".to_owned());
         assert_eq!(sight.check(&gone, 1, second(6)).len(), 1);
         assert_eq!(sight.check(&Ok(()), 2, second(9)), [seeing(3.0)]);

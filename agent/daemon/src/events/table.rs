@@ -1,35 +1,35 @@
-//! Every event the agent tells, once: name, severity, attributes, help. The streams, the log records
-//! of OpenTelemetry, the table of `docs/events.md` and the tests work from it; nothing else spells a name.
+//! Table of all events: name, severity, attributes and help. Streams, log records of OpenTelemetry,
+//! the table of `docs/events.md` and the tests derive from it; names are spelled only here.
 //!
-//! Attributes bear the names of the metrics' labels, so that events and series can be joined.
+//! Attributes have the names of the metrics' labels, so that events and series can be joined.
 
 use crate::stability::Stability;
 
 /// One kind of event.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Definition {
-    /// Its name, for ever the same structure.
+    /// Name of the event; stable.
     pub name: &'static str,
-    /// How bad it is.
+    /// Severity of the event.
     pub severity: Severity,
-    /// How bad where it tells of something that is over or was meant to be.
+    /// Severity if the event reports the end of a condition or an intended change.
     pub relief: Severity,
-    /// Attributes, in order; those that are not known are left out.
+    /// Attributes in order; unknown ones are left out.
     pub attributes: &'static [&'static str],
-    /// One sentence.
+    /// One sentence of help.
     pub help: &'static str,
-    /// Whether name and attributes may still change.
+    /// Stability of name and attributes.
     pub stability: Stability,
 }
 
-/// Severities of OpenTelemetry's logs, as far as they are used.
+/// Severities of OpenTelemetry's logs that events use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Severity {
-    /// What happens on a healthy robot.
+    /// Normal on a healthy robot.
     Info,
-    /// Worth attention.
+    /// Needs attention.
     Warn,
-    /// The agent does not see all.
+    /// Visibility is incomplete.
     Error,
 }
 
@@ -297,7 +297,7 @@ pub(super) const SUPPRESSED: Definition = Definition::new(
     "Too many events of one name or group in a second; the others are only counted.",
 );
 
-/// All of them.
+/// All events.
 pub const EVENTS: &[Definition] = &[
     PARTICIPANT_DISCOVERED,
     PARTICIPANT_CHANGED,

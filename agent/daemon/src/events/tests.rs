@@ -1,4 +1,4 @@
-//! The log of events under storms, slow readers and restarts.
+//! Log of events under bursts, slow readers and restarts.
 
 use ros2probe_wire::{DomainId, Guid};
 
@@ -23,7 +23,7 @@ fn taken(events: Vec<Event>) -> Taken {
     Taken { events, overflow }
 }
 
-/// The clock at the beginning of a second.
+/// Time at the start of a second of the clock.
 const fn second(number: u64) -> Timestamp {
     Timestamp(number * SECOND)
 }
@@ -160,7 +160,7 @@ fn a_replay_at_full_speed_tells_what_one_at_the_capture_s_pace_tells() {
 fn what_was_overwritten_is_told_to_the_reader_that_missed_it() {
     let log = EventLog::new();
     for number in 0..25 {
-        // Every other second, for a late event is of the second that is there.
+        // Every other second, since a late event counts in the current second.
         let at = second(2 * number);
         log.add(taken((0..200).map(|each| node(at.0 + each)).collect()), at);
     }
@@ -172,7 +172,7 @@ fn what_was_overwritten_is_told_to_the_reader_that_missed_it() {
     assert_eq!(log.read(4000, 1).lagged, 0);
     log.overtook(Reader::Otlp, lost);
     assert!(log.dropped().contains(&("otlp_lagged", lost)));
-    // A place that never was is no reason to give anything.
+    // An impossible position returns no events.
     assert_eq!(log.read(u64::MAX, 1).records.len(), 0);
 }
 
@@ -204,7 +204,7 @@ async fn who_waits_is_woken_by_the_next_event() {
     woken.await_soon(true).await;
 }
 
-/// Waits for a future, or not for long.
+/// Waits briefly for a future.
 trait Soon: Future + Sized {
     async fn await_soon(self, expected: bool) {
         let timeout = Duration::from_millis(if expected { 10_000 } else { 20 });

@@ -1,9 +1,8 @@
-//! Standard error as a place for log lines that holds nobody up: where it takes no more for a moment,
-//! lines are lost and counted. A journal that hangs, a terminal that is stopped or a full disk behind
-//! a redirection must not stop the capture.
+//! Writes log lines to standard error without blocking. If it accepts no more, lines are dropped
+//! and counted. A hanging journal, a stopped terminal or a full disk must not stop the capture.
 //!
-//! The descriptor may be shared with other processes, so it stays a blocking one; it is asked before
-//! each piece of a size that a pipe takes as a whole.
+//! The descriptor may be shared with other processes, so it stays in blocking mode. It is polled
+//! before each write of at most the size that a pipe accepts atomically.
 
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -12,9 +11,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
-/// A pipe that is ready takes so many bytes without waiting (`PIPE_BUF`).
+/// Bytes that a ready pipe accepts without blocking (`PIPE_BUF`).
 const PIECE: usize = 4096;
-/// How long a reader that was quick so far may take.
+/// Longest wait for a reader that kept up so far.
 const TIMEOUT: Timespec = Timespec {
     tv_sec: 0,
     tv_nsec: 100_000_000,
@@ -24,16 +23,16 @@ const NONE: Timespec = Timespec {
     tv_nsec: 0,
 };
 
-/// Where lines go.
+/// Writer of lines.
 #[derive(Debug)]
 pub(super) struct Lines<W> {
     target: W,
     lost: Arc<AtomicU64>,
-    /// Of those, not told yet.
+    /// Dropped lines that are not reported yet.
     untold: u64,
-    /// The last line was lost: the next one does not wait.
+    /// Whether the last line was dropped; the next one then does not wait.
     is_stuck: bool,
-    /// A line was begun and not ended.
+    /// Whether a line was written in part.
     is_cut: bool,
 }
 
@@ -48,7 +47,7 @@ impl<W: Write + AsFd> Lines<W> {
         }
     }
 
-    /// Writes a line as far as that is possible at once.
+    /// Writes a line as far as possible without blocking.
     fn line(&mut self, line: &[u8]) -> io::Result<()> {
         for piece in line.chunks(PIECE) {
             self.ready()?;
@@ -58,7 +57,7 @@ impl<W: Write + AsFd> Lines<W> {
         Ok(())
     }
 
-    /// What has to be said before the next line.
+    /// Completes a cut line and reports dropped lines before the next one.
     fn catch_up(&mut self) -> io::Result<()> {
         if self.untold == 0 {
             return Ok(());
@@ -73,7 +72,7 @@ impl<W: Write + AsFd> Lines<W> {
     fn ready(&self) -> io::Result<()> {
         let timeout = if self.is_stuck { NONE } else { TIMEOUT };
         let mut target = [PollFd::new(&self.target, PollFlags::OUT)];
-        // What has hung up is ready, too: writing tells.
+        // A descriptor after a hangup is ready, too; the write then fails.
         match poll(&mut target, Some(&timeout)) {
             Ok(0) => Err(io::ErrorKind::WouldBlock.into()),
             Ok(_) => Ok(()),
@@ -83,7 +82,7 @@ impl<W: Write + AsFd> Lines<W> {
 }
 
 impl<W: Write + AsFd> Write for Lines<W> {
-    /// Takes a line; its fate is no error of the caller.
+    /// Writes a line. A dropped line is not an error.
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
         let written = self.catch_up().and_then(|()| self.line(line));
         self.is_stuck = written.is_err();
@@ -127,7 +126,7 @@ mod tests {
         for _ in 0..1000 {
             assert_eq!(lines.write(&line).unwrap(), line.len());
         }
-        // Waited for once.
+        // Only the first line waits.
         assert!(
             began.elapsed() < Duration::from_secs(2),
             "{:?}",

@@ -1,9 +1,9 @@
-//! Which system calls the threads of each role make, and the filter that refuses all others.
+//! System calls of each thread role, and the filter that refuses all others.
 //!
-//! What is refused fails with `EPERM`, as it does for who lacks a privilege; what C libraries try
-//! before an older call that is allowed with `ENOSYS`, so that they try that. Arguments count where
-//! they make the difference: memory never becomes executable, a new process never begins, the threads
-//! that look at the network and at other processes open nothing for writing.
+//! A refused call fails with `EPERM`, as without a privilege. Calls that C libraries try before an
+//! older allowed one fail with `ENOSYS`, which makes them use that one. Some calls are restricted
+//! by their arguments: memory never becomes executable, no process is created, and threads that
+//! read the network or other processes open no file for writing.
 
 use std::collections::BTreeMap;
 
@@ -15,24 +15,24 @@ use seccompiler::{
 
 use super::Role;
 
-/// Why a filter is not in force.
+/// A filter is not in force.
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
-    /// It cannot be put together.
+    /// The filter cannot be built.
     #[error(transparent)]
     Made(#[from] BackendError),
-    /// The kernel has none, or not for this process.
+    /// The kernel does not support filters, or not for this process.
     #[error("{0}")]
     Refused(String),
 }
 
-/// Refuses, from now on and for good, what the calling thread does not do in this role.
+/// Loads the filter of a role into the calling thread, permanently.
 pub(super) fn load(role: Role) -> Result<(), FilterError> {
     let program = program(role)?;
     apply_filter(&program).map_err(|error| FilterError::Refused(error.to_string()))
 }
 
-/// The filter's program.
+/// Program of a role's filter.
 fn program(role: Role) -> Result<BpfProgram, BackendError> {
     let filter = SeccompFilter::new(
         Allowed::to(role)?.0,
@@ -45,17 +45,17 @@ fn program(role: Role) -> Result<BpfProgram, BackendError> {
     Ok(program)
 }
 
-/// Calls for which C libraries have an older one.
+/// Calls with an older alternative that C libraries use.
 const ABSENT: [c_long; 3] = [libc::SYS_clone3, libc::SYS_epoll_pwait2, FCHMODAT2];
-/// Not told for every architecture by the libc crate.
+/// The libc crate does not define it for every architecture.
 const FCHMODAT2: c_long = 452;
 #[cfg(target_arch = "aarch64")]
 const RENAMEAT: c_long = 38;
 #[cfg(not(target_arch = "aarch64"))]
 const RENAMEAT: c_long = libc::SYS_renameat;
 
-/// Comes before the rest of a program, which has one answer for all it does not know. These calls
-/// have the same number on all architectures.
+/// Precedes the rest of a program, which has a single result for unknown calls. These calls have
+/// the same number on all architectures.
 fn absent() -> BpfProgram {
     let step = |code: u32, jt, jf, k| sock_filter {
         code: u16::try_from(code).unwrap_or_default(),
@@ -75,7 +75,7 @@ fn absent() -> BpfProgram {
     program
 }
 
-/// What every thread does: memory, locks, the time, reading and writing what is open, ending.
+/// Calls of every thread: memory, locks, time, I/O on open files, exit.
 const EVERYWHERE: &[c_long] = &[
     libc::SYS_brk,
     libc::SYS_capget,
@@ -123,7 +123,7 @@ const EVERYWHERE: &[c_long] = &[
     libc::SYS_poll,
 ];
 
-/// Looking for files and at them; opening is allowed apart.
+/// Reading file metadata and directories; opening is allowed separately.
 const LOOK: &[c_long] = &[
     libc::SYS_faccessat,
     libc::SYS_faccessat2,
@@ -144,7 +144,7 @@ const LOOK: &[c_long] = &[
     libc::SYS_stat,
 ];
 
-/// Changing files: state, recordings.
+/// Changing files, for state and recordings.
 const CHANGE: &[c_long] = &[
     libc::SYS_copy_file_range,
     libc::SYS_fallocate,
@@ -176,7 +176,7 @@ const CHANGE: &[c_long] = &[
     libc::SYS_unlink,
 ];
 
-/// A tokio runtime and the connections that it serves.
+/// Calls of a tokio runtime and of its connections.
 const SERVE: &[c_long] = &[
     libc::SYS_accept4,
     libc::SYS_epoll_create1,
@@ -195,10 +195,10 @@ const SERVE: &[c_long] = &[
     libc::SYS_epoll_wait,
 ];
 
-/// Reaching others. Each of them can connect: a message to an address does with TCP Fast Open.
+/// Connecting. Each of these can connect: a message with an address does so with TCP Fast Open.
 const CONNECT: &[c_long] = &[libc::SYS_connect, libc::SYS_sendmsg, libc::SYS_sendto];
 
-/// Asking a name server as well: many questions at once, and musl binds before it asks.
+/// DNS queries: several questions at once, and musl binds before it sends.
 const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendmmsg];
 
 /// inotify.
@@ -208,25 +208,25 @@ const NOTICE: &[c_long] = &[
     libc::SYS_inotify_rm_watch,
 ];
 
-/// `bpf` commands, of linux/bpf.h; on maps: look up, update, delete, next key.
+/// `bpf` commands of linux/bpf.h: lookup, update, delete and next key of maps.
 mod command {
     pub(super) const MAPS: [libc::c_int; 4] = [1, 2, 3, 4];
     pub(super) const LINK_CREATE: libc::c_int = 28;
     pub(super) const ITERATOR_CREATE: libc::c_int = 33;
 }
 
-/// `ioctl` requests, the same on both architectures: of linux/perf_event.h and asm-generic/ioctls.h.
+/// `ioctl` requests of linux/perf_event.h and asm-generic/ioctls.h, the same on both architectures.
 mod request {
     pub(super) const PERF_ENABLE: i32 = 0x2400;
     pub(super) const PERF_DISABLE: i32 = 0x2401;
     pub(super) const PERF_SET_BPF: i32 = 0x4004_2408;
-    /// A descriptor's flags: not blocking, closed by exec. Whether it is a terminal. How much of an
-    /// answer there is, as glibc asks when it has asked a name server.
+    /// Non-blocking and close-on-exec flags, a terminal check, and the number of readable bytes,
+    /// which glibc requests after a DNS query.
     pub(super) const ORDINARY: [i32; 4] = [0x5421, 0x5451, 0x5401, 0x541b];
 }
 
-/// System calls by number, each with the conditions under which it is allowed: one of them is enough,
-/// and without any it always is.
+/// System calls by number, each with alternative conditions. A call without conditions is always
+/// allowed.
 #[derive(Default)]
 struct Allowed(BTreeMap<c_long, Vec<SeccompRule>>);
 
@@ -283,7 +283,7 @@ impl Allowed {
         self
     }
 
-    /// All of `conditions` hold.
+    /// Allows `call` if all `conditions` hold.
     fn when(&mut self, call: c_long, conditions: &[SeccompCondition]) -> Result<(), BackendError> {
         let rule = SeccompRule::new(conditions.to_vec())?;
         self.0.entry(call).or_default().push(rule);
@@ -295,7 +295,7 @@ impl Allowed {
         for call in [libc::SYS_mmap, libc::SYS_mprotect] {
             self.when(call, &[without(2, libc::PROT_EXEC)?])?;
         }
-        // Its own end, as abort() does it.
+        // Its own abort, as abort() does it.
         self.when(libc::SYS_tgkill, &[equal(0, process)?])?;
         let named_or_read = [
             libc::PR_SET_NAME,
@@ -307,9 +307,9 @@ impl Allowed {
         }
         let is_set = equal(1, libc::PR_CAP_AMBIENT_IS_SET)?;
         self.when(libc::SYS_prctl, &[equal(0, libc::PR_CAP_AMBIENT)?, is_set])?;
-        // A signal is handled by any thread, which tells the runtime through a socket that is open.
+        // Any thread may handle a signal, and notifies the runtime through an open socket.
         self.when(libc::SYS_sendto, &[condition(4, SeccompCmpOp::Eq, 0)?])?;
-        // Limits are read.
+        // Limits are only read.
         self.when(libc::SYS_prlimit64, &[condition(2, SeccompCmpOp::Eq, 0)?])
     }
 
@@ -324,7 +324,7 @@ impl Allowed {
 
     fn serve(&mut self) -> Result<(), BackendError> {
         self.always(LOOK).always(CHANGE).always(SERVE);
-        // A thread, never a process, never in a namespace of its own.
+        // Threads only, without new processes or namespaces.
         let kinds =
             libc::CLONE_THREAD | libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
         let thread = SeccompCmpOp::MaskedEq(wide(kinds));
@@ -358,19 +358,19 @@ impl Allowed {
         Ok(())
     }
 
-    /// Letting go of a tracepoint or a probe.
+    /// Allows detaching tracepoints and probes.
     fn end_perf_events(&mut self) -> Result<(), BackendError> {
         self.when(libc::SYS_ioctl, &[equal(1, request::PERF_DISABLE)?])
     }
 }
 
-/// An argument of 32 bits has this value.
+/// Condition that a 32-bit argument has this value.
 fn equal(argument: u8, value: i32) -> Result<SeccompCondition, BackendError> {
     let value = u64::from(value.cast_unsigned());
     SeccompCondition::new(argument, SeccompCmpArgLen::Dword, SeccompCmpOp::Eq, value)
 }
 
-/// An argument has none of these bits.
+/// Condition that an argument has none of these bits.
 fn without(argument: u8, bits: i32) -> Result<SeccompCondition, BackendError> {
     condition(argument, SeccompCmpOp::MaskedEq(wide(bits)), 0)
 }

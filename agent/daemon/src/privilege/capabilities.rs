@@ -1,4 +1,4 @@
-//! Which capabilities each source needs, what a thread goes on needing, and giving up the rest.
+//! Capabilities that each source and each thread need, and dropping the rest.
 
 use std::fmt;
 
@@ -11,8 +11,9 @@ use rustix::thread::{
 
 use crate::config::{CaptureSettings, SourceChoice};
 
-/// Attaching programs to a cgroup (`CAP_NET_ADMIN`); loading them; tracepoints, iterators and the
-/// verifier's leave to skip Spectre barriers, without which 5.15 to 6.8 refuse the filter.
+/// For attaching programs to a cgroup (`CAP_NET_ADMIN`), for loading them, and for tracepoints and
+/// iterators. The last one also skips Spectre barriers in the verifier, without which 5.15 to 6.8
+/// refuse the filter.
 const HOST: [CapabilitySet; 3] = [
     CapabilitySet::NET_ADMIN,
     CapabilitySet::BPF,
@@ -26,52 +27,53 @@ const WIRE: [CapabilitySet; 3] = [
     CapabilitySet::PERFMON,
 ];
 
-/// Live capture is not possible for lack of these.
+/// Capabilities that a live capture lacks.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Missing {
-    /// Each source that would do, with what it lacks.
+    /// Each possible source with its missing capabilities.
     sources: Vec<(SourceChoice, Vec<CapabilitySet>)>,
-    /// What grants everything that the configuration can make use of.
+    /// Capabilities that cover the whole configuration.
     grant: Vec<CapabilitySet>,
 }
 
-/// Why privileges could not be given up.
+/// Privileges could not be dropped.
 #[derive(Debug, thiserror::Error)]
 #[error("cannot drop privileges")]
 pub struct DropError(#[from] Errno);
 
-/// The calling thread has no capability in any set that would give it one, and can gain none: what
-/// is asked for to serve HTTP.
+/// Proof that the calling thread has no capability and can gain none. Serving HTTP requires it.
 #[derive(Debug)]
 pub struct Unprivileged(());
 
-/// It has.
+/// The calling thread still has privileges.
 #[derive(Debug, thiserror::Error)]
 pub enum CapabilitiesRemain {
-    /// These are left.
-    #[error("refusing to serve: {left} left in the {set} set after all were given up")]
+    /// Capabilities are left in a set.
+    #[error("refusing to serve: {left} left in the {set} set after dropping all capabilities")]
     Capabilities {
-        /// Their names.
+        /// Names of the capabilities.
         left: String,
-        /// Where.
+        /// Name of the set.
         set: &'static str,
     },
-    /// A program that it executes could.
-    #[error("refusing to serve: no_new_privs is not set after it was")]
+    /// An executed program could gain capabilities.
+    #[error("refusing to serve: no_new_privs is not set")]
     MayGain,
-    /// The kernel does not say.
-    #[error("refusing to serve: cannot read which capabilities are left")]
+    /// A set cannot be read.
+    #[error("refusing to serve: cannot read the remaining capabilities")]
     Unreadable(#[source] Errno),
-    /// Likewise.
+    /// `no_new_privs` cannot be read.
     #[error("refusing to serve: cannot read no_new_privs")]
     Unknown(#[source] Errno),
 }
 
-/// Looks for what capturing as `settings` say needs. Where the choice of the source is the
-/// agent's, having what one of them needs is enough.
+/// Checks for the capabilities that `settings` need. If the agent selects the source, those of one
+/// possible source suffice.
 ///
 /// # Errors
-/// The capabilities that are not effective. When they cannot be read, opening the sockets will tell.
+///
+/// Returns the missing effective capabilities. If they cannot be read, opening the sockets reports
+/// the error.
 pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     let Ok(sets) = capabilities(None) else {
         return Ok(());
@@ -79,10 +81,10 @@ pub fn check(settings: &CaptureSettings) -> Result<(), Missing> {
     missing(sets.effective, settings).map_or(Ok(()), Err)
 }
 
-/// What a process with these effective capabilities lacks; `None` = nothing.
+/// Capabilities that a process with these effective ones lacks. `None` if it lacks none.
 #[must_use]
 pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<Missing> {
-    // The old, wider capability still counts for its successors.
+    // The older, wider capability includes its successors.
     let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
         true => CapabilitySet::BPF | CapabilitySet::PERFMON,
         false => CapabilitySet::empty(),
@@ -100,7 +102,7 @@ pub fn missing(effective: CapabilitySet, settings: &CaptureSettings) -> Option<M
     (!sources.iter().any(able)).then_some(Missing { sources, grant })
 }
 
-/// The sources that `settings` allow, each with what it needs.
+/// Sources that `settings` allow, each with the capabilities it needs.
 fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySet>)> {
     let named = !settings.include_interfaces.is_empty() || !settings.exclude_interfaces.is_empty();
     let mirrors = !settings.mirror_interfaces.is_empty();
@@ -120,8 +122,8 @@ fn candidates(settings: &CaptureSettings) -> Vec<(SourceChoice, Vec<CapabilitySe
     }
 }
 
-/// Gives up what the calling thread does not keep, from every set; from the bounding set where it
-/// may, and where it may not nothing can be gained from it any more.
+/// Drops all capabilities of the calling thread except `kept`, and clears its bounding set if
+/// permitted. Without that permission, the thread can gain nothing from the bounding set.
 pub(super) fn keep(kept: CapabilitySet) -> Result<(), DropError> {
     let sets = capabilities(None)?;
     if sets.effective.contains(CapabilitySet::SETPCAP) {
@@ -163,10 +165,11 @@ fn ambient() -> Result<CapabilitySet, Errno> {
 }
 
 impl Unprivileged {
-    /// Reads back what the calling thread has left.
+    /// Verifies that the calling thread has no privileges.
     ///
     /// # Errors
-    /// There is something, or it cannot be read.
+    ///
+    /// A capability is left, or a set cannot be read.
     pub fn verify() -> Result<Self, CapabilitiesRemain> {
         let sets = capabilities(None).map_err(CapabilitiesRemain::Unreadable)?;
         let ambient = ambient().map_err(CapabilitiesRemain::Unreadable)?;
@@ -190,7 +193,7 @@ impl Unprivileged {
 }
 
 impl Missing {
-    /// The capabilities that each source lacks.
+    /// Text about the capabilities that each source lacks.
     #[must_use]
     pub fn needs(&self) -> String {
         let needs: Vec<String> = self
@@ -205,7 +208,7 @@ impl Missing {
         needs.join(", or ")
     }
 
-    /// The command that grants them to this program.
+    /// Command that grants them to this program.
     #[must_use]
     pub fn command(&self) -> String {
         let grant = self.grant.iter().copied().flat_map(capability_names);

@@ -1,4 +1,4 @@
-//! Confining a thread to what its role needs: capabilities, `no_new_privs`, the filter of system calls.
+//! Confines a thread to its role: capabilities, `no_new_privs`, and the filter of system calls.
 
 use std::io;
 use std::sync::OnceLock;
@@ -14,78 +14,78 @@ use ros2probe_capture::system::allow_running_first;
 use ros2probe_capture::threads::Task;
 use ros2probe_capture::uprobe;
 
-/// Whether filters are in force, as the kernel answered when the first thread was confined: its answer
-/// is the same for all.
+/// Whether filters are in force, as determined for the first confined thread. The result is the
+/// same for all threads.
 static FILTERED: OnceLock<Result<(), String>> = OnceLock::new();
 
-/// What keeps system calls that the agent does not make from being made.
+/// State of the system-call filter.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Sandbox {
-    /// Nothing: no thread of this process was confined. A command that replays is no agent.
+    /// No thread of this process is confined, as in commands that replay.
     Never,
-    /// A filter in every thread.
+    /// Every thread has a filter.
     Filtered,
-    /// Nothing, for this reason.
+    /// No thread has a filter, for this reason.
     Unfiltered(&'static str),
 }
 
-/// What a thread is for, which decides what it keeps.
+/// Role of a thread, which determines its privileges.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// `main` and whatever it starts: signals, reloads, state, snapshots. No capability; no
-    /// connection of its own but to the service manager.
+    /// The main thread and its children: signals, reloads, state, snapshots. No capability, and no
+    /// outgoing connection except to the service manager.
     Service,
-    /// HTTP, and recordings that clients begin: as [`Role::Service`], and no connection of its own
-    /// at all. A connection that was accepted cannot be led elsewhere.
+    /// HTTP, and recordings started by clients. As [`Role::Service`], without any outgoing
+    /// connection. An accepted connection cannot be redirected.
     Serve,
-    /// OTLP: as [`Role::Service`], and connections to the collector.
+    /// OTLP. As [`Role::Service`], with connections to the collector.
     Export,
-    /// Packets, the model, the kernel's maps: no capability where the kernel lets the maps' owner
-    /// change them, otherwise `CAP_BPF`. Opens nothing for writing, and no socket.
+    /// Packets, the model and the kernel's maps. No capability if the kernel lets the owner of maps
+    /// change them, otherwise `CAP_BPF`. Opens no socket, and no file for writing.
     Capture {
-        /// As [`Role::capture`] found out.
+        /// As determined by [`Role::capture`].
         needs_bpf: bool,
     },
-    /// Looks at shared memory: `CAP_SYS_PTRACE`, which opens `/proc/<pid>/root`, and so the shared
-    /// memory of containers, if it was given; `CAP_SYS_NICE` where no limit allows it to run first.
+    /// Reading shared memory. `CAP_SYS_PTRACE`, if granted, opens `/proc/<pid>/root` and hence the
+    /// shared memory of containers. `CAP_SYS_NICE` is kept if no limit allows its priority.
     SharedMemory {
-        /// As [`Role::shared_memory`] found out.
+        /// As determined by [`Role::shared_memory`].
         needs_nice: bool,
     },
-    /// Attaches the host hook to a control group that is made anew: `CAP_NET_ADMIN`, and `CAP_BPF`
-    /// where the kernel wants it. Creates links, and opens nothing for writing, and no socket.
+    /// Attaching the host hook to a recreated control group: `CAP_NET_ADMIN`, and `CAP_BPF` if the
+    /// kernel requires it. Creates links, and opens no socket and no file for writing.
     Reattach {
-        /// As [`Role::reattach`] found out.
+        /// As determined by [`Role::reattach`].
         needs_bpf: bool,
     },
-    /// Attaches to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
+    /// Attaching uprobes to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
     Exact,
 }
 
-/// Why a thread has more than it should.
+/// A thread could not be confined.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfineError {
-    /// Capabilities.
+    /// Its capabilities could not be dropped.
     #[error(transparent)]
     Drop(#[from] DropError),
-    /// Programs that it executes.
+    /// `no_new_privs` could not be set.
     #[error("cannot set no_new_privs")]
     Gain(#[source] io::Error),
-    /// The filter is not to be had for this machine.
+    /// The filter could not be built for this architecture.
     #[error("cannot build the system call filter")]
     Filter(#[source] FilterError),
 }
 
-/// Why there is no thread.
+/// A thread could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum SpawnError {
-    /// The system has none.
+    /// The operating system refused the thread.
     #[error("failed to spawn a thread")]
     Thread(#[from] io::Error),
-    /// It could not be confined, and ended.
+    /// The thread could not be confined, and ended.
     #[error(transparent)]
     Confine(#[from] ConfineError),
-    /// It died before it had begun.
+    /// The thread died before it began.
     #[error("the thread panicked")]
     Died,
 }
@@ -100,7 +100,7 @@ impl Sandbox {
         }
     }
 
-    /// Why system calls are not filtered.
+    /// Reason why system calls are not filtered.
     #[must_use]
     pub const fn reason(&self) -> Option<&'static str> {
         match self {
@@ -112,21 +112,21 @@ impl Sandbox {
 }
 
 impl Role {
-    /// The capture thread's, on this kernel.
+    /// Role of the capture thread on this kernel.
     #[must_use]
     pub fn capture() -> Self {
         let needs_bpf = map_updates_need_bpf();
         Self::Capture { needs_bpf }
     }
 
-    /// That of the thread that attaches the host hook again, on this kernel.
+    /// Role of the thread that attaches the host hook again, on this kernel.
     #[must_use]
     pub fn reattach() -> Self {
         let needs_bpf = map_updates_need_bpf();
         Self::Reattach { needs_bpf }
     }
 
-    /// That of the thread that looks at shared memory. Raises a limit of the process.
+    /// Role of the thread that reads shared memory. Raises a limit of the process.
     #[must_use]
     pub fn shared_memory() -> Self {
         let needs_nice = !allow_running_first();
@@ -155,11 +155,12 @@ impl Role {
     }
 }
 
-/// Confines the calling thread, for good, and all threads that it starts from now on. Where the
-/// kernel has no filters (qemu's user mode, an old configuration) [`sandbox`] tells.
+/// Confines the calling thread and its future children, permanently. If the kernel has no filters
+/// (qemu's user mode, an old configuration), [`sandbox`] reports it.
 ///
 /// # Errors
-/// When the kernel refuses to take capabilities away, which it does not.
+///
+/// The kernel refuses to drop capabilities, which is not expected.
 pub fn confine(role: Role) -> Result<(), ConfineError> {
     give_up(role)?;
     rustix::thread::set_no_new_privs(true).map_err(|error| ConfineError::Gain(error.into()))?;
@@ -172,15 +173,16 @@ pub fn confine(role: Role) -> Result<(), ConfineError> {
     Ok(())
 }
 
-/// Gives up the calling thread's capabilities alone.
+/// Drops only the calling thread's capabilities.
 ///
 /// # Errors
-/// When the kernel refuses, which it does not for a thread that gives up what it has.
+///
+/// The kernel refuses, which is not expected for capabilities that the thread has.
 pub fn give_up(role: Role) -> Result<(), DropError> {
     capabilities::keep(role.capabilities())
 }
 
-/// What is in force in this process.
+/// State of the filter in this process.
 #[must_use]
 pub fn sandbox() -> Sandbox {
     match FILTERED.get() {
@@ -190,10 +192,11 @@ pub fn sandbox() -> Sandbox {
     }
 }
 
-/// Starts a thread that is confined before it does anything else; returns when it is.
+/// Starts a thread that is confined before any other work. Returns after it is.
 ///
 /// # Errors
-/// There can be no more threads, or it cannot be confined.
+///
+/// The thread cannot be started or confined.
 pub fn spawn(
     role: Role,
     thread: Builder,
@@ -215,6 +218,7 @@ pub fn spawn(
 /// Starts a thread of a source, confined to its task.
 ///
 /// # Errors
+///
 /// As [`spawn`].
 pub fn spawn_source(
     task: Task,

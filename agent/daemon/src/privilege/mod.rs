@@ -1,10 +1,9 @@
-//! What the agent may do. It begins with what attaching needs; once sockets and kernel programs are
-//! open, every thread gives up the capabilities that it does not go on needing and every system call
-//! that it does not make.
+//! Privileges of the agent. It starts with those that attaching needs. Once sockets and kernel
+//! programs are open, every thread drops the capabilities and system calls that it no longer needs.
 //!
-//! Both belong to threads, and a new thread has those of its creator: one that needs more than the
-//! rest is started by [`spawn`] before the creator is confined. Nothing here ever asks for more than
-//! the process was started with.
+//! Both belong to threads, and a new thread inherits those of its creator. A thread that needs more
+//! is started by [`spawn`] before its creator is confined. The agent never gains privileges beyond
+//! those of its start.
 
 mod calls;
 mod capabilities;

@@ -1,19 +1,19 @@
-//! Whether this kernel lets who holds a map change it without `CAP_BPF`: from Linux 5.19 on it does;
-//! before, only where unprivileged BPF is not disabled.
+//! Whether the owner of a map can change it without `CAP_BPF` on this kernel. From Linux 5.19 on it
+//! can; before, only if unprivileged BPF is enabled.
 //!
-//! Asked of the kernel rather than of its version: distributions take such changes over.
+//! A probe decides instead of the version, because distributions backport such changes.
 
 use ros2probe_capture::bpf::failed_lookup;
 use rustix::thread::CapabilitySet;
 
 use super::capabilities::keep;
 
-/// Tries, in a thread that has given up everything, to look up something in a map that does not
-/// exist: the kernel checks `EPERM` before `EBADF`.
+/// Looks up an element of a map that does not exist, in a thread without privileges. The kernel
+/// checks `EPERM` before `EBADF`.
 pub(super) fn map_updates_need_bpf() -> bool {
     let thread = std::thread::Builder::new().name("probe".to_owned());
     let probe = thread.spawn(|| {
-        // A thread that could not give up has not tried anything.
+        // A thread that could not drop its privileges proves nothing.
         keep(CapabilitySet::empty()).is_err() || failed_lookup().raw_os_error() == Some(libc::EPERM)
     });
     // A failed probe is treated as `CAP_BPF` required.

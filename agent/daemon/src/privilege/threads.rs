@@ -1,5 +1,5 @@
-//! What each thread of this process has left, as the kernel tells it: what `/health` shows is read
-//! and not remembered.
+//! Privileges of each thread of this process as the kernel reports them. `/health` shows these
+//! values, not remembered ones.
 
 use std::fs;
 
@@ -7,18 +7,18 @@ use rustix::thread::CapabilitySet;
 
 use super::capabilities::capability_names;
 
-/// One thread.
+/// Privileges of one thread.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ThreadCapabilities {
-    /// Its name; `rp` for the first one.
+    /// Name of the thread; `rp` for the first one.
     pub name: String,
-    /// Capabilities that it can use, by name.
+    /// Names of its effective capabilities.
     pub capabilities: Vec<String>,
-    /// The kernel refuses system calls that its role does not make.
+    /// Whether the kernel refuses system calls outside of its role.
     pub filtered: bool,
 }
 
-/// All of them, by the order in which they began; none where `/proc` does not tell.
+/// All threads in the order of their start. Empty if `/proc` is unreadable.
 #[must_use]
 pub fn threads() -> Vec<ThreadCapabilities> {
     let entries = fs::read_dir("/proc/self/task").into_iter().flatten();
@@ -28,7 +28,7 @@ pub fn threads() -> Vec<ThreadCapabilities> {
         .collect();
     numbers.sort_unstable();
     let status = |number| fs::read_to_string(format!("/proc/self/task/{number}/status"));
-    // One that ends while this is read is gone.
+    // A thread may end while this is read.
     let readable = numbers.into_iter().filter_map(|each| status(each).ok());
     readable.map(|status| read(&status)).collect()
 }
@@ -71,7 +71,7 @@ mod tests {
     #[test]
     fn every_thread_of_this_process_is_told() {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
-        // A thread takes its name itself, once it runs.
+        // A thread sets its own name once it runs.
         let (runs, running) = std::sync::mpsc::channel();
         let thread = std::thread::Builder::new().name("another".to_owned());
         let thread = thread.spawn(move || {

@@ -1,5 +1,5 @@
-//! An agent that root has started by hand becomes the user that the package has made, so that no
-//! file of root's is ever written. It keeps its capabilities for what is still to be given up.
+//! Switches an agent that root started by hand to the package's user, so that it writes no file as
+//! root. Capabilities are kept until they are dropped later.
 
 use std::fs;
 use std::io;
@@ -12,13 +12,13 @@ use rustix::thread::{
 
 use super::capabilities::capability_names;
 
-/// The user and the group.
+/// Name of the user and of the group.
 const NAME: &str = "ros2probe";
 
-/// Who the agent is.
+/// User of the agent.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Identity {
-    /// Not root; the user stays.
+    /// The user that started it, which is not root.
     AsStarted,
     /// The package's user.
     Own,
@@ -42,15 +42,15 @@ pub fn become_own_user() -> Identity {
     let needed = [CapabilitySet::SETUID, CapabilitySet::SETGID];
     if let Some(missing) = needed.into_iter().find(|one| !effective.contains(*one)) {
         let missing = capability_names(missing).concat();
-        return Identity::Root(format!("becoming the user {NAME} takes {missing}"));
+        return Identity::Root(format!("switching to user {NAME} needs {missing}"));
     }
     match become_user(user, group) {
         Ok(()) => Identity::Own,
-        Err(error) => Identity::Root(format!("cannot become the user {NAME}: {error}")),
+        Err(error) => Identity::Root(format!("cannot switch to user {NAME}: {error}")),
     }
 }
 
-/// The numbers of the user and of the group of that name, or else of the user's own group.
+/// Ids of the user and group of that name, or else of the user's primary group.
 fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     let line = |text: &str| -> Option<Vec<String>> {
         let mut lines = text.lines().map(|line| line.split(':'));
@@ -68,7 +68,7 @@ fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
 fn become_user(user: Uid, group: Gid) -> io::Result<()> {
     set_thread_groups(&[])?;
     set_thread_res_gid(group, group, group)?;
-    // Otherwise all capabilities would go with root's number.
+    // Otherwise all capabilities would be lost with root's user id.
     set_keep_capabilities(true)?;
     set_thread_res_uid(user, user, user)?;
     set_keep_capabilities(false)?;

@@ -1,9 +1,8 @@
-//! What recordings may take of the disk: each bag, all of them together, and what has to stay free for
-//! everything else.
+//! Disk usage of recordings: limits per bag and in total, and space that must stay free.
 //!
-//! Asked before a message is taken, so that a recording ends in order before a disk is full. Looks at
-//! the file system at every few megabytes and every second; several recordings may overdraw a limit by
-//! so much.
+//! The limits are checked before each message, so that a recording ends in order before the disk is
+//! full. The file system is checked every few megabytes and every second; several recordings may
+//! exceed a limit by that amount.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -14,17 +13,17 @@ use ros2probe_bag::Error;
 /// Bytes of messages between two checks of the file system.
 const STEP: u64 = 8 << 20;
 
-/// The quota of one recording.
+/// Quota of one recording.
 #[derive(Clone, Debug)]
 pub struct DiskQuota {
-    /// In which all bags lie.
+    /// Parent directory of all bags.
     directory: PathBuf,
     limits: RecordingLimits,
     /// Bytes taken since the last check.
     unseen: u64,
 }
 
-/// A limit that is reached.
+/// A limit was reached.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 enum QuotaExceeded {
     #[error("the recording would be larger than {0} bytes (recordings.max_bytes)")]
@@ -39,7 +38,7 @@ enum QuotaExceeded {
 }
 
 impl DiskQuota {
-    /// Below this directory, which may not exist yet.
+    /// Quota for bags below this directory, which may not exist yet.
     #[must_use]
     pub fn new(directory: &Path, limits: RecordingLimits) -> Self {
         Self {
@@ -52,6 +51,7 @@ impl DiskQuota {
     /// Takes quota for `more` bytes in a bag of `bag` bytes.
     ///
     /// # Errors
+    ///
     /// A limit would be exceeded.
     pub fn take(&mut self, bag: u64, more: u64) -> Result<(), Error> {
         if let Some(limit) = self.limits.max_bytes
@@ -67,9 +67,10 @@ impl DiskQuota {
         Ok(())
     }
 
-    /// Looks at the file system.
+    /// Checks the file system.
     ///
     /// # Errors
+    ///
     /// A limit is exceeded.
     pub fn check(&self) -> Result<(), Error> {
         if let Some(limit) = self.limits.max_total_bytes {
@@ -78,13 +79,13 @@ impl DiskQuota {
                 return Err(QuotaExceeded::Total { used, limit }.into());
             }
         }
-        // What cannot be asked shows itself in writing.
+        // If the query fails, writing reports the error.
         let Ok(space) = space(&self.directory) else {
             return Ok(());
         };
         let percent = u64::from(self.limits.reserve_percent);
         let reserve = (space.size / 100 * percent).max(self.limits.reserve_bytes);
-        // Without a reserve the storage itself refuses what it has no room for.
+        // Without a reserve, the storage itself reports a full disk.
         if reserve > 0 && space.free <= reserve {
             let free = space.free;
             return Err(QuotaExceeded::Reserve { free, reserve }.into());
@@ -99,7 +100,7 @@ impl From<QuotaExceeded> for Error {
     }
 }
 
-/// Bytes of all files in the directories of this one.
+/// Bytes of all files in the subdirectories of `directory`.
 fn used(directory: &Path) -> u64 {
     let entries = |path: &Path| std::fs::read_dir(path).into_iter().flatten().flatten();
     let bags = entries(directory);
@@ -108,14 +109,14 @@ fn used(directory: &Path) -> u64 {
     sizes.fold(0, u64::saturating_add)
 }
 
-/// Bytes of a file system.
+/// Space of a file system, in bytes.
 struct FilesystemSpace {
     size: u64,
-    /// To users without privileges.
+    /// Available to users without privileges.
     free: u64,
 }
 
-/// Of the file system in which a directory is, or would be.
+/// Space of the file system of an existing or future directory.
 fn space(directory: &Path) -> io::Result<FilesystemSpace> {
     let existing = directory.ancestors().find(|path| path.exists());
     let path = existing.unwrap_or(directory);

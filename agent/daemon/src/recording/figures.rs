@@ -1,15 +1,15 @@
-//! What recordings and snapshots have done and cost, counted where they work and shown on the page.
+//! Counters of recordings and snapshots, for metrics and the page.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// Counts of all recordings of a run, and what each snapshot holds.
+/// Counters of all recordings of a run, and the state of each snapshot.
 #[derive(Debug, Default)]
 pub struct RecordingFigures {
-    /// Recordings under way.
+    /// Active recordings.
     pub active: AtomicU64,
-    /// Messages in bags.
+    /// Messages written to bags.
     pub messages: AtomicU64,
     /// Bytes of those messages.
     pub bytes: AtomicU64,
@@ -18,30 +18,30 @@ pub struct RecordingFigures {
     snapshots: Mutex<BTreeMap<String, SnapshotFigures>>,
 }
 
-/// One snapshot of the configuration.
+/// State of one configured snapshot.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SnapshotFigures {
     /// Messages in memory.
     pub messages: u64,
-    /// What they take.
+    /// Memory of those messages, in bytes.
     pub bytes: u64,
-    /// Messages that were young enough and had to go for want of room.
+    /// Messages evicted before the end of the time span, for lack of memory.
     pub crowded_out: u64,
     /// Bags written.
     pub written: u64,
-    /// Bags that could not be.
+    /// Bags that could not be written.
     pub failed: u64,
 }
 
 impl RecordingFigures {
-    /// Adds up what one recording has since it was last counted.
+    /// Adds the changes of one recording since its last call.
     pub fn add(&self, messages: u64, bytes: u64, missing: u64) {
         self.messages.fetch_add(messages, Ordering::Relaxed);
         self.bytes.fetch_add(bytes, Ordering::Relaxed);
         self.missing.fetch_add(missing, Ordering::Relaxed);
     }
 
-    /// This is how the snapshot of this name stands.
+    /// Sets the state of the snapshot of this name.
     pub fn snapshot(&self, name: &str, figures: SnapshotFigures) {
         let mut snapshots = self
             .snapshots
@@ -50,7 +50,7 @@ impl RecordingFigures {
         snapshots.insert(name.to_owned(), figures);
     }
 
-    /// All snapshots.
+    /// State of all snapshots.
     #[must_use]
     pub fn snapshots(&self) -> Vec<(String, SnapshotFigures)> {
         let snapshots = self

@@ -1,7 +1,7 @@
-//! Which topics a recording takes: the options of `ros2 bag record`, as one question to each topic.
+//! Selection of topics for a recording, with the options of `ros2 bag record`.
 //!
-//! The question is asked again whenever the graph changes, so that topics that come later are taken,
-//! too. Topics of service events are a service's: topics' options do not reach them.
+//! It is evaluated again after each change of the graph, so that later topics are included. Topics
+//! of service events belong to services, and options for topics do not apply to them.
 
 use std::collections::HashSet;
 
@@ -11,28 +11,28 @@ use ros2probe_api::recordings::FilterOptions;
 
 use crate::subscriptions::{Choice, ChoiceError, Selection};
 
-/// The end of the name of a service's event topic.
+/// Suffix of the name of a service's event topic.
 const SERVICE_EVENT: &str = "/_service_event";
 const EVERY_SERVICE_EVENT: &str = "/_service_event$";
-/// Names, types and services in one choice.
+/// Most names, types and services in one selection.
 const MAX_NAMES: usize = 1024;
-/// Characters of a regular expression.
+/// Most characters of a regular expression.
 const MAX_EXPRESSION: usize = 1024;
 
-/// One topic of the graph, as far as the choice looks at it.
+/// Facts about a topic that the selection uses.
 #[derive(Clone, Copy, Debug)]
 pub struct Candidate<'a> {
     /// ROS name.
     pub name: &'a str,
-    /// Types announced on it.
+    /// Types announced on the topic.
     pub types: &'a [String],
-    /// Somebody publishes it.
+    /// Whether it has a publisher.
     pub published: bool,
-    /// Somebody subscribes to it.
+    /// Whether it has a subscriber.
     pub subscribed: bool,
 }
 
-/// What was asked for, ready to be held against topics.
+/// Selection of topics, ready for use.
 #[derive(Clone, Debug)]
 pub struct Filter {
     options: FilterOptions,
@@ -41,33 +41,34 @@ pub struct Filter {
     only: Option<HashSet<String>>,
 }
 
-/// Why nothing can be chosen like this.
+/// The options are invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// No topic can ever match.
-    #[error("name topics, or request all of them or those that match a regular expression")]
+    #[error("no topics selected: name topics, pass a regular expression, or select all")]
     Nothing,
-    /// Too long a list.
+    /// A list is too long.
     #[error("more than {MAX_NAMES} names")]
     TooMany,
-    /// A name without its leading slash, or a wrong one.
+    /// A name lacks its leading slash or is invalid.
     #[error("`{0}` is not a topic or service name: it must begin with `/`")]
     Name(String),
-    /// A regular expression that cannot be used.
+    /// A regular expression is invalid.
     #[error("the regular expression `{expression}` cannot be used: {reason}")]
     Expression {
-        /// As given.
+        /// The expression as given.
         expression: String,
-        /// What is wrong with it.
+        /// Error of the expression.
         reason: String,
     },
 }
 
 impl Filter {
-    /// Checks what was asked for.
+    /// Checks the options.
     ///
     /// # Errors
-    /// Nothing could match, or an expression or a name is wrong.
+    ///
+    /// Nothing could match, or an expression or a name is invalid.
     pub fn new(options: FilterOptions) -> Result<Self, FilterError> {
         let names = [
             &options.topics,
@@ -109,16 +110,17 @@ impl Filter {
         })
     }
 
-    /// What was asked for.
+    /// Options of the selection.
     #[must_use]
     pub const fn options(&self) -> &FilterOptions {
         &self.options
     }
 
-    /// What to subscribe to: everything that [`Self::takes`] may take, and little more.
+    /// Topics to subscribe to: all that [`Self::takes`] may accept, and few more.
     ///
     /// # Errors
-    /// A name cannot be a topic's.
+    ///
+    /// A name cannot be that of a topic.
     pub fn selection(&self) -> Result<Selection, ChoiceError> {
         let options = &self.options;
         let event = |service: &String| Choice::Name(format!("{service}{SERVICE_EVENT}"));
@@ -143,14 +145,14 @@ impl Filter {
         Ok(Selection {
             include,
             exclude,
-            // A service's events are hidden; what else is hidden is for `takes` to leave out.
+            // Event topics of services are hidden; `takes` excludes other hidden topics.
             hidden: options.include_hidden_topics
                 || options.all_services
                 || options.regex.is_some(),
         })
     }
 
-    /// The same as a query of the API's `/samples`, with so much room for what waits.
+    /// [`Self::selection`] as a query of the API's `/samples`, with a queue of `queue_bytes`.
     #[must_use]
     pub fn query(&self, domain_id: u32, queue_bytes: u64) -> String {
         let options = &self.options;
@@ -185,7 +187,7 @@ impl Filter {
         query
     }
 
-    /// Of those it takes, only these topics.
+    /// Restricts the selection to these topics.
     #[must_use]
     pub fn only(self, names: &[String]) -> Self {
         Self {
@@ -194,7 +196,7 @@ impl Filter {
         }
     }
 
-    /// Whether `topic` is to be recorded.
+    /// Returns whether `topic` is to be recorded.
     #[must_use]
     pub fn takes(&self, topic: &Candidate<'_>) -> bool {
         let options = &self.options;
@@ -224,7 +226,7 @@ impl Filter {
         {
             return false;
         }
-        // Who names a hidden topic means it.
+        // A hidden topic is selected by its exact name.
         named(&options.topics)
             || ((options.include_hidden_topics || !is_hidden(topic.name))
                 && (options.all_topics

@@ -1,5 +1,5 @@
-//! What discovery says of topics, as far as a bag or its report says it: from a snapshot within the
-//! agent, from an agent's answers where a client records.
+//! Facts about topics for a bag and its report: from a snapshot within the agent, or from an
+//! agent's answers in a client.
 
 use std::collections::HashMap;
 
@@ -14,10 +14,10 @@ use ros2probe_wire::qos::Durability;
 
 const VOLATILE: &str = "VOLATILE";
 
-/// The graph at one moment, as far as a report compares two of them.
+/// The graph at one moment; a report compares two of them.
 #[derive(Clone, Debug, Default)]
 pub struct GraphSnapshot {
-    /// ROS topics that somebody publishes.
+    /// ROS topics with a publisher.
     pub topics: Vec<PublishedTopic>,
     /// Messages of each writer that was never announced, by its GUID.
     pub unknown_writers: HashMap<String, u64>,
@@ -26,23 +26,23 @@ pub struct GraphSnapshot {
 /// A published topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct PublishedTopic {
-    /// Its domain.
+    /// Domain of the topic.
     pub domain_id: u32,
     /// ROS name.
     pub name: String,
     /// ROS types.
     pub message_types: Vec<String>,
-    /// Somebody subscribes to it.
+    /// Whether it has a subscriber.
     pub subscribed: bool,
-    /// How messages pass between most pairs, where none of them uses the network.
+    /// Transport of most pairs, if none of them uses the network.
     pub other_transport: Option<String>,
-    /// Publishers that late joiners are given samples of.
+    /// Publishers that send stored samples to late joiners.
     pub durable_publishers: Vec<String>,
-    /// Messages counted so far; `None` where it is not measured.
+    /// Messages counted so far; `None` if the topic is not measured.
     pub messages: Option<u64>,
 }
 
-/// Topics of one domain, by the names that messages bear: ROS names of topics, else DDS names.
+/// Topics of one domain by the names that messages have: ROS names of topics, else DDS names.
 #[must_use]
 pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, DiscoveredTopic> {
     let topics = topics.iter();
@@ -59,7 +59,7 @@ pub fn by_name(topics: &[Topic<'_>], domain_id: u32) -> HashMap<String, Discover
 }
 
 impl GraphSnapshot {
-    /// From an agent's answers.
+    /// Graph from an agent's answers.
     #[must_use]
     pub fn answered(topics: &[Topic<'_>], unknown_writers: Vec<UnknownWriter<'_>>) -> Self {
         let topics = topics.iter();
@@ -96,12 +96,12 @@ impl From<&Topic<'_>> for PublishedTopic {
     }
 }
 
-/// Whether ROS names a topic by it; a kind that this version does not know counts as one.
+/// Returns whether the topic has a ROS name. Kinds unknown to this version count as such.
 fn is_ros_topic(kind: &str) -> bool {
     TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
 }
 
-/// Each as it is printed.
+/// Texts of the values.
 fn printed<T: ToString>(texts: &[T]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }
@@ -153,30 +153,31 @@ fn other_transport<'a>(
     most.map(|(passage, _)| passage)
 }
 
-/// A topic at the moment in which it is taken into a bag.
+/// Facts about a topic at the moment it is added to a bag.
 #[derive(Clone, Debug, Default)]
 pub struct DiscoveredTopic {
-    /// ROS types announced on it.
+    /// ROS types announced on the topic.
     pub message_types: Vec<String>,
-    /// RIHS01 hashes announced on it.
+    /// RIHS01 hashes announced on the topic.
     pub type_hashes: Vec<String>,
-    /// Its writers.
+    /// Writers of the topic.
     pub publishers: Vec<Publisher>,
-    /// It has a reader.
+    /// Whether it has a reader.
     pub subscribed: bool,
 }
 
 /// One writer.
 #[derive(Clone, Debug)]
 pub struct Publisher {
-    /// GUID as the metrics show it.
+    /// GUID as in the metrics.
     pub guid: String,
-    /// What it offers.
+    /// Offered QoS.
     pub qos: OfferedQos,
 }
 
 impl Publisher {
-    /// Late joiners are given its last samples, which were sent before and are sent to them alone.
+    /// Returns whether late joiners receive its last samples. These were sent earlier and are
+    /// repeated only to them.
     #[must_use]
     pub fn is_durable(&self) -> bool {
         self.qos.durability != VOLATILE

@@ -1,8 +1,8 @@
-//! Recordings: which topics, what of them is in the bag, and what is not.
+//! Recordings: selected topics, recorded messages, and missing ones.
 //!
-//! A recording takes samples from a subscription, as a stream of the API does: nothing on the
-//! network tells that there is one. The agent writes some itself (`service`), and the last seconds
-//! before an incident (`snapshot`). How a bag looks on disk is the business of `ros2probe_bag`.
+//! A recording receives samples from a subscription, as a stream of the API does; it is invisible
+//! on the network. The agent writes recordings on request (`service`), and the last seconds before
+//! an incident (`snapshot`). `ros2probe_bag` implements the format on disk.
 
 mod disk_quota;
 mod figures;

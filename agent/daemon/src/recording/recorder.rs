@@ -1,8 +1,8 @@
 //! One recording: samples in, a bag and a report out.
 //!
-//! No thread and no clock of its own: its owner feeds it from a subscription or from an agent's
-//! stream, and time comes with the items. The first error of the storage ends it; what was
-//! taken before is in the bag, and what is not is counted.
+//! It has no thread and no clock: its owner feeds it from a subscription or from an agent's stream,
+//! and times come with the items. The first error of the storage ends it. Earlier samples are in
+//! the bag, and missing ones are counted.
 
 mod unrecorded;
 
@@ -27,91 +27,90 @@ use ros2probe_bag::{
 };
 use ros2probe_model::dispatch::{Offered, Sample};
 
-/// How often what was taken is handed to the system, by the time of the samples: so much is lost
-/// when the process is killed.
+/// Interval of writes to the operating system, by the time of samples. A killed process loses at
+/// most this much.
 const FLUSH: u64 = SECOND;
-/// How often it is waited for until it is on the disk: so much is lost with the power.
+/// Interval of syncs to disk. A power failure loses at most this much.
 const SYNC: u64 = 5 * SECOND;
-/// Writers of one topic whose first number is remembered.
+/// Most writers of one topic whose first sequence number is kept.
 const WRITERS: usize = 256;
 
-/// Where a recorder learns what it does not see in samples.
+/// Sources of facts that samples do not contain.
 pub struct Sources<'a> {
-    /// What is announced at the moment of the topics of these names, in their order.
+    /// Current announcements about topics of these names, in their order.
     pub announced: Box<Announcements<'a>>,
-    /// What is there at the moment, in all domains.
+    /// Current graph of all domains.
     pub graph: Box<dyn FnMut() -> GraphSnapshot + Send + 'a>,
-    /// How messages of a type look; the type and its announced hash.
+    /// Schema of a type, by its name and announced hash.
     pub schema: Box<Schemas<'a>>,
 }
 
-/// What is announced of topics, asked for all at once: each question may take a while.
+/// Announcements about several topics, requested at once, since each request may take long.
 pub type Announcements<'a> = dyn FnMut(&[String]) -> Vec<DiscoveredTopic> + Send + 'a;
 
-/// The schema of a type, by its name and announced hash.
+/// Schema of a type, by its name and announced hash.
 pub type Schemas<'a> = dyn FnMut(&str, Option<&str>) -> Option<Schema> + Send + 'a;
 
-/// A bag in the making.
+/// A bag in progress.
 pub struct Recorder<'a> {
     writer: Writer,
     domain_id: u32,
-    /// What was counted when it began.
+    /// Counts at the start.
     before: Baseline,
     filter: Filter,
     sources: Sources<'a>,
     topics: HashMap<String, TopicDecision>,
-    /// Of those, the ones in the bag.
+    /// Topics in the bag, in order.
     order: Vec<String>,
     report: Report,
     sampled: BTreeSet<String>,
     paused: bool,
-    /// In snapshot mode: samples that wait for being asked for.
+    /// In snapshot mode: samples in memory that wait for a request.
     ring: Option<SampleRing>,
-    /// What it may take of the disk.
+    /// Quota of disk usage.
     quota: Option<DiskQuota>,
     flushed: Timestamp,
     synced: Timestamp,
 }
 
-/// Counts at the beginning: messages of topics in other domains, and of writers that were never
-/// announced.
+/// Counts at the start: messages of topics in other domains, and of unannounced writers.
 #[derive(Default)]
 struct Baseline {
     topics: HashMap<(u32, String), u64>,
     unknown_writers: HashMap<String, u64>,
 }
 
-/// What was decided for a topic.
+/// Decision about a topic.
 enum TopicDecision {
-    /// It is in the bag.
+    /// The topic is in the bag.
     Recorded(Box<RecordedTopic>),
-    /// The filter does not take it.
+    /// The filter excludes the topic.
     Excluded,
 }
 
 struct RecordedTopic {
     id: TopicId,
     description: TopicDescription,
-    /// Of each publisher by its GUID, for the description.
+    /// Offered QoS of each publisher by its GUID, for the description.
     offered: BTreeMap<String, Qos>,
-    /// Number of the first recorded sample of each writer.
+    /// Sequence number of the first recorded sample of each writer.
     first: HashMap<Guid, u64>,
 }
 
-/// What became of a recording.
+/// Result of a recording.
 #[derive(Debug)]
 pub struct Finished {
-    /// The bag, where it could be completed.
+    /// Summary of the bag, if it could be completed.
     pub summary: Option<Summary>,
-    /// What it has and has not.
+    /// Recorded and missing messages.
     pub report: Report,
-    /// What the storage refused; the bag is whole up to there.
+    /// Error of the storage; the bag is complete up to it.
     pub error: Option<Error>,
 }
 
 impl<'a> Recorder<'a> {
-    /// Records what `filter` takes of a domain into `writer`'s bag. `before` is what was there before
-    /// the first sample.
+    /// Records topics selected by `filter` in one domain into the bag of `writer`. `before` is the
+    /// graph before the first sample.
     #[must_use]
     pub fn new(
         writer: Writer,
@@ -151,7 +150,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Keeps the last samples in memory and writes them when [`Self::snapshot`] asks for them.
+    /// Keeps the last samples in memory, and writes them on [`Self::snapshot`].
     #[must_use]
     pub fn waiting_in(self, ring: SampleRing) -> Self {
         Self {
@@ -160,7 +159,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Ends with an error when the room is used up.
+    /// Ends with an error when the quota is exhausted.
     #[must_use]
     pub fn within(self, quota: DiskQuota) -> Self {
         Self {
@@ -169,10 +168,11 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Writes what waits in memory; nothing where it does not wait.
+    /// Writes the samples in memory. Does nothing without snapshot mode.
     ///
     /// # Errors
-    /// The storage takes no more.
+    ///
+    /// The storage fails.
     pub fn snapshot(&mut self) -> Result<(), Error> {
         let waiting: Vec<_> = self.ring.iter_mut().flat_map(SampleRing::drain).collect();
         for sample in waiting {
@@ -181,14 +181,14 @@ impl<'a> Recorder<'a> {
         self.writer.flush()
     }
 
-    /// What it has so far.
+    /// Report so far.
     #[must_use]
     pub const fn report(&self) -> &Report {
         &self.report
     }
 
-    /// Of these topics, the published ones that it takes and that have no message yet although the
-    /// reason is known: by name, the reason as in [`Report::unobserved`].
+    /// Selected and published topics among those of `graph` that have no message yet for a known
+    /// reason. By name, with the reason as in [`Report::unobserved`].
     #[must_use]
     pub fn unobserved(&self, graph: &GraphSnapshot) -> BTreeMap<String, String> {
         let topics = graph.topics.iter();
@@ -207,13 +207,13 @@ impl<'a> Recorder<'a> {
         topics.collect()
     }
 
-    /// What was asked for.
+    /// Options of the selection.
     #[must_use]
     pub const fn options(&self) -> &FilterOptions {
         self.filter.options()
     }
 
-    /// Whether this topic is recorded, in whichever domain it is.
+    /// Returns whether this topic would be recorded, regardless of its domain.
     #[must_use]
     pub fn takes(&self, topic: &PublishedTopic) -> bool {
         self.filter.takes(&Candidate {
@@ -224,60 +224,62 @@ impl<'a> Recorder<'a> {
         })
     }
 
-    /// Topics of which messages were sampled in shared memory.
+    /// Topics with messages sampled in shared memory.
     #[must_use]
     pub const fn sampled(&self) -> &BTreeSet<String> {
         &self.sampled
     }
 
-    /// Topics in the bag, in the order in which they came into it.
+    /// Topics in the bag, in order of their addition.
     pub fn topics(&self) -> impl Iterator<Item = &str> {
         self.order.iter().map(String::as_str)
     }
 
-    /// The bag so far.
+    /// Writer of the bag.
     #[must_use]
     pub const fn writer(&self) -> &Writer {
         &self.writer
     }
 
-    /// Whether samples are let go by.
+    /// Returns whether the recording is paused.
     #[must_use]
     pub const fn is_paused(&self) -> bool {
         self.paused
     }
 
-    /// Lets samples go by, or takes them again.
+    /// Pauses or resumes the recording.
     pub const fn pause(&mut self, paused: bool) {
         self.paused = paused;
     }
 
-    /// Goes on in a new file.
+    /// Continues in a new file.
     ///
     /// # Errors
-    /// The storage takes no more.
+    ///
+    /// The storage fails.
     pub fn split(&mut self) -> Result<(), Error> {
         self.writer.split()
     }
 
-    /// Complete files that are to be compressed, by another thread.
+    /// Complete files to compress on another thread.
     pub fn take_compressions(&mut self) -> Vec<FileCompression> {
         self.writer.take_file_compressions()
     }
 
-    /// One of them is.
+    /// Records that a file is compressed.
     ///
     /// # Errors
-    /// The storage takes no more.
+    ///
+    /// The storage fails.
     pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
         self.writer.compressed(done)
     }
 
-    /// Takes topics into the bag that may never have a message: each by its name and type, as
-    /// discovery knows them.
+    /// Adds topics to the bag by name and type, even if no message follows.
     ///
     /// # Errors
-    /// The storage takes no more.
+    ///
+    /// The storage fails.
     pub fn declare<'t>(
         &mut self,
         topics: impl IntoIterator<Item = (&'t str, &'t str)>,
@@ -288,7 +290,7 @@ impl<'a> Recorder<'a> {
         let announced = self.discover(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
             let place = self.decide(name, message_type, None, &announced, false)?;
-            // One that is left out may yet be published.
+            // An excluded topic may still be published later.
             if matches!(place, TopicDecision::Recorded(_)) {
                 self.topics.insert(name.to_owned(), place);
             }
@@ -296,10 +298,11 @@ impl<'a> Recorder<'a> {
         Ok(())
     }
 
-    /// Takes what the subscription gives.
+    /// Processes an item of the subscription.
     ///
     /// # Errors
-    /// The storage takes no more; [`Self::finish`] completes the bag all the same.
+    ///
+    /// The storage fails; [`Self::finish`] completes the bag nevertheless.
     pub fn take(&mut self, item: &Item) -> Result<(), Error> {
         match item {
             Item::Sample(sample) if sample.payload.is_none() => Ok(()),
@@ -324,7 +327,7 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Completes the bag. `error` is what ended it, if that was the storage.
+    /// Completes the bag. `error` is the storage error that ended it, if any.
     #[must_use]
     pub fn finish(self, error: Option<Error>) -> Finished {
         self.finish_with(error, |work| work.run().map(Some))
@@ -343,7 +346,7 @@ impl<'a> Recorder<'a> {
         let graph = (self.sources.graph)();
         self.note_what_was_sent_before(&graph);
         self.note_what_was_not_observed(graph);
-        // Before the report goes into the bag.
+        // Before the report is added to the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
             take_back(&mut self.report, topic, messages, bytes);
@@ -420,14 +423,14 @@ impl<'a> Recorder<'a> {
         !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
-    /// The place of a topic of which something came; `None` where it is not recorded.
+    /// State of a topic with a message. `None` if it is not recorded.
     fn place(&mut self, topic: &Topic) -> Result<Option<&mut RecordedTopic>, Error> {
         let Topic {
             name, message_type, ..
         } = topic;
         if !self.topics.contains_key(&**name) {
             let offered = topic.offered.as_deref();
-            // What the writer announced comes with its messages; the rest has to be asked for.
+            // Messages carry the announcement of their writer; other facts have to be requested.
             let announced = match offered {
                 Some(_) if !self.filter.options().ignore_leaf_topics => DiscoveredTopic::default(),
                 _ => self.discover_one(name),
@@ -438,7 +441,7 @@ impl<'a> Recorder<'a> {
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
         };
-        // A loss may come before the first message, and without a type.
+        // A loss may precede the first message and has no type.
         if !message_type.is_empty() && taken.description.type_name != **message_type {
             if !self
                 .report
@@ -453,7 +456,7 @@ impl<'a> Recorder<'a> {
         Ok(Some(taken))
     }
 
-    /// What is announced of these topics: as many answers as there are names.
+    /// Announcements about these topics, one result per name.
     fn discover(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         if names.is_empty() {
             return Vec::new();
@@ -504,9 +507,9 @@ impl<'a> Recorder<'a> {
             type_hash,
             publishers: offered.values().cloned().collect(),
         };
-        // Before its first message comes its description: with that of its writer.
+        // The description precedes the first message, and includes that of its writer.
         let id = self.writer.topic(description.clone())?;
-        // The bag has it now.
+        // The schema is in the bag now.
         description.schema = None;
         self.report.topic(name);
         self.order.push(name.to_owned());
@@ -518,7 +521,7 @@ impl<'a> Recorder<'a> {
         })))
     }
 
-    /// Describes a topic again when a writer is new that offers something.
+    /// Writes a topic's description again if a writer is new, or its offered QoS has changed.
     fn describe_again(&mut self, topic: &Topic, writer: Guid) -> Result<(), Error> {
         let (Some(offered), Some(TopicDecision::Recorded(taken))) =
             (&topic.offered, self.topics.get_mut(&*topic.name))

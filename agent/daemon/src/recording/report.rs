@@ -1,5 +1,5 @@
-//! Counts what a recording has and what it lacks, and puts that into words. The report itself is an
-//! answer of the API and part of the bag's metadata.
+//! Counts recorded and missing messages, and formats them as text. The report is an answer of the
+//! API and part of the bag's metadata.
 
 use std::collections::BTreeMap;
 
@@ -9,11 +9,11 @@ use ros2probe_api::recording_report::{
 
 use crate::subscriptions::{Missed, MissedReason};
 
-/// Runs of missing samples that are named; further ones are counted.
+/// Most runs of missing samples listed; further ones are counted.
 const RUNS: usize = 256;
-/// Topics that are named in one line.
+/// Most topics named in one line.
 const NAMES: usize = 8;
-/// Reasons why no message of a published topic was seen, and what people read.
+/// Reasons for a published topic without visible messages, with their texts.
 const UNOBSERVED: [(&str, &str); 5] = [
     (
         NO_SUBSCRIBER,
@@ -36,10 +36,10 @@ const UNOBSERVED: [(&str, &str); 5] = [
         "messages pass through iceoryx, which cannot be observed",
     ),
 ];
-/// Under this name in the bag's custom data.
+/// Key of the report in the bag's custom data.
 pub(super) const CUSTOM_DATA: &str = "ros2probe";
 
-/// A message is in the bag.
+/// Counts a recorded message.
 pub(super) fn add_written(report: &mut Report, topic: &str, bytes: usize) {
     let bytes = bytes as u64;
     report.messages += 1;
@@ -49,12 +49,12 @@ pub(super) fn add_written(report: &mut Report, topic: &str, bytes: usize) {
     topic.bytes += bytes;
 }
 
-/// A message came while the recording was paused.
+/// Counts a message that arrived during a pause.
 pub(super) fn add_paused(report: &mut Report, topic: &str) {
     report.topic(topic).paused += 1;
 }
 
-/// Messages will never be in the bag.
+/// Counts messages that will never be in the bag.
 pub(super) fn add_missed(report: &mut Report, missed: &Missed) {
     report.missing += missed.samples;
     let topic = report.topic(&missed.topic.name);
@@ -80,7 +80,7 @@ pub(super) fn add_missed(report: &mut Report, missed: &Missed) {
     });
 }
 
-/// Messages that were taken for written are not in the bag after all.
+/// Corrects the counts of messages that were not written after all.
 pub(super) fn take_back(report: &mut Report, topic: &str, messages: u64, bytes: u64) {
     report.messages = report.messages.saturating_sub(messages);
     report.bytes = report.bytes.saturating_sub(bytes);
@@ -91,14 +91,14 @@ pub(super) fn take_back(report: &mut Report, topic: &str, messages: u64, bytes: 
     topic.unwritten += messages;
 }
 
-/// For a bag's metadata: one line of JSON.
+/// Report for a bag's metadata: one line of JSON.
 pub(super) fn custom_data(report: &Report) -> BTreeMap<String, String> {
-    // Numbers and strings: nothing that could fail.
+    // Numbers and strings cannot fail to serialize.
     let text = serde_json::to_string(report).unwrap_or_default();
     BTreeMap::from([(CUSTOM_DATA.to_owned(), text)])
 }
 
-/// For people: what is missing, a line for each topic; nothing where nothing is.
+/// Text about missing messages, one line per topic. Empty if nothing is missing.
 #[must_use]
 pub fn shortfalls(report: &Report) -> Vec<String> {
     let mut lines = Vec::new();
@@ -164,7 +164,7 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
     }
     lines
 }
-/// For people: why nothing of these topics is seen, a line for each reason.
+/// Text about invisible topics, one line per reason.
 #[must_use]
 pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
     let lines = UNOBSERVED.iter().filter_map(|(why, what)| {
@@ -176,13 +176,13 @@ pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
     lines.collect()
 }
 
-/// A number of things.
+/// Count with its noun.
 fn counted(count: u64, thing: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };
     format!("{count} {thing}{plural}")
 }
 
-/// Of a list of names the first ones.
+/// The first names of a list.
 fn few(names: &[&str]) -> String {
     let shown = names
         .iter()

@@ -1,4 +1,4 @@
-//! The last samples, bounded in bytes and in time: what was there before something happened.
+//! Ring of the last samples, bounded in bytes and in time, for the moments before an incident.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use ros2probe_wire::Timestamp;
 
 use ros2probe_model::dispatch::Sample;
 
-/// What keeping a sample costs besides its payload.
+/// Memory of a sample besides its payload, in bytes.
 const OVERHEAD: usize = 256;
 
 /// The last samples, oldest first.
@@ -18,12 +18,12 @@ pub struct SampleRing {
     bytes: usize,
     limit: usize,
     span: Option<Duration>,
-    /// Samples younger than the span that had to go for want of room.
+    /// Samples evicted before the end of the span, for lack of memory.
     crowded_out: u64,
 }
 
 impl SampleRing {
-    /// Keeps at most `limit` bytes, and nothing older than `span`.
+    /// Creates a ring with at most `limit` bytes, and no sample older than `span`.
     #[must_use]
     pub const fn new(limit: usize, span: Option<Duration>) -> Self {
         Self {
@@ -35,31 +35,31 @@ impl SampleRing {
         }
     }
 
-    /// Bytes kept.
+    /// Bytes in the ring.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Samples kept.
+    /// Number of samples in the ring.
     #[must_use]
     pub fn len(&self) -> usize {
         self.samples.len()
     }
 
-    /// Nothing is kept.
+    /// Returns whether the ring is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.samples.is_empty()
     }
 
-    /// Samples that the bytes had no room for although they were young enough.
+    /// Number of samples evicted before the end of the span, for lack of memory.
     #[must_use]
     pub const fn crowded_out(&self) -> u64 {
         self.crowded_out
     }
 
-    /// Keeps this one.
+    /// Adds a sample, and evicts the oldest ones if necessary.
     pub fn push(&mut self, sample: Arc<Sample>) {
         let now = sample.time;
         self.bytes += cost(&sample);
@@ -70,7 +70,7 @@ impl SampleRing {
         }
     }
 
-    /// Forgets what is too old.
+    /// Evicts samples that are too old at `now`.
     pub fn advance(&mut self, now: Timestamp) {
         let Some(span) = self.span else { return };
         let is_old = |sample: &Arc<Sample>| {
@@ -82,18 +82,18 @@ impl SampleRing {
         }
     }
 
-    /// All of them, oldest first.
+    /// All samples, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = &Arc<Sample>> {
         self.samples.iter()
     }
 
-    /// Forgets all of them.
+    /// Removes all samples.
     pub fn clear(&mut self) {
         self.samples.clear();
         self.bytes = 0;
     }
 
-    /// Gives all of them away, oldest first.
+    /// Removes and returns all samples, oldest first.
     pub fn drain(&mut self) -> impl Iterator<Item = Arc<Sample>> + use<> {
         self.bytes = 0;
         std::mem::take(&mut self.samples).into_iter()
@@ -163,7 +163,7 @@ mod tests {
         }
         assert_eq!(ring.crowded_out(), 3);
         assert_eq!(numbers(&mut ring), [3, 4]);
-        // One that is larger than everything is not kept, and nothing else is harmed by it later.
+        // A sample larger than the limit is not kept, and does not affect later ones.
         ring.push(sample(6, 5000));
         assert!(ring.is_empty());
         ring.push(sample(7, 10));

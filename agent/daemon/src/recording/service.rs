@@ -1,5 +1,5 @@
-//! The agent's own recordings: begun and ended by clients, each on a thread of its own, written where
-//! the configuration allows and nowhere else.
+//! Recordings of the agent, started and ended by clients. Each runs on its own thread, and writes
+//! only below the configured directory.
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -33,18 +33,18 @@ use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
 use ros2probe_wire::DomainId;
 
-/// Ended ones whose report is kept.
+/// Most ended recordings whose report is kept.
 const ENDED: usize = 16;
-/// A larger chunk of a bag is not kept in memory, nor a larger index of a file.
+/// Largest chunk of a bag, and largest index of a file, kept in memory, in bytes.
 const CHUNK_BYTES: u64 = 1 << 20;
 const INDEX_BYTES: u64 = 1 << 20;
-/// Longest name of a recording.
+/// Longest name of a recording, in bytes.
 const NAME: usize = 128;
 
 /// All recordings of an agent.
 #[derive(Debug)]
 pub struct Recordings {
-    /// Where they are written; `None` = nowhere.
+    /// Directory of the bags; `None` if recordings are refused.
     directory: Option<PathBuf>,
     limits: RecordingLimits,
     queue_bytes: usize,
@@ -58,41 +58,41 @@ pub struct Recordings {
     slots: Arc<Slots>,
 }
 
-/// What recordings are made of.
+/// Parts that recordings need.
 #[derive(Debug)]
 pub struct Components {
-    /// Where they are written; `None` = nowhere.
+    /// Directory of the bags; `None` if recordings are refused.
     pub directory: Option<PathBuf>,
-    /// What they may take of the disk.
+    /// Limits of disk usage.
     pub limits: RecordingLimits,
-    /// Bytes of each that may wait for being written.
+    /// Bytes of each recording that may wait for the storage.
     pub queue_bytes: usize,
-    /// What discovery knows.
+    /// Latest snapshot of the model.
     pub latest: Arc<SnapshotCell>,
-    /// Takes their beginnings and ends.
+    /// Log for the start and end of recordings.
     pub events: Arc<EventLog>,
-    /// Limits their number and that of topics.
+    /// Caps on the number of recordings and topics.
     pub caps: Arc<LimitFigures>,
-    /// Counts what they write.
+    /// Counters of written messages.
     pub figures: Arc<RecordingFigures>,
-    /// Where messages come from.
+    /// Source of messages.
     pub subscriptions: Arc<Subscriptions>,
     /// Definitions of messages.
     pub library: Arc<Library>,
 }
 
-/// What a client wants to be recorded.
+/// Recording requested by a client.
 #[derive(Debug)]
 pub struct RecordingOptions {
-    /// Name of the directory; the time when it is left out.
+    /// Name of the directory; the current time if omitted.
     pub name: Option<String>,
-    /// Which topics.
+    /// Selection of topics.
     pub asked: FilterOptions,
-    /// Of which domain.
+    /// Domain of the topics.
     pub domain_id: u32,
-    /// How it is written.
+    /// Options of the bag.
     pub options: Options,
-    /// Begins paused.
+    /// Whether it starts paused.
     pub paused: bool,
 }
 
@@ -101,13 +101,13 @@ pub struct RecordingOptions {
 pub struct Recording {
     /// Name of its directory.
     pub name: String,
-    /// Where it lies.
+    /// Path of its directory.
     pub directory: PathBuf,
-    /// Of which domain.
+    /// Domain of the topics.
     pub domain_id: u32,
-    /// What is recorded.
+    /// Selection of topics.
     pub asked: FilterOptions,
-    /// When it began.
+    /// Time of its start.
     pub began: SystemTime,
     status: Mutex<Status>,
     commands: Mutex<Sender<Command>>,
@@ -115,61 +115,61 @@ pub struct Recording {
     over: Notify,
 }
 
-/// How it goes.
+/// Status of a recording.
 #[derive(Clone, Debug, Default)]
 pub struct Status {
-    /// What it is doing.
+    /// State of the recording.
     pub state: RecordingState,
-    /// What it has and has not.
+    /// Recorded and missing messages.
     pub report: Report,
     /// Bytes of its files.
     pub file_bytes: u64,
-    /// Files begun.
+    /// Number of files, including the open one.
     pub files: usize,
-    /// Why it ended, if that was not asked for.
+    /// Reason of an end that was not requested.
     pub error: Option<String>,
 }
 
-/// Why nothing is recorded.
+/// A recording was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum Refusal {
-    /// There is no place.
+    /// No directory is available.
     #[error(
-        "the agent has no place for recordings: set `recordings.directory`, or record with \
+        "the agent has no directory for recordings: set `recordings.directory`, or record with \
          `rp bag record`"
     )]
     NoDirectory,
-    /// No name of a directory.
+    /// The name is not a valid directory name.
     #[error(
         "`{0}` is not a valid name: use letters, digits, `_`, `-` and `.`, not starting with \
              `.`"
     )]
     Name(String),
-    /// There is one of that name.
+    /// A bag of this name exists.
     #[error("a recording named `{0}` already exists")]
     Exists(String),
-    /// As many as may are under way.
+    /// The number of active recordings is at its limit.
     #[error("{0} recordings are running, which is the limit (limits.recordings)")]
     TooMany(usize),
-    /// The topics.
+    /// The selection is invalid.
     #[error(transparent)]
     Filter(#[from] FilterError),
-    /// A topic's name.
+    /// A topic's name is invalid.
     #[error(transparent)]
     Choice(#[from] ChoiceError),
-    /// Too many subscriptions.
+    /// The subscription was refused.
     #[error(transparent)]
     Subscription(#[from] Refused),
-    /// It cannot be written.
+    /// The bag cannot be written.
     #[error("{reason}")]
     Storage {
-        /// With its causes.
+        /// Error with its causes.
         reason: String,
     },
 }
 
 impl Recordings {
-    /// None yet.
+    /// Creates the service without recordings.
     #[must_use]
     pub fn new(components: Components) -> Self {
         let Components {
@@ -198,10 +198,12 @@ impl Recordings {
         }
     }
 
-    /// Begins one. The subscription is open when this returns; see [`Subscription::in_force`].
+    /// Starts a recording. Its subscription is open when this returns; see
+    /// [`Subscription::in_force`].
     ///
     /// # Errors
-    /// It cannot be.
+    ///
+    /// Returns [`Refusal`] if the recording cannot start.
     pub fn begin(&self, wanted: RecordingOptions) -> Result<Arc<Recording>, Refusal> {
         let filter = Filter::new(wanted.asked.clone())?;
         let (name, directory) = self.bag_directory(wanted.name)?;
@@ -247,8 +249,8 @@ impl Recordings {
         Ok(recording)
     }
 
-    /// Declares the known topics that the subscription covers, as many as are measured: a robot that
-    /// announces thousands fills no bag.
+    /// Adds the known topics of the subscription to the bag, at most as many as can be measured.
+    /// Thousands of announced topics thus cannot fill a bag.
     fn declare(
         &self,
         recorder: &mut Recorder<'_>,
@@ -270,7 +272,7 @@ impl Recordings {
         }))
     }
 
-    /// Starts the thread of a recording; removes the bag, which is empty, if that fails.
+    /// Starts the thread of a recording. Removes the empty bag on failure.
     fn spawn(
         &self,
         recording: &Arc<Recording>,
@@ -284,7 +286,7 @@ impl Recordings {
         let thread = std::thread::Builder::new().name("recording".to_owned());
         thread.spawn(work).map_err(|error| {
             let _ = std::fs::remove_dir_all(&recording.directory);
-            let reason = format!("no thread for it: {error}");
+            let reason = format!("cannot start the recording's thread: {error}");
             self.events.record(AgentEvent::RecordingEnded {
                 recording: recording.name.clone(),
                 messages: 0,
@@ -295,7 +297,7 @@ impl Recordings {
         })
     }
 
-    /// All of them, as they began.
+    /// All recordings in the order of their start.
     #[must_use]
     pub fn all(&self) -> Vec<Arc<Recording>> {
         let mut list = self.list();
@@ -303,14 +305,14 @@ impl Recordings {
         list.clone()
     }
 
-    /// The one of this name.
+    /// The recording of this name. `None` if it does not exist.
     #[must_use]
     pub fn find(&self, name: &str) -> Option<Arc<Recording>> {
-        // The latest, should one have been deleted and begun again.
+        // The latest one, since a deleted name can be used again.
         self.list().iter().rfind(|each| each.name == name).cloned()
     }
 
-    /// Completes all bags, when the agent ends.
+    /// Completes all bags at the end of the agent.
     pub fn finish(&self) {
         let list = self.all();
         for recording in &list {
@@ -326,24 +328,24 @@ impl Recordings {
         }
     }
 
-    /// Where the agent writes.
+    /// Directory of the bags.
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         self.directory.as_deref()
     }
 
-    /// What they may take of the disk.
+    /// Limits of disk usage.
     #[must_use]
     pub const fn limits(&self) -> RecordingLimits {
         self.limits
     }
 
-    /// The room of a bag that is to lie there.
+    /// Quota for a bag at this path.
     pub(super) fn quota(&self, bag: &Path) -> DiskQuota {
         DiskQuota::new(bag.parent().unwrap_or(bag), self.limits)
     }
 
-    /// Opens what `filter` takes, of one domain.
+    /// Subscribes to topics selected by `filter` in one domain.
     fn subscribe(
         &self,
         filter: &Filter,
@@ -353,7 +355,7 @@ impl Recordings {
         self.open(filter.selection()?, domain_id, name)
     }
 
-    /// Opens these topics of one domain.
+    /// Subscribes to these topics of one domain.
     pub(super) fn open(
         &self,
         topics: Selection,
@@ -370,7 +372,7 @@ impl Recordings {
         })?)
     }
 
-    /// What the snapshot and the library know.
+    /// Sources for a recorder, from the snapshot and the library.
     pub(super) fn sources(&self, domain_id: u32) -> Sources<'static> {
         let (latest, library) = (Arc::clone(&self.latest), Arc::clone(&self.library));
         let seen = Arc::clone(&self.latest);
@@ -394,7 +396,7 @@ impl Recordings {
         }
     }
 
-    /// Name and directory, checked.
+    /// Validated name and path of a new bag.
     pub(super) fn bag_directory(&self, name: Option<String>) -> Result<(String, PathBuf), Refusal> {
         let Some(directory) = &self.directory else {
             return Err(Refusal::NoDirectory);
@@ -418,19 +420,19 @@ impl Recordings {
 }
 
 impl Recording {
-    /// How it goes, at most half a second ago.
+    /// Status, at most half a second old.
     #[must_use]
     pub fn status(&self) -> Status {
         locked(&self.status).clone()
     }
 
-    /// Asks for something; nothing happens where it is over.
+    /// Sends a command. Does nothing if the recording has ended.
     pub fn command(&self, command: Command) {
-        // Nobody takes orders where it is over.
+        // Fails only if the recording has ended.
         let _ = locked(&self.commands).send(command);
     }
 
-    /// Waits until the bag is complete, but no longer than `timeout`.
+    /// Waits at most `timeout` for the bag to be complete. Returns whether it is.
     pub async fn over(&self, timeout: Duration) -> bool {
         let wait = async {
             loop {
@@ -488,7 +490,7 @@ impl Recording {
             reason: error.clone(),
         });
         self.finish(ended, error);
-        // A bag of many topics takes much, and it may be long until the next one.
+        // A bag of many topics uses much memory, and the next one may be far off.
         give_back_memory();
     }
 
@@ -521,12 +523,12 @@ impl Recording {
     }
 }
 
-/// What is behind a lock here is whole at any moment.
+/// Locks the mutex. A poisoned lock is usable, since the contents are always consistent.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The definition of a type for a bag, where there is one that its hash agrees with.
+/// Definition of a type for a bag. `None` if no definition has this name and hash.
 pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schema> {
     let found = library.find(name, hash).ok()?;
     let (encoding, text) = found.schema_text();
@@ -536,7 +538,7 @@ pub fn schema(library: &Library, name: &str, hash: Option<&str>) -> Option<Schem
     })
 }
 
-/// Local time, as rosbag2 names its directories.
+/// Name of a bag from the local time, in the format of rosbag2.
 #[must_use]
 pub fn default_name() -> String {
     Zoned::now()
@@ -553,7 +555,7 @@ pub(super) fn refusal(name: &str, error: ros2probe_bag::Error) -> Refusal {
     }
 }
 
-/// An error with its causes.
+/// Text of an error with its causes.
 pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
     let mut text = error.to_string();
     let mut cause = std::error::Error::source(error);
@@ -564,7 +566,7 @@ pub(super) fn causes(error: &ros2probe_bag::Error) -> String {
     text
 }
 
-/// Keeps the latest of those that ended.
+/// Removes all but the latest ended recordings.
 fn forget_ended(list: &mut Vec<Arc<Recording>>) {
     let mut surplus = list.iter().filter(|each| each.is_over()).count();
     surplus = surplus.saturating_sub(ENDED);

@@ -1,8 +1,8 @@
-//! The life of a recording: what comes is handed to the recorder until somebody ends it, the source
-//! ends, or the storage takes no more. The same within the agent and in a client.
+//! Runs a recording: passes items to the recorder until a command, the end of the source, or an
+//! error of the storage. The agent and clients share this code.
 //!
-//! What was sent before the end was asked for is still taken. Whole files are compressed beside it,
-//! by a thread that ends with it.
+//! Messages sent before the end was requested are still recorded. Whole files are compressed on a
+//! separate thread that ends with the recording.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -16,38 +16,38 @@ use super::recorder::{Finished, Recorder};
 use crate::subscriptions::{Item, NextItem};
 use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 
-/// How long orders wait at most.
+/// Longest delay of a command.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// How often the state of a recording is reported.
+/// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
-/// How long what was sent before the end is waited for.
+/// Longest wait for messages sent before the end.
 const FAREWELL: Duration = Duration::from_secs(2);
 
-/// What may be asked of a recording under way.
+/// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Command {
-    /// Let samples go by from now on.
+    /// Ignore samples from now on.
     Pause,
-    /// Take them again.
+    /// Record samples again.
     Resume,
-    /// The one or the other.
+    /// Pause or resume.
     Toggle,
-    /// Go on in a new file.
+    /// Continue in a new file.
     Split,
-    /// Write what waits in memory.
+    /// Write the samples in memory.
     Snapshot,
     /// Complete the bag.
     Stop,
-    /// Complete it without what takes long: messages on their way, compression of whole files.
+    /// Complete the bag without slow steps: messages in flight, compression of whole files.
     Hurry,
 }
 
-/// What a recording is doing.
+/// Current activity of a recording.
 #[derive(Clone, Copy, Debug)]
 pub enum Activity<'a> {
-    /// It takes messages.
+    /// It records messages.
     Recording(&'a Recorder<'a>),
-    /// It takes the last messages and completes the bag.
+    /// It records the last messages and completes the bag.
     Completing,
     /// It compresses a whole file.
     Compressing {
@@ -58,21 +58,21 @@ pub enum Activity<'a> {
     },
 }
 
-/// Whole files on their way to being compressed, one after the other.
+/// Files to compress, one after the other.
 #[derive(Default)]
 struct Compressing {
     waiting: VecDeque<FileCompression>,
     task: Option<CompressionTask>,
 }
 
-/// A file that is being compressed by a thread of its own.
+/// A file in compression on its own thread.
 struct CompressionTask {
     thread: JoinHandle<Result<Compressed, Error>>,
     progress: Arc<Progress>,
     bytes: u64,
 }
 
-/// Orders and the one who listens, while the bag is being completed.
+/// Commands and the listener during the completion of the bag.
 struct Completion<'a, T> {
     commands: &'a Receiver<Command>,
     report_activity: T,
@@ -80,8 +80,8 @@ struct Completion<'a, T> {
     hurry: bool,
 }
 
-/// Records until it ends; the second value is why the source did, if it broke. `report_activity` hears of the
-/// recording now and then, and whenever an order was carried out.
+/// Records until the end. The second value is the source's error, if it broke. `report_activity` is
+/// called regularly and after each command.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<NextItem, E>,
@@ -173,7 +173,7 @@ fn carry_out(
             Ok(Command::Split) => recorder.split()?,
             Ok(Command::Snapshot) => recorder.snapshot()?,
             Ok(Command::Hurry) => return Ok(CommandOutcome::Hurry),
-            // Who could give orders has gone.
+            // All senders of commands are gone.
             Ok(Command::Stop) | Err(TryRecvError::Disconnected) => return Ok(CommandOutcome::Stop),
             Err(TryRecvError::Empty) => return Ok(outcome),
         }
@@ -182,7 +182,7 @@ fn carry_out(
 }
 
 impl Compressing {
-    /// Takes over what is done, and begins with what waits.
+    /// Handles finished compressions and starts the next one.
     fn poll(&mut self, recorder: &mut Recorder<'_>) -> Result<(), Error> {
         if let Some(task) = &self.task
             && !task.thread.is_finished()
@@ -197,7 +197,7 @@ impl Compressing {
         Ok(())
     }
 
-    /// Waits for what was begun and for what waits.
+    /// Waits for all running and pending compressions.
     fn finish(
         &mut self,
         recorder: &mut Recorder<'_>,
@@ -215,7 +215,7 @@ impl Compressing {
 }
 
 impl CompressionTask {
-    /// `None` without a thread: then the file stays as it is, which is no loss.
+    /// `None` without a thread: the file then stays uncompressed, which loses nothing.
     fn begin(work: FileCompression) -> Option<Self> {
         let progress = Arc::new(Progress::default());
         let (watched, bytes) = (Arc::clone(&progress), work.bytes());
@@ -232,7 +232,7 @@ impl CompressionTask {
         self.thread.join().ok()
     }
 
-    /// Waits until the file is compressed; `None` where that was given up.
+    /// Waits for the compression of the file. `None` if it was cancelled.
     fn wait(
         self,
         completion: &mut Completion<'_, impl FnMut(Activity<'_>)>,

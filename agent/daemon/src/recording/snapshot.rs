@@ -1,8 +1,8 @@
-//! Snapshots: the last seconds of chosen topics, always in memory, written into a bag when something
-//! happens: an expectation is violated, a client asks, the agent gets SIGUSR1.
+//! Snapshots: the last seconds of selected topics in memory, written into a bag on a violated
+//! expectation, a client's request, or SIGUSR1.
 //!
-//! Bounded in bytes and seconds; what that costs is shown. A robot that goes on failing fills no
-//! disk: one bag at most for each length of the snapshot, and a sum of bytes for all of them.
+//! Bounded in bytes and seconds; the memory is reported. Repeated failures cannot fill the disk:
+//! there is at most one bag per time span of the snapshot, and a limit on the bytes of all bags.
 
 use std::collections::HashSet;
 use std::path::PathBuf;
@@ -27,13 +27,13 @@ use crate::subscriptions::{Item, Selection, Subscription};
 use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{Options, Writer};
 
-/// How long orders and events wait at most.
+/// Longest delay of commands and events.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Between two bags, at least.
+/// Least time between two bags.
 const PAUSE: Duration = Duration::from_secs(10);
-/// All bags of one snapshot together.
+/// Most bytes of all bags of one snapshot.
 const DISK: u64 = 1 << 30;
-/// Clients that wait for one at once.
+/// Most clients that wait for a bag at once.
 const CLIENTS: usize = 8;
 const EXPECTATION: &str = "ros2.topic.expectation_changed";
 
@@ -42,15 +42,15 @@ const EXPECTATION: &str = "ros2.topic.expectation_changed";
 pub struct WrittenBag {
     /// Name of its directory.
     pub name: String,
-    /// Where it lies.
+    /// Path of its directory.
     pub directory: PathBuf,
-    /// Messages in it.
+    /// Number of messages in it.
     pub messages: u64,
 }
 
 type Answer = oneshot::Sender<Result<WrittenBag, String>>;
 
-/// All snapshots of the configuration.
+/// All configured snapshots.
 #[derive(Debug, Default)]
 pub struct Snapshots {
     list: Vec<Snapshot>,
@@ -65,22 +65,23 @@ struct Snapshot {
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// What its thread works with.
+/// State of a snapshot's thread.
 struct SnapshotTask {
     settings: SnapshotSettings,
     recordings: Arc<Recordings>,
     ring: SampleRing,
     figures: SnapshotFigures,
-    /// The last event that was looked at.
+    /// Number of the last examined event.
     event: u64,
     written: Option<Instant>,
 }
 
 impl Snapshots {
-    /// Keeps them from now on.
+    /// Starts all snapshots.
     ///
     /// # Errors
-    /// There is no directory, no room for a subscription, or no thread.
+    ///
+    /// No directory is available, a subscription is refused, or a thread cannot be started.
     pub fn start(
         settings: &[SnapshotSettings],
         recordings: &Arc<Recordings>,
@@ -108,7 +109,7 @@ impl Snapshots {
             let work = move || keeper.work(subscription, &waiting, &ordered, &stopping);
             let thread = std::thread::Builder::new().name("snapshot".to_owned());
             let thread = thread.spawn(work).map_err(|error| Refusal::Storage {
-                reason: format!("no thread for the snapshot: {error}"),
+                reason: format!("cannot start the snapshot's thread: {error}"),
             })?;
             list.push(Snapshot {
                 settings: settings.clone(),
@@ -120,37 +121,40 @@ impl Snapshots {
         Ok(Self { list, stop })
     }
 
-    /// Those that are kept.
+    /// Settings of all snapshots.
     pub fn settings(&self) -> impl Iterator<Item = &SnapshotSettings> {
         self.list.iter().map(|snapshot| &snapshot.settings)
     }
 
-    /// Has the one of this name written, whatever was written before; `None` = there is none.
+    /// Writes the snapshot of this name, regardless of earlier bags. `None` if it does not exist.
     pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, String>> {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
         if snapshot.clients.try_send(answer).is_err() {
-            return Some(Err("too many clients wait for it".to_owned()));
+            return Some(Err("too many clients wait for this snapshot".to_owned()));
         }
         let written = written.await;
         Some(written.unwrap_or_else(|_| Err("the agent is shutting down".to_owned())))
     }
 
-    /// Has all of them written.
+    /// Writes all snapshots.
     pub fn write_all(&self) {
         for snapshot in &self.list {
             snapshot.asked.store(true, Ordering::Relaxed);
         }
     }
 
-    /// When the agent ends.
+    /// Stops all snapshots at the end of the agent.
     pub fn finish(&self) {
         self.stop.store(true, Ordering::Relaxed);
         for snapshot in &self.list {
             let thread = snapshot.thread.lock();
             let thread = thread.unwrap_or_else(PoisonError::into_inner).take();
             if thread.is_some_and(|thread| thread.join().is_err()) {
-                tracing::error!(snapshot = snapshot.settings.name, "its thread failed");
+                tracing::error!(
+                    snapshot = snapshot.settings.name,
+                    "the snapshot's thread failed"
+                );
             }
         }
     }
@@ -179,7 +183,7 @@ impl SnapshotTask {
             looked = Instant::now();
             self.show();
             if let Ok(client) = clients.try_recv() {
-                // Who does not wait any more has it in the directory all the same.
+                // If the client no longer waits, the bag exists nevertheless.
                 let _ = client.send(self.write());
             }
             let violated = self.settings.on_violation && self.is_violated();
@@ -188,15 +192,15 @@ impl SnapshotTask {
             let rested = self
                 .written
                 .is_none_or(|written| written.elapsed() >= pause);
-            // A topic that never came is no incident that something was kept of.
+            // A topic without any message is not worth a bag.
             if asked || (violated && rested && !self.ring.is_empty()) {
-                // Told as an event.
+                // The event log records the result.
                 let _ = self.write();
             }
         }
     }
 
-    /// Whether an expectation has been broken since the last look.
+    /// Returns whether an expectation was violated since the last call.
     fn is_violated(&mut self) -> bool {
         let events = Arc::clone(&self.recordings.events);
         let mut violated = false;
@@ -229,14 +233,14 @@ impl SnapshotTask {
         outcome
     }
 
-    /// What is kept, in a bag of its own; it stays in memory where that fails.
+    /// Writes the samples in memory into a new bag. They stay in memory if that fails.
     fn bag(&mut self) -> (String, Result<WrittenBag, String>) {
         let base = format!("{}_{}", self.settings.name, default_name());
         let mut wanted = base.clone();
         let directory = self.recordings.directory();
         let mut copies = 1;
         while directory.is_some_and(|directory| directory.join(&wanted).exists()) {
-            // Another one in the same second.
+            // Another bag in the same second.
             copies += 1;
             wanted = format!("{base}_{copies}");
         }
@@ -246,9 +250,7 @@ impl SnapshotTask {
         };
         let used = self.used();
         if used >= DISK {
-            let reason = format!(
-                "the snapshots there take {used} bytes already, of {DISK} they may: remove some"
-            );
+            let reason = format!("bags of this snapshot use {used} of {DISK} bytes: remove some");
             return (name, Err(reason));
         }
         let write = || -> Result<WrittenBag, Refusal> {
@@ -263,7 +265,7 @@ impl SnapshotTask {
             let writer = writer.map_err(|error| refusal(&name, error))?;
             let mut sources = self.recordings.sources(self.settings.domain_id);
             let domain_id = self.settings.domain_id;
-            // The report is about the topics in memory, not about what else is there.
+            // The report covers only topics in memory.
             let names = self.ring.iter().map(|sample| sample.topic.name.to_string());
             let names: HashSet<String> = names.collect();
             let mut all = sources.graph;
@@ -300,10 +302,10 @@ impl SnapshotTask {
         let outcome = write();
         match &outcome {
             Ok(_) => self.ring.clear(),
-            // There was one before this.
+            // A bag of this name exists already.
             Err(Refusal::Exists(_)) => {}
-            // All of it is still in memory: the part of a bag is of no use, and would be
-            // joined by the next one.
+            // All samples are still in memory: the incomplete bag is useless, and the next one
+            // would be added to it.
             Err(_) => {
                 let _ = std::fs::remove_dir_all(&directory);
             }
@@ -311,7 +313,7 @@ impl SnapshotTask {
         (name, outcome.map_err(|refusal| refusal.to_string()))
     }
 
-    /// Bytes of the bags of this snapshot that still lie there.
+    /// Bytes of this snapshot's bags on disk.
     fn used(&self) -> u64 {
         let prefix = format!("{}_rosbag2_", self.settings.name);
         let entries = |path: &std::path::Path| std::fs::read_dir(path).into_iter().flatten();

@@ -1,4 +1,4 @@
-//! A time in a capture, as people name it.
+//! Time in a capture, as typed by a user.
 
 use std::str::FromStr;
 
@@ -7,14 +7,14 @@ use ros2probe_wire::Timestamp;
 /// A time in a capture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CaptureTime {
-    /// Since the epoch.
+    /// Time since the epoch.
     At(Timestamp),
     /// Nanoseconds since the capture's first packet.
     After(u64),
 }
 
 impl CaptureTime {
-    /// The time in a capture that begins at `beginning`.
+    /// Absolute time in a capture that begins at `beginning`.
     #[must_use]
     pub const fn in_capture(self, beginning: Timestamp) -> Timestamp {
         match self {
@@ -27,7 +27,8 @@ impl CaptureTime {
 impl FromStr for CaptureTime {
     type Err = &'static str;
 
-    /// Unix seconds, or `+` and seconds from the capture's beginning; nanoseconds are kept.
+    /// Parses Unix seconds, or `+` and seconds from the capture's beginning, with nanosecond
+    /// precision.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         const WRONG: &str =
             "must be Unix seconds, or `+S` for seconds from the capture's beginning";

@@ -1,5 +1,5 @@
-//! The agent's one working thread: takes packets from the source, feeds the model, pins a snapshot
-//! once a second and when a scrape asks for one. Surfaces never reach in here; they read snapshots.
+//! Working thread of the agent: reads packets from the source, feeds the model, and publishes a
+//! snapshot once a second or on a scrape. Surfaces only read snapshots.
 
 mod capture_time;
 pub mod replay;
@@ -31,63 +31,63 @@ use ros2probe_model::selection::SampleRequest;
 use ros2probe_model::snapshot::Snapshot;
 pub use source::{Source, probe};
 
-/// Longest time without looking at commands and the clock. Captured frames and a record ring that
-/// is half full end it earlier; each round costs a wake-up, and on a quiet host nothing else does.
+/// Longest time without checking commands and the clock. Captured frames and a half-full record
+/// ring end it earlier. Each round costs a wake-up, and on a quiet host nothing else does.
 const SLICE: Duration = Duration::from_millis(250);
-/// How often surfaces get a new snapshot unasked, and how often at most when they ask.
+/// Interval of snapshots without requests, and least interval with requests.
 const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
-/// Subscribers learn at least this often that nothing came.
+/// Longest interval of clock items to subscribers during silence.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
 const CLOCK_NANOSECONDS: u64 = 100_000_000;
-/// A clock that is so far behind what was told was set back.
+/// Step back of the clock, in nanoseconds, that means it was set.
 const SET_BACK: u64 = 1_000_000_000;
 
-/// Why the working thread ended by itself.
+/// The working thread ended with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The host's interfaces can no longer be captured.
-    #[error("capturing ended")]
+    #[error("the capture failed")]
     Capture(#[from] CaptureError),
-    /// The rest of a capture cannot be read; what came before it is published.
-    #[error("the capture was replayed up to a fault")]
+    /// The rest of a capture cannot be read; packets before it are published.
+    #[error("the rest of the capture is unreadable")]
     Replay(#[source] PcapError),
 }
 
-/// Source, model and outputs, for one thread.
+/// Source, model and outputs of the working thread.
 pub struct Run {
     source: Source,
     observer: Observer,
-    /// Participants whose last message the kernel filter notes.
+    /// Participants whose last message the kernel filter records.
     followed: BTreeSet<GuidPrefix>,
     outputs: Outputs,
     drops: DropMonitor,
     watches: Arc<Watches>,
     subscriptions: Arc<Subscriptions>,
-    /// Those that subscriptions wait for to be in force.
+    /// Requests that subscriptions wait for.
     sample_requests: Option<Arc<Vec<SampleRequest>>>,
-    /// The time that subscriptions were last told.
+    /// Last clock item sent to subscriptions.
     published_until: Timestamp,
     stop: CancellationToken,
     keeper: Option<StateWriter>,
     history: Option<History>,
 }
 
-/// Where the loop leaves what it finds.
+/// Outputs of the loop.
 #[derive(Debug)]
 pub struct Outputs {
-    /// Takes snapshots.
+    /// Receives snapshots.
     pub latest: Arc<SnapshotCell>,
-    /// Takes events.
+    /// Receives events.
     pub events: Arc<EventLog>,
-    /// Notes which limits a snapshot reaches.
+    /// Records which limits a snapshot reaches.
     pub limits: Arc<LimitFigures>,
-    /// Takes spans of sampled messages.
+    /// Receives spans of sampled messages.
     pub spans: SpanSink,
 }
 
 impl Run {
-    /// Ready to run.
+    /// Creates the loop.
     #[must_use]
     pub fn new(
         source: Source,
@@ -113,22 +113,23 @@ impl Run {
         }
     }
 
-    /// Keeps what discovery knows for the next start.
+    /// Saves the discovery state for the next start.
     #[must_use]
     pub fn keeping(self, keeper: Option<StateWriter>) -> Self {
         Self { keeper, ..self }
     }
 
-    /// Remembers what was measured in the last seconds.
+    /// Keeps the measurements of the last seconds.
     #[must_use]
     pub fn remembering(self, history: Option<History>) -> Self {
         Self { history, ..self }
     }
 
-    /// Works until told to stop or until the capture ends; the last state stays published.
+    /// Runs until it is stopped or the capture ends; the last snapshot stays published.
     ///
     /// # Errors
-    /// When the source fails for good.
+    ///
+    /// The source fails permanently.
     pub fn run(mut self) -> Result<(), RunError> {
         let ended = self.work();
         self.subscriptions.end(match &ended {
@@ -206,13 +207,13 @@ impl Run {
         Ok(())
     }
 
-    /// Where a replay has to stop for a moment: where subscriptions receive the time, or where a
-    /// second ends.
+    /// Next time at which a replay has to return: for a clock item to subscriptions, or at the end
+    /// of a second.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
         let published_until =
             subscribed.then(|| Timestamp(self.published_until.0.saturating_add(CLOCK_NANOSECONDS)));
         let second = self.history.as_ref().map(History::due);
-        // Before the first packet nothing is known of the capture's time.
+        // Before the first packet, the capture's time is unknown.
         let second = second.filter(|second| second.0 > 0);
         match (published_until, second) {
             (Some(published_until), Some(second)) => Some(published_until.min(second)),
@@ -220,7 +221,7 @@ impl Run {
         }
     }
 
-    /// Takes the second that has just ended.
+    /// Stores the measurements of the last second.
     fn remember(&mut self) {
         let now = self.source.clock();
         let Some(history) = self.history.as_mut().filter(|history| history.is_due(now)) else {
@@ -230,7 +231,7 @@ impl Run {
         self.outputs.latest.publish_past(history.past());
     }
 
-    /// Gives away what has come up since the last time. No reader makes this wait.
+    /// Passes new items to the outputs. Slow readers do not block it.
     fn hand_over(&mut self) {
         let now = self.source.clock();
         let output = self.observer.drain();
@@ -248,9 +249,9 @@ impl Run {
         self.subscriptions.deliver(output.samples, news);
     }
 
-    /// Gives the model changed lists of watches and wishes. Returns whether every topic was matched
-    /// against them. Where many topics meet many globs, packets are taken in between, and lists that
-    /// change meanwhile wait.
+    /// Passes changed watches and requests to the model. Returns whether every topic was matched
+    /// against them. With many topics and globs, packets are read in between, and further changes
+    /// wait.
     fn take_watches(&mut self) -> bool {
         if self.apply_lists() {
             if let Some(watchlist) = self.watches.take_changed() {
@@ -266,7 +267,7 @@ impl Run {
         self.apply_lists()
     }
 
-    /// Confirms wishes whose verdicts the kernel has, before the next packets.
+    /// Confirms requests that are in force in the kernel, before the next packets.
     fn confirm_wishes(&mut self) {
         if let Some(sample_requests) = self.sample_requests.take() {
             self.subscriptions.in_force(&sample_requests);
@@ -277,8 +278,8 @@ impl Run {
         }
     }
 
-    /// Applies new lists of watches and subscriptions to further topics; returns whether all are done.
-    /// A replay waits for it.
+    /// Applies new lists of watches and subscriptions to further topics. Returns whether all are
+    /// done; a replay waits for it.
     fn apply_lists(&mut self) -> bool {
         while !self.observer.apply_more_lists() {
             if let Source::Live(_) = self.source {
@@ -318,7 +319,7 @@ impl Run {
     }
 }
 
-/// Keeps the kernel filter's list of participants the model's.
+/// Copies the model's list of participants to the kernel filter.
 fn follow(live: &mut LiveSource, followed: &mut BTreeSet<GuidPrefix>, snapshot: &Snapshot) {
     let present: BTreeSet<_> = snapshot
         .participants

@@ -1,5 +1,5 @@
-//! A capture as a source: its packets at the pace asked for, in slices short enough that the agent
-//! stays responsive.
+//! Capture file as a source: delivers packets at the requested pace, in short slices so that the
+//! agent stays responsive.
 
 use std::collections::BTreeMap;
 use std::io::IsTerminal as _;
@@ -17,15 +17,15 @@ use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, lin
 use ros2probe_capture::reassembly::{Limits, Reassembly};
 use ros2probe_model::observer::Observer;
 
-/// How often progress is printed on a terminal.
+/// Interval of progress reports on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
-/// A packet this far from the last one is gone to at once, not step by step.
+/// Gap between packets, in nanoseconds, that the replay skips in one step.
 const FAR: u64 = 3600 * 1_000_000_000;
 
-/// The polling period of requests while a replay is paused.
+/// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
 
-/// Both ends of a pause of a replay, which lasts until it is resumed.
+/// Creates both ends of a pause, which lasts until it is resumed.
 #[must_use]
 pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
     let (resume, resumed) = mpsc::channel();
@@ -38,10 +38,10 @@ pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
     (pause, ReplayControl { resume, paused })
 }
 
-/// Where a replay waits.
+/// Point at which a replay pauses.
 #[derive(Debug)]
 pub struct PausePoint {
-    /// The beginning when left out.
+    /// Time of the pause. `None` means the beginning.
     at: Option<CaptureTime>,
     resumed: mpsc::Receiver<()>,
     pausing: watch::Sender<bool>,
@@ -55,40 +55,40 @@ pub struct ReplayControl {
 }
 
 impl ReplayControl {
-    /// Returns when the replay pauses, or when it has ended before.
+    /// Returns when the replay pauses, or has ended earlier.
     pub async fn paused(&mut self) {
         let _ = self.paused.wait_for(|pausing| *pausing).await;
     }
 
-    /// Has the replay go on.
+    /// Resumes the replay.
     pub fn resume(&self) {
         let _ = self.resume.send(());
     }
 }
 
-/// A capture being replayed.
+/// A capture in replay.
 pub struct Replay {
     reader: PcapReader,
     decoder: FrameDecoder,
     pacer: Pacer,
     speed: Speed,
-    /// Read but not due yet.
+    /// Packet that is read but not due yet.
     waiting: Option<Waiting>,
     clock: Timestamp,
     packets: u64,
     bytes: u64,
-    /// Packets of link layers that cannot be read, by number.
+    /// Packets of unsupported link layers, by number.
     unsupported: BTreeMap<u16, u64>,
     began: Option<Timestamp>,
     progress: Option<Instant>,
     until: Option<CaptureTime>,
     pause: Option<PausePoint>,
-    /// The capture goes on where the replay ends.
+    /// Whether the replay ends before the capture.
     cut: bool,
     finished: bool,
 }
 
-/// A packet's facts; its bytes are in `bytes`.
+/// Facts about a packet; its bytes are in `bytes`.
 struct Waiting {
     time: Timestamp,
     link: Link,
@@ -101,7 +101,8 @@ impl Replay {
     /// Opens a capture.
     ///
     /// # Errors
-    /// When it cannot be read, is none, or has a link layer that cannot be read.
+    ///
+    /// The file cannot be read, is not a capture, or has an unsupported link layer.
     pub fn open(path: &Path, speed: Speed, limits: Limits) -> Result<Self, PcapError> {
         let reader = PcapReader::open(path)?;
         if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
@@ -126,13 +127,13 @@ impl Replay {
         })
     }
 
-    /// Ends at this moment, as if the capture ended there.
+    /// Ends at this time, as if the capture ended there.
     #[must_use]
     pub fn until(self, until: Option<CaptureTime>) -> Self {
         Self { until, ..self }
     }
 
-    /// Prints no progress: the terminal is used for something else.
+    /// Disables progress reports, for commands that use the terminal.
     #[must_use]
     pub fn quiet(self) -> Self {
         Self {
@@ -141,7 +142,7 @@ impl Replay {
         }
     }
 
-    /// Waits at some moment until it is resumed.
+    /// Pauses at some time until it is resumed.
     #[must_use]
     pub fn pausing_at(self, pause: PausePoint) -> Self {
         Self {
@@ -150,12 +151,12 @@ impl Replay {
         }
     }
 
-    /// Delivers what is due within `timeout`, then returns: at the latest after it, earlier at the
-    /// end of the capture, before a packet that is not older than `until`, and when the model has
-    /// much to give.
+    /// Delivers packets that are due within `timeout`. Returns earlier at the end of the capture,
+    /// before a packet at or after `until`, and when the model has much output.
     ///
     /// # Errors
-    /// When the rest of the capture cannot be read; what came before has been delivered.
+    ///
+    /// The rest of the capture cannot be read; earlier packets have been delivered.
     pub fn poll(
         &mut self,
         timeout: Duration,
@@ -232,7 +233,7 @@ impl Replay {
         Ok(())
     }
 
-    /// Reads one packet ahead, into the memory of the one before.
+    /// Reads one packet ahead, into the memory of the last one.
     fn next(&mut self) -> Result<(), PcapError> {
         let memory = self.waiting.take().map(|waiting| waiting.bytes);
         match self.reader.next_packet() {
@@ -270,7 +271,7 @@ impl Replay {
                     tracing::warn!(
                         link_type,
                         packets,
-                        "packets of an unsupported link type left out"
+                        "packets of an unsupported link type skipped"
                     );
                 }
                 self.is_readable()
@@ -282,7 +283,7 @@ impl Replay {
         }
     }
 
-    /// Fails where every packet is of a link layer that cannot be read.
+    /// Fails if every packet has an unsupported link layer.
     fn is_readable(&self) -> Result<(), PcapError> {
         match self.unsupported.first_key_value() {
             Some((link, _)) if self.unsupported.values().sum::<u64>() == self.packets => {
@@ -293,8 +294,7 @@ impl Replay {
         }
     }
 
-    /// Waits a moment for being told to go on. What was asked for meanwhile is to be taken before the
-    /// next packets.
+    /// Waits briefly for the end of the pause. New requests are handled before the next packets.
     fn wait(&mut self) {
         let Some(pause) = &self.pause else { return };
         let begins = pause
@@ -308,7 +308,7 @@ impl Replay {
         }
     }
 
-    /// It has come to its pause, which was not reported yet.
+    /// Returns whether the pause is reached and not reported yet.
     #[must_use]
     pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
@@ -325,32 +325,32 @@ impl Replay {
         }
     }
 
-    /// Where it ended although the capture goes on.
+    /// Time of the end, if it was before that of the capture.
     #[must_use]
     pub fn cut(&self) -> Option<Timestamp> {
         self.cut.then_some(self.clock)
     }
 
-    /// The capture's clock: the time of its last packet, running on while the next one is waited
-    /// for.
+    /// Clock of the capture: the time of its last packet, which advances during the wait for the
+    /// next one.
     #[must_use]
     pub const fn clock(&self) -> Timestamp {
         self.clock
     }
 
-    /// All packets were delivered.
+    /// Returns whether all packets were delivered.
     #[must_use]
     pub const fn is_finished(&self) -> bool {
         self.finished
     }
 
-    /// When the capture begins; `None` until its first packet is read.
+    /// Start of the capture. `None` until its first packet is read.
     #[must_use]
     pub const fn began(&self) -> Option<Timestamp> {
         self.began
     }
 
-    /// Which part of the file was read, 0 to 1; `None` if that is unknown.
+    /// Fraction of the file that was read, 0 to 1. `None` if unknown.
     #[must_use]
     pub fn part_read(&self) -> Option<f64> {
         if self.finished {
@@ -359,19 +359,19 @@ impl Replay {
         self.reader.part_read()
     }
 
-    /// Packets and their bytes so far.
+    /// Number of packets and of their bytes so far.
     #[must_use]
     pub const fn progress(&self) -> (u64, u64) {
         (self.packets, self.bytes)
     }
 
-    /// Packets of link layers that cannot be read, by the layer's number.
+    /// Packets of unsupported link layers, by the layer's number.
     #[must_use]
     pub const fn unsupported(&self) -> &BTreeMap<u16, u64> {
         &self.unsupported
     }
 
-    /// What puts its fragments together, for its counters.
+    /// Reassembly of fragments, for its counters.
     #[must_use]
     pub const fn reassembly(&self) -> &Reassembly {
         self.decoder.reassembly()
@@ -394,7 +394,7 @@ impl Replay {
     }
 }
 
-/// How long a tenth of a second of the capture takes.
+/// Real duration of a tenth of a second of the capture.
 fn step(speed: Speed) -> Duration {
     match speed {
         Speed::Max => Duration::ZERO,
@@ -408,7 +408,7 @@ impl PausePoint {
     }
 }
 
-/// The capture's time when a packet is `delay` away.
+/// Time of the capture when a packet is `delay` away.
 fn before(time: Timestamp, delay: Duration, speed: Speed) -> Timestamp {
     let Speed::Times(factor) = speed else {
         return time;

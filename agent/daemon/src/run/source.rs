@@ -1,6 +1,6 @@
-//! Where packets come from: this host or a capture, behind one face for the working thread.
+//! Source of packets: this host or a capture, with one interface for the working thread.
 //!
-//! Also what the agent says of it: in the log once, at the start, and in each snapshot.
+//! It also logs its abilities at the start, and adds facts about itself to each snapshot.
 
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;
@@ -21,7 +21,7 @@ use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
 use ros2probe_model::observer::Observer;
 
-/// Where packets come from.
+/// Source of packets.
 pub enum Source {
     /// This host.
     Live(Box<LiveSource>),
@@ -29,10 +29,11 @@ pub enum Source {
     Replay(Box<Replay>),
 }
 
-/// What an agent with these settings would see on this host: its taps are opened for a moment, and
-/// read nothing.
+/// Abilities of an agent with these settings on this host. The taps are opened briefly, and read
+/// nothing.
 ///
 /// # Errors
+///
 /// A capability is missing, or the kernel refuses.
 pub fn probe(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
     let live = LiveSource::open(settings, Limits::default())?;
@@ -40,7 +41,7 @@ pub fn probe(settings: &CaptureSettings) -> Result<AgentFacts, CaptureError> {
 }
 
 impl Source {
-    /// Sockets, wire or replay.
+    /// Kind of the source.
     #[must_use]
     pub const fn kind(&self) -> SourceKind {
         match self {
@@ -49,7 +50,7 @@ impl Source {
         }
     }
 
-    /// Says in the log what this looks at, what it can tell and what it cannot.
+    /// Logs the source, its abilities and its limits.
     pub fn announce(&self, settings: &CaptureSettings) {
         let Self::Live(live) = self else { return };
         if let Some(reason) = live.without_host() {
@@ -63,7 +64,11 @@ impl Source {
         }
         for (ability, able) in tracepoint_abilities(live).into_iter().flatten() {
             if let Err(reason) = able {
-                tracing::warn!(ability = ability.label(), reason, "not available here");
+                tracing::warn!(
+                    ability = ability.label(),
+                    reason,
+                    "ability not available on this kernel"
+                );
             }
         }
         let able = abilities(live);
@@ -76,11 +81,11 @@ impl Source {
             cgroup = live.host().map(|host| host.cgroup().display().to_string()),
             sees = words(sees).join(", "),
             blind = words(blind).join(", "),
-            "looking"
+            "observing"
         );
     }
 
-    /// Takes in what comes, for `timeout` at most; of a capture nothing from `until` on.
+    /// Reads packets for at most `timeout`; from a capture, only those before `until`.
     pub(super) fn poll(
         &mut self,
         timeout: Duration,
@@ -110,7 +115,7 @@ impl Source {
         }
     }
 
-    /// Where a replay was told to end although the capture goes on.
+    /// Time at which a replay ended before its capture.
     pub(super) fn cut(&self) -> Option<Timestamp> {
         match self {
             Self::Live(_) => None,
@@ -118,7 +123,7 @@ impl Source {
         }
     }
 
-    /// A replay has just come to where it waits: what is known there is to be shown.
+    /// Returns whether a replay has reached its pause, at which the state is to be published.
     pub(super) fn reached_pause(&self) -> bool {
         match self {
             Self::Live(_) => false,
@@ -126,7 +131,7 @@ impl Source {
         }
     }
 
-    /// It is shown.
+    /// Reports the pause after the publication.
     pub(super) fn report_pause(&mut self) {
         if let Self::Replay(replay) = self {
             replay.report_pause();
@@ -206,7 +211,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     };
     AgentFacts {
         interfaces,
-        // Bytes are no events; those copied are counted below.
+        // Bytes are not events; copied ones are counted below.
         filter_events: counters
             .iter()
             .filter(|(counter, _)| *counter != Counter::CapturedBytes)
@@ -232,7 +237,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
     }
 }
 
-/// What exact mode covers, and why not everything; nothing where it was not asked for.
+/// State of exact mode for each library. Empty if it is off.
 fn exact(live: &LiveSource) -> Vec<ExactFacts> {
     let whole = |reason: &str| ExactFacts {
         library: String::new(),
@@ -279,11 +284,11 @@ fn shared_memory(facts: shm::Facts) -> SharedMemoryFacts {
     }
 }
 
-/// What this source can see on this kernel and with this configuration.
+/// Abilities of this source on this kernel and with this configuration.
 fn abilities(live: &LiveSource) -> Vec<Ability> {
     let mut abilities = kind(live).abilities().to_vec();
     if live.host().is_some_and(|host| host.detached().is_some()) {
-        // Its sockets, its processes and their shared memory are gone with the cgroup.
+        // Its sockets, processes and their shared memory have gone with the cgroup.
         return match live.is_on_the_wire() {
             true => vec![Ability::Forwarded],
             false => Vec::new(),
@@ -306,7 +311,7 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     abilities
 }
 
-/// Why it cannot see the rest, where that is known.
+/// Reasons for missing abilities, if known.
 fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     if let Some(reason) = live.host().and_then(HostTap::detached) {
         let able = abilities(live);
@@ -323,7 +328,7 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     blind
 }
 
-/// What depends on the kernel.
+/// Abilities that depend on tracepoints of the kernel.
 fn tracepoint_abilities(live: &LiveSource) -> Option<[(Ability, &Result<(), String>); 3]> {
     let abilities = live.host()?.abilities()?;
     Some([

@@ -127,7 +127,7 @@ fn every_version_is_read_by_its_own_reader_and_the_last_one_is_written() {
 fn a_file_of_the_first_agent_is_read() {
     let (place, directory) = directory();
     let boot = boot();
-    // As it was before shared memory and what matching asks for were kept.
+    // Format before shared memory and requested QoS were added.
     let first = r#"{"version":1,"boot":"BOOT","participants":[{"prefix":"010f0102030405060708090a",
             "vendor":"010f","domain_id":5,"domain_source":"multicast_port","enclave":"/",
             "host":"robot","process_name":"lidar","process_id":42,"lease":20000000000,
@@ -216,7 +216,7 @@ fn two_agents_do_not_share_a_directory() {
 #[test]
 fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
     let (place, directory) = directory();
-    // Nobody can write a file where a directory is.
+    // A file cannot replace a directory.
     let obstacle = place.path().join(NEW_FILE);
     fs::create_dir(&obstacle).unwrap();
     let mut keeper = StateWriter::start(Arc::new(directory)).unwrap();

@@ -1,8 +1,8 @@
-//! What waits for one reader, in the order in which it came, and by topic.
+//! Items that wait for one reader, in order of arrival and by topic.
 //!
-//! Where room is short, the oldest sample of the topic that holds most bytes goes first: a few point
-//! clouds rather than every `/tf`. Times go before any sample, since a later one says as much. It
-//! knows no limit of its own and counts no loss.
+//! For eviction, the oldest sample of the topic with most bytes goes first: a few point clouds
+//! rather than all of `/tf`. Clock items go before any sample, since a later one supersedes them.
+//! This module has no limit and counts no losses.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, HashMap, VecDeque};
@@ -12,15 +12,15 @@ use super::Item;
 use super::channel::QueuedBytes;
 use ros2probe_model::names::DdsName;
 
-/// Entries by their place in the order of coming.
+/// Entries by arrival number.
 #[derive(Debug, Default)]
 pub(super) struct Backlog {
     entries: BTreeMap<u64, Entry>,
-    /// Places given so far.
+    /// Arrival numbers assigned so far.
     places: u64,
     bytes: usize,
     topics: HashMap<Key, Held>,
-    /// Places of what is of no topic.
+    /// Arrival numbers of entries without a topic.
     times: VecDeque<u64>,
 }
 
@@ -28,14 +28,14 @@ pub(super) struct Backlog {
 struct Entry {
     item: Item,
     bytes: usize,
-    /// Given back when the entry goes.
+    /// Released when the entry is removed.
     _charge: Option<Arc<QueuedBytes>>,
 }
 
-/// Domain and DDS name: writers of one topic stand together.
+/// Domain and DDS name, which writers of one topic share.
 type Key = (u32, DdsName);
 
-/// What waits of one topic; never empty.
+/// Waiting entries of one topic; never empty.
 #[derive(Debug, Default)]
 struct Held {
     places: VecDeque<u64>,
@@ -68,23 +68,23 @@ impl Backlog {
         self.entries.insert(place, entry);
     }
 
-    /// What came last. Its topic and its size must stay.
+    /// The newest entry. Callers must not change its topic or size.
     pub(super) fn last_mut(&mut self) -> Option<&mut Item> {
         let last = self.entries.last_entry()?;
         Some(&mut last.into_mut().item)
     }
 
-    /// Takes what came first.
+    /// Removes the oldest entry.
     pub(super) fn pop(&mut self) -> Option<Item> {
         let place = *self.entries.first_key_value()?.0;
         self.remove(place)
     }
 
-    /// Takes what can be missed best.
+    /// Evicts the least important entry.
     pub(super) fn sacrifice(&mut self) -> Option<Item> {
         let time = self.times.front().copied();
         let place = time.or_else(|| {
-            // Among equals the one that waits longest.
+            // Among equals, the one that has waited longest.
             let rank = |held: &&Held| (held.bytes, Reverse(held.places.front().copied()));
             self.topics
                 .values()
@@ -96,7 +96,7 @@ impl Backlog {
         self.remove(place)
     }
 
-    /// Takes the first of all or of its topic.
+    /// Removes the first entry of all or of its topic.
     fn remove(&mut self, place: u64) -> Option<Item> {
         let entry = self.entries.remove(&place)?;
         self.bytes -= entry.bytes;

@@ -1,7 +1,6 @@
-//! The queue between the capture thread and one reader, bounded in bytes.
+//! Queue between the capture thread and one reader, bounded in bytes.
 //!
-//! The capture thread holds its lock for the time of a push, the reader for that of a pop. What is
-//! put into it is for its reader: it chooses no topics.
+//! Each end holds the lock only for one push or pop. The queue does not select topics.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -16,11 +15,11 @@ use super::{Depth, Item, Overflow, Request, Selection};
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::selection::SampleRequest;
 
-/// What a queued entry costs besides a payload.
+/// Memory of a queued entry besides its payload, in bytes.
 const OVERHEAD: usize = 256;
-/// Losses that wait to be reported one by one, by writer and reason; more are reported together.
+/// Most losses reported separately, by writer and reason; further ones are merged.
 const MISSED: usize = 1024;
-/// How often a source that waits for a reader looks whether the agent ends.
+/// Interval at which a source that waits for a reader checks for the end of the agent.
 const LOOK: Duration = Duration::from_millis(50);
 
 /// One subscription, shared by both ends.
@@ -30,9 +29,9 @@ pub(super) struct Channel {
     selection: Arc<Selection>,
     request: ChannelOptions,
     queue: Mutex<Queue>,
-    /// Bytes in the queue, to be read without its lock.
+    /// Bytes in the queue, readable without the lock.
     bytes: AtomicUsize,
-    /// Something may be read, for readers that are tasks and for those that are threads.
+    /// Notification of asynchronous and of blocking readers.
     readable: Notify,
     changed: Condvar,
     in_force: AtomicBool,
@@ -51,16 +50,16 @@ struct ChannelOptions {
 #[derive(Debug, Default)]
 struct Queue {
     waiting: Backlog,
-    /// Samples dropped since the reader was last told.
+    /// Samples dropped since the last report to the reader.
     dropped: Vec<Missed>,
-    /// Of those, how many are not counted yet.
+    /// Number of those that are not counted yet.
     uncounted: u64,
     end: Option<&'static str>,
-    /// The reader has gone.
+    /// Whether the reader has gone.
     closed: bool,
 }
 
-/// Bytes that count in the sum of all queues for as long as this lives.
+/// Bytes that count towards the sum of all queues while this lives.
 #[derive(Debug)]
 pub(super) struct QueuedBytes {
     queued: Arc<AtomicUsize>,
@@ -68,7 +67,7 @@ pub(super) struct QueuedBytes {
 }
 
 impl QueuedBytes {
-    /// For one payload, in however many queues.
+    /// For one payload, which may be in several queues.
     pub(super) fn new(queued: &Arc<AtomicUsize>, bytes: usize) -> Arc<Self> {
         queued.fetch_add(bytes, Ordering::Relaxed);
         Arc::new(Self {
@@ -146,8 +145,8 @@ impl Channel {
         }
     }
 
-    /// Queues a sample. On a replay, this and all else waits for room until the reader goes or the
-    /// agent ends.
+    /// Queues a sample. During a replay, this and the other calls wait for room until the reader
+    /// goes or the agent ends.
     pub(super) fn sample(
         &self,
         sample: &Arc<Sample>,
@@ -160,7 +159,7 @@ impl Channel {
         self.push(&mut queue, item, bytes, charge.map(Arc::clone));
     }
 
-    /// Tells of samples that will not be given.
+    /// Reports samples that will not be delivered.
     pub(super) fn miss(&self, missed: Missed, stop: &CancellationToken) {
         let mut queue = self.wait_for_room(OVERHEAD, stop);
         if let Some(Item::Missed(last)) = queue.waiting.last_mut()
@@ -173,7 +172,7 @@ impl Channel {
         self.push(&mut queue, Item::Missed(missed), OVERHEAD, None);
     }
 
-    /// Everything up to `now` is in the queue.
+    /// Reports that all items up to `now` are in the queue.
     pub(super) fn clock(&self, now: Timestamp, stop: &CancellationToken) {
         let mut queue = self.wait_for_room(OVERHEAD, stop);
         if let Some(Item::Clock(last)) = queue.waiting.last_mut()
@@ -185,13 +184,13 @@ impl Channel {
         self.push(&mut queue, Item::Clock(now), OVERHEAD, None);
     }
 
-    /// Nothing will follow.
+    /// Reports the end of the stream.
     pub(super) fn end(&self, reason: &'static str) {
         self.lock().end.get_or_insert(reason);
         self.wake();
     }
 
-    /// The reader has gone.
+    /// Marks that the reader has gone.
     pub(super) fn close(&self) {
         let mut queue = self.lock();
         queue.closed = true;
@@ -200,13 +199,13 @@ impl Channel {
         self.changed.notify_all();
     }
 
-    /// Tells the reader that there may be something.
+    /// Wakes the reader.
     pub(super) fn wake(&self) {
         self.readable.notify_one();
         self.changed.notify_all();
     }
 
-    /// Bytes that could be taken from it.
+    /// Bytes that could be evicted.
     pub(super) fn droppable(&self) -> usize {
         match self.request.overflow {
             Overflow::DropOldest => self.bytes.load(Ordering::Relaxed),
@@ -214,18 +213,18 @@ impl Channel {
         }
     }
 
-    /// Takes what can be missed best.
+    /// Evicts the least important entry.
     pub(super) fn drop_oldest(&self) {
         let mut queue = self.lock();
         self.drop_one(&mut queue);
     }
 
-    /// Samples that found no room, each told once.
+    /// Returns the number of samples dropped since the last call.
     pub(super) fn take_dropped(&self) -> u64 {
         std::mem::take(&mut self.lock().uncounted)
     }
 
-    /// What the reader gets next, if there is anything.
+    /// Removes the next item for the reader. `None` if nothing waits.
     pub(super) fn take(&self) -> Option<Item> {
         let mut queue = self.lock();
         self.pop(&mut queue)
@@ -279,7 +278,7 @@ impl Channel {
         Some(Item::End(reason))
     }
 
-    /// The queue; on a replay, once it has room.
+    /// Locks the queue; during a replay, after it has room.
     fn wait_for_room(&self, bytes: usize, stop: &CancellationToken) -> MutexGuard<'_, Queue> {
         let mut queue = self.lock();
         while self.request.overflow == Overflow::Wait
@@ -307,7 +306,7 @@ impl Channel {
         {}
     }
 
-    /// Drops an entry; `false` when there is none.
+    /// Evicts an entry. Returns `false` if the queue has no more samples.
     fn drop_one(&self, queue: &mut Queue) -> bool {
         let Some(item) = queue.waiting.sacrifice() else {
             return false;
@@ -350,7 +349,7 @@ impl Queue {
         } else if self.dropped.len() < MISSED {
             self.dropped.push(missed);
         } else if let Some(last) = self.dropped.last_mut() {
-            // Whose they were is no longer told; how many is.
+            // Their writers are no longer reported, only their number.
             last.samples += missed.samples;
         }
     }

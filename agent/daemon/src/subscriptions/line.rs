@@ -1,4 +1,4 @@
-//! Items of a subscription as lines of the API's stream, and back.
+//! Conversion of subscription items to lines of the API's stream, and back.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use ros2probe_wire::{Duration, Timestamp};
 use super::Item;
 use ros2probe_model::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
 
-/// The line for an item of a subscription.
+/// Line of an item.
 #[must_use]
 pub fn line(item: &Item) -> Line {
     match item {
@@ -70,7 +70,7 @@ fn missed(missed: &Missed) -> samples::Missed {
     }
 }
 
-/// What a writer announced, as a line has it.
+/// Offered QoS of a writer in the form of a line.
 #[must_use]
 pub fn offered(offered: &Offered) -> samples::Offered {
     samples::Offered {
@@ -79,7 +79,7 @@ pub fn offered(offered: &Offered) -> samples::Offered {
     }
 }
 
-/// What a writer announced, as discovery has it.
+/// Offered QoS of a writer in the form of discovery.
 pub(super) fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
@@ -106,7 +106,7 @@ fn offered_qos(qos: &Qos) -> OfferedQos {
     }
 }
 
-/// As policies; what has no word stays unknown.
+/// QoS policies; unknown words stay unknown.
 #[must_use]
 pub fn qos(words: &OfferedQos) -> Qos {
     let unknown = u32::MAX;

@@ -1,4 +1,4 @@
-//! Items of a subscription, read from the lines of an agent's stream.
+//! Reads subscription items from the lines of an agent's stream.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,20 +13,20 @@ use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 use super::Item;
 use super::line::announced;
 
-/// Writers that are remembered; of further ones each message makes its own description.
+/// Most writers with a stored description; each message of a further one creates its own.
 const WRITERS: usize = 65_536;
 
-/// Makes items of lines, with the topics that earlier lines described.
+/// Converts lines to items, with the topics that earlier lines described.
 #[derive(Debug)]
 pub struct LineReader {
     topics: HashMap<(u32, String), Arc<Topic>>,
-    /// By writer, with what it announced.
+    /// Topics by writer, with the writer's announcement.
     writers: HashMap<String, Arc<Topic>>,
     open: Open,
 }
 
 impl LineReader {
-    /// For the stream that began with `open`.
+    /// Creates the reader of the stream that began with `open`.
     #[must_use]
     pub fn new(open: Open) -> Self {
         Self {
@@ -36,14 +36,14 @@ impl LineReader {
         }
     }
 
-    /// The line that the stream began with.
+    /// First line of the stream.
     #[must_use]
     pub const fn opened(&self) -> &Open {
         &self.open
     }
 
-    /// The item of a line; `None` for [`Line::Open`]. `payload` holds the bytes that follow the line
-    /// of a sample.
+    /// The item of a line. `None` for [`Line::Open`]. `payload` holds the bytes after the line of a
+    /// sample.
     pub fn item(&mut self, line: &Line, payload: Bytes) -> Option<Item> {
         Some(match line {
             Line::Open(_) => return None,
@@ -85,7 +85,7 @@ impl LineReader {
         topic
     }
 
-    /// Without a type it is the one known from before.
+    /// Topic of a line. Without a type, the type of an earlier line applies.
     fn topic(
         &mut self,
         domain_id: u32,
@@ -143,7 +143,7 @@ fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
     Some((seconds, rest))
 }
 
-/// Unknown where it is written in some other way.
+/// Parses a GUID. Other formats become the unknown GUID.
 fn guid(text: &str) -> Guid {
     let parts = text.split_once('.').and_then(|(prefix, entity)| {
         Some(Guid {

@@ -1,9 +1,9 @@
-//! Who gets samples one by one, beside the watches: streams of the API and recordings. A
-//! subscription opens interest in topics for as long as it lives; dropping it closes the interest.
+//! Subscriptions to single samples, for streams of the API and recordings. A subscription keeps its
+//! topics captured while it lives; dropping it ends that.
 //!
-//! Between the capture thread and each reader lies a queue, bounded in bytes, all of them together
-//! as well. A reader that is slow loses the oldest samples of the topics that hold most of its queue
-//! and receives their number. A replay waits for it instead; the capture of a live host never does.
+//! A queue connects the capture thread with each reader; bytes are bounded per queue and in total.
+//! A slow reader loses the oldest samples of the topics that hold most of its queue, and receives
+//! their number. A replay waits for readers instead; live capture never does.
 
 mod backlog;
 mod channel;
@@ -32,51 +32,52 @@ pub use ros2probe_model::dispatch::{Missed, MissedReason, Topic};
 pub use ros2probe_model::header::begins_with_header;
 pub use ros2probe_model::selection::{Choice, ChoiceError, Depth, Selection};
 
-/// Regular expressions of all subscriptions together.
+/// Most regular expressions in all subscriptions together.
 const MAX_REGEXES: usize = 16;
 
-/// How much there may be of it.
+/// Caps on subscriptions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Caps {
-    /// Subscriptions open at once.
+    /// Most open subscriptions.
     pub subscriptions: usize,
-    /// Bytes that wait in all queues.
+    /// Most bytes in all queues.
     pub bytes: usize,
 }
 
-/// What becomes of samples for which a queue has no room.
+/// Treatment of samples for which a queue has no room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Overflow {
-    /// The oldest of the topic that holds most bytes go; the reader receives their number.
+    /// Evict the oldest samples of the topic with most bytes; the reader receives their number.
     DropOldest,
-    /// The source waits for the reader. For replays alone.
+    /// The source waits for the reader. Only for replays.
     Wait,
 }
 
-/// What a subscription asks for.
+/// Options of a subscription.
 #[derive(Clone, Debug)]
 pub struct Request {
-    /// Which topics; also those that appear later.
+    /// Selection of topics, including those that appear later.
     pub topics: Selection,
-    /// Only of this domain; `None` = every domain.
+    /// Domain of the topics; `None` for every domain.
     pub domain_id: Option<u32>,
-    /// Whether the bytes of the messages are wanted.
+    /// Whether payloads are included.
     pub depth: Depth,
-    /// Room in the queue.
+    /// Capacity of the queue in bytes.
     pub queue_bytes: usize,
-    /// What happens when that is not enough.
+    /// Treatment of samples that do not fit.
     pub overflow: Overflow,
-    /// On whose behalf, for logs.
+    /// Name of the client, for logs.
     pub label: String,
 }
 
-/// Why nothing was opened.
+/// A subscription was refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Refused {
-    /// As many as may are open.
+    /// The number of open subscriptions is at its limit.
     #[error("{0} subscriptions are open, which is the limit (limits.subscriptions)")]
     TooMany(usize),
-    /// Matching its patterns, and those of the open ones, against every topic takes too long.
+    /// Matching its patterns, and those of the open subscriptions, against every topic would take
+    /// too long.
     #[error(
         "the open subscriptions have too many patterns together: at most {MAX_GLOBS} globs of \
          {MAX_GLOB_BYTES} bytes and {MAX_REGEXES} regular expressions; name topics instead"
@@ -84,27 +85,27 @@ pub enum Refused {
     Patterns,
 }
 
-/// What a reader gets.
+/// Item for a reader.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Item {
-    /// A message, once; those of a reliable writer in its order.
+    /// A message. Each arrives once, those of a reliable writer in order.
     Sample(Arc<Sample>),
-    /// Everything up to this time has been given; at least ten times a second.
+    /// All items up to this time have been delivered; at least ten times a second.
     Clock(Timestamp),
-    /// Messages that will not be given.
+    /// Messages that will not be delivered.
     Missed(Missed),
-    /// Nothing will follow; why.
+    /// The end of the stream, with its reason.
     End(&'static str),
 }
 
-/// What came within a time.
+/// Result of a wait with a timeout.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum NextItem {
-    /// Something.
+    /// An item.
     Item(Item),
-    /// Nothing yet.
+    /// No item within the timeout.
     Pending,
-    /// The agent hung up.
+    /// The agent closed the stream.
     Closed,
 }
 
@@ -112,16 +113,16 @@ pub enum NextItem {
 #[derive(Debug)]
 pub struct Subscriptions {
     channels: ArcSwap<Vec<Arc<Channel>>>,
-    /// Held while `channels` is changed.
+    /// Locked while `channels` changes.
     changing: Mutex<Opened>,
     retained: Mutex<Retained>,
-    /// For the capture thread: the latest wishes it has not taken yet.
+    /// Latest requests that the capture thread has not read yet.
     news: ArcSwapOption<Vec<SampleRequest>>,
     latest: Arc<SnapshotCell>,
     caps: Caps,
-    /// Ends waiting for readers when the agent ends.
+    /// Ends waits for readers when the agent ends.
     stop: CancellationToken,
-    /// Bytes that wait in queues, those of a sample once.
+    /// Bytes in all queues; each sample counts once.
     queued: Arc<AtomicUsize>,
     given: AtomicU64,
     missed: [AtomicU64; MissedReason::ALL.len()],
@@ -131,13 +132,13 @@ pub struct Subscriptions {
 
 #[derive(Debug, Default)]
 struct Opened {
-    /// So far; the last one's id.
+    /// Number of subscriptions so far, which is the last id.
     count: u64,
-    /// No more samples will come.
+    /// Reason of the end, after which no samples follow.
     ended: Option<&'static str>,
 }
 
-/// One reader's end.
+/// Reader's end of a subscription.
 #[derive(Debug)]
 pub struct Subscription {
     channel: Arc<Channel>,
@@ -145,7 +146,7 @@ pub struct Subscription {
 }
 
 impl Subscriptions {
-    /// None yet. What waits for a reader waits no longer than until `stop`.
+    /// Creates the registry. Waits for readers end at `stop`.
     #[must_use]
     pub fn new(latest: Arc<SnapshotCell>, caps: Caps, stop: CancellationToken) -> Self {
         Self {
@@ -164,10 +165,11 @@ impl Subscriptions {
         }
     }
 
-    /// Gives what `request` asks for from now on; see [`Subscription::in_force`].
+    /// Opens a subscription; see [`Subscription::in_force`].
     ///
     /// # Errors
-    /// There are too many already, or their patterns are.
+    ///
+    /// There are too many subscriptions, or too many patterns.
     pub fn open(self: &Arc<Self>, request: Request) -> Result<Subscription, Refused> {
         let mut opened = self.changing();
         let channels = self.channels.load();
@@ -199,7 +201,7 @@ impl Subscriptions {
         })
     }
 
-    /// What they cost and lose.
+    /// Figures of all subscriptions.
     #[must_use]
     pub fn facts(&self) -> SubscriptionFacts {
         let missed = self.missed.each_ref();
@@ -214,19 +216,19 @@ impl Subscriptions {
         }
     }
 
-    /// Whether anybody is there.
+    /// Returns whether any subscription is open.
     #[must_use]
     pub fn is_open(&self) -> bool {
         !self.channels.load().is_empty()
     }
 
-    /// For the capture thread: all wishes, when they have changed since the last call.
+    /// For the capture thread: all requests, if they changed since the last call.
     #[must_use]
     pub fn take_changed(&self) -> Option<Arc<Vec<SampleRequest>>> {
         self.news.swap(None)
     }
 
-    /// For the capture thread: retains what these watches ask for.
+    /// For the capture thread: retains samples for these watches.
     pub fn retain(&self, watches: &[Arc<Watch>]) {
         let changing = self.changing();
         let mut retained = self.retained();
@@ -240,8 +242,8 @@ impl Subscriptions {
         drop(changing);
     }
 
-    /// For the capture thread: the model and the kernel know these wishes. Readers that are new
-    /// among them get first what is retained for them.
+    /// For the capture thread: marks these requests as in force in model and kernel. New readers
+    /// first receive their retained samples.
     pub fn in_force(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
             let is_new = !channel.is_in_force();
@@ -270,8 +272,7 @@ impl Subscriptions {
         }
     }
 
-    /// For the capture thread: puts what the model gives into the queues, and the time up to which
-    /// that is all, if it has gone on.
+    /// For the capture thread: queues samples from the model, then the clock if it has advanced.
     pub fn deliver(&self, given: Vec<Dispatch>, clock: Option<Timestamp>) {
         let mut retained = self.retained();
         for Dispatch { to, outcome } in &given {
@@ -303,7 +304,7 @@ impl Subscriptions {
         }
     }
 
-    /// For the capture thread: nothing will follow, to whomever.
+    /// For the capture thread: ends all subscriptions.
     pub fn end(&self, reason: &'static str) {
         let mut opened = self.changing();
         opened.ended = Some(reason);
@@ -340,7 +341,7 @@ impl Subscriptions {
         self.make_room(channels);
     }
 
-    /// Takes samples from the longest queues until all together keep their cap.
+    /// Evicts samples from the longest queues until the total is within its cap.
     fn make_room(&self, channels: &[Arc<Channel>]) {
         while self.queued.load(Ordering::Relaxed) > self.caps.bytes {
             let longest = channels.iter().max_by_key(|channel| channel.droppable());
@@ -369,7 +370,7 @@ impl Subscriptions {
         self.latest.bell().ring();
     }
 
-    /// Others are open from now on. Called while `changing` is held.
+    /// Replaces the open channels. The caller holds `changing`.
     fn change(&self, channels: Vec<Arc<Channel>>) {
         let sample_requests = channels.iter().map(|channel| channel.request());
         let retained = self.retained();
@@ -391,29 +392,29 @@ impl Subscriptions {
 }
 
 impl Subscription {
-    /// What comes next; `None` behind [`Item::End`].
+    /// Waits for the next item. `None` after [`Item::End`].
     pub async fn next(&mut self) -> Option<Item> {
         self.channel.next().await
     }
 
-    /// What comes next, if it is there already.
+    /// The next item, if one is queued.
     pub fn try_next(&mut self) -> Option<Item> {
         self.channel.take()
     }
 
-    /// What comes next, within `timeout`; `None` also behind [`Item::End`].
+    /// Waits for the next item for at most `timeout`. `None` also after [`Item::End`].
     pub fn next_blocking(&mut self, timeout: Duration) -> Option<Item> {
         self.channel.next_blocking(timeout)
     }
 
-    /// Waits until the capture knows what is wanted, but no longer than `timeout`: what is sent
-    /// from then on is given.
+    /// Waits for at most `timeout` until the request is in force. All messages sent after that are
+    /// delivered.
     pub async fn in_force(&self, timeout: Duration) -> bool {
         let known = self.channel.in_force();
         tokio::time::timeout(timeout, known).await.is_ok()
     }
 
-    /// What is wanted.
+    /// Selection of topics.
     #[must_use]
     pub fn selection(&self) -> &Selection {
         self.channel.selection()
@@ -422,7 +423,7 @@ impl Subscription {
 
 impl Drop for Subscription {
     fn drop(&mut self) {
-        // First, so that a source that waits for this reader goes on.
+        // First of all, so that a source that waits for this reader continues.
         self.channel.close();
         self.all.close(self.channel.id());
     }

@@ -1,7 +1,7 @@
-//! The last sample of writers that keep theirs for late joiners, of topics whose watch says
-//! `retain: last`: what was sent before a recording begins cannot be asked for without joining.
+//! Last sample of transient-local writers, for topics whose watch has `retain: last`. Samples sent
+//! before a recording cannot be requested without joining the domain.
 //!
-//! Bounded in number and bytes, the oldest go first. Kept by the capture thread alone.
+//! Bounded in number and bytes; the oldest are evicted first. Only the capture thread uses this.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -15,14 +15,14 @@ use ros2probe_model::dispatch::{Sample, Topic};
 use ros2probe_model::naming::Naming;
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 
-/// From here on ids are those of wishes for what is retained, not of readers.
+/// First id of requests for retention; lower ids belong to readers.
 const FIRST: u64 = 1 << 63;
-/// Writers.
+/// Most writers.
 const WRITERS: usize = 256;
-/// Bytes of all of them together.
+/// Most bytes of all samples together.
 const BYTES: usize = 4 << 20;
 
-/// What is retained.
+/// Retained samples.
 #[derive(Debug, Default)]
 pub(super) struct Retained {
     sample_requests: Vec<SampleRequest>,
@@ -31,13 +31,13 @@ pub(super) struct Retained {
 }
 
 impl Retained {
-    /// Retains what these watches ask for, and nothing else any more.
+    /// Retains samples for these watches, and drops all others.
     pub(super) fn set<'a>(&mut self, watches: impl Iterator<Item = &'a Watch>) {
         let asking = watches.filter(|watch| watch.retain == Retain::Last);
         let sample_requests = asking.zip(FIRST..).filter_map(|(watch, id)| {
             Some(SampleRequest {
                 id,
-                // Checked when it was configured.
+                // The configuration's check has accepted the pattern.
                 selection: Arc::new(Selection::named([watch.pattern.as_str()]).ok()?),
                 domain_id: watch.domain_id,
                 depth: Depth::Payloads,
@@ -53,17 +53,17 @@ impl Retained {
         self.bytes = self.samples.values().map(|sample| size(sample)).sum();
     }
 
-    /// What the model has to give for that.
+    /// Requests to the model for these samples.
     pub(super) fn sample_requests(&self) -> impl Iterator<Item = &SampleRequest> {
         self.sample_requests.iter()
     }
 
-    /// Bytes kept.
+    /// Bytes of retained samples.
     pub(super) const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Keeps a sample that was given to `to`, if that means here.
+    /// Retains a sample that was delivered to `to`, if one of these is a retention.
     pub(super) fn keep(&mut self, to: &[u64], sample: &Arc<Sample>) {
         let is_ours = to.iter().any(|id| *id >= FIRST);
         let offered = sample.topic.offered.as_ref();
@@ -84,7 +84,7 @@ impl Retained {
         }
     }
 
-    /// What a new reader is to get first, oldest first; of writers that are still there.
+    /// Samples that a new reader receives first, oldest first, from writers that still exist.
     pub(super) fn for_reader(
         &mut self,
         request: &SampleRequest,
@@ -205,10 +205,10 @@ mod tests {
             retained.keep(&[id], &kept);
         }
         retained.keep(&[id], &sample("/tf_static", 3, 4, Durability::VOLATILE, 10));
-        // Of somebody else's interest.
+        // Delivered only to another reader.
         retained.keep(&[5], &lasting(4, 5));
         assert_eq!((times(&mut retained), retained.bytes()), (vec![2, 3], 20));
-        // A node that has gone would give nothing to a late joiner either.
+        // A late joiner would receive nothing from a stopped node either.
         let left = retained.for_reader(&reader(), |guid| guid == writer(1));
         assert_eq!((left.len(), retained.bytes()), (1, 10));
         retained.set([].into_iter());

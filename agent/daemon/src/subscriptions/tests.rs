@@ -136,7 +136,7 @@ fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
                 .or_default()
                 .push(sample.sequence_number),
             Item::Missed(missed) => dropped.push(missed),
-            // The last time says what the others said.
+            // The last clock item supersedes the others.
             Item::Clock(now) => assert_eq!(now, Timestamp(10)),
             Item::End(reason) => panic!("{reason}"),
         }

@@ -1,7 +1,7 @@
-//! What clients have added, on disk for the next start: `watches.json` in the state directory.
+//! Saves watches of clients for the next start, in `watches.json` of the state directory.
 //!
-//! Written by a thread of its own, the latest list only; who adds a watch does not wait for the
-//! disk. A file that cannot be used is kept aside and never ends the agent.
+//! A separate thread writes only the latest list, so clients do not wait for the disk. An unusable
+//! file is moved aside and never ends the agent.
 
 use std::io;
 use std::mem;
@@ -18,32 +18,32 @@ use crate::config::{Limit, check_globs};
 use crate::state::{Form, Found, Newer, StateDirectory, from_json};
 
 const FILE: &str = "watches.json";
-/// The form that is written. What was added to it so far may be lacking in a file; what is added
-/// from now on is a new version, for an agent that does not know it would take the file for broken.
+/// Version of the written format. Fields added so far may be missing in a file. Further fields need
+/// a new version, since older agents would consider the file broken.
 const VERSION: u32 = 1;
 const FORM: Form<Document> = Form {
     file: FILE,
     readers: &[(VERSION, from_json)],
 };
-/// Changes that come so close together are written once.
+/// Changes within this time are written once.
 const TOGETHER: Duration = Duration::from_millis(50);
-/// How long after a failure the disk is tried again.
+/// Time after a failure until the next attempt.
 const AGAIN: Duration = Duration::from_secs(30);
 
-/// What was found at the start.
+/// Saved watches at the start.
 #[derive(Debug, PartialEq)]
 pub enum LoadedWatches {
-    /// No file.
+    /// No file exists.
     Nothing,
     /// These watches.
     These(Vec<Watch>),
-    /// A newer rp wrote them: they are left as they are, and nothing may be written in their place.
+    /// A newer version wrote the file; it must not be overwritten.
     Newer(Newer),
-    /// It cannot be used, for this reason, and now lies there.
+    /// The file is unusable and was moved aside.
     Unusable {
-        /// Why.
+        /// Reason why it is unusable.
         reason: String,
-        /// Where it lies, if it could be moved.
+        /// New path of the file, if it could be moved.
         moved_to: Option<PathBuf>,
     },
 }
@@ -71,14 +71,14 @@ struct Line {
     max_silence_s: Option<f64>,
 }
 
-/// The thread that writes.
+/// The writing thread.
 #[derive(Debug)]
 pub(super) struct WatchWriter {
     mailbox: Arc<Mailbox>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// The mailbox of the thread.
+/// Mailbox of the thread.
 #[derive(Debug, Default)]
 struct Mailbox {
     pending: Mutex<Pending>,
@@ -87,13 +87,13 @@ struct Mailbox {
 
 #[derive(Debug, Default)]
 struct Pending {
-    /// Not written yet.
+    /// List that is not written yet.
     latest: Option<Vec<Arc<Watch>>>,
     is_failing: bool,
     is_closed: bool,
 }
 
-/// What clients of the last agent had added. What is no such file is moved aside.
+/// Reads watches of the last agent's clients. An invalid file is moved aside.
 #[must_use]
 pub fn load(directory: &StateDirectory) -> LoadedWatches {
     let document = match directory.read(&FORM) {
@@ -132,7 +132,7 @@ impl TryFrom<Line> for Watch {
             .domain_id
             .filter(|domain_id| *domain_id > DomainId::MAX.0)
         {
-            return Err(format!("there is no domain {domain_id}"));
+            return Err(format!("invalid domain {domain_id}"));
         }
         let expectations = Expectations {
             min_rate_hz: line.min_rate_hz,
@@ -192,24 +192,24 @@ impl WatchWriter {
         })
     }
 
-    /// Hands over what is to be on disk; returns at once.
+    /// Hands over the list to save, without blocking.
     pub(super) fn keep(&self, watches: Vec<Arc<Watch>>) {
         self.mailbox.pending().latest = Some(watches);
         self.mailbox.changed.notify_one();
     }
 
-    /// The last write did not fail.
+    /// Returns whether the last write succeeded.
     pub(super) fn works(&self) -> bool {
         !self.mailbox.pending().is_failing
     }
 
-    /// Waits until the latest list is written, or cannot be.
+    /// Waits until the latest list is written, or its write has failed.
     pub(super) fn finish(&self) {
         self.mailbox.pending().is_closed = true;
         self.mailbox.changed.notify_one();
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = thread.take() {
-            // If it has panicked, that is in the log.
+            // If it has panicked, the panic is in the log.
             let _ = thread.join();
         }
     }
@@ -229,7 +229,7 @@ impl Mailbox {
             let written = directory.replace(FILE, &document);
             let mut pending = self.pending();
             let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
-            // At the end a disk that fails is not tried for ever.
+            // At the end, a failing disk is not retried forever.
             if pending.is_failing && !pending.is_closed {
                 pending.latest.get_or_insert(watches);
             }
@@ -237,17 +237,17 @@ impl Mailbox {
             let path = directory.path().display();
             match written {
                 Ok(()) if failed_before => {
-                    tracing::info!(%path, "added watches are written again");
+                    tracing::info!(%path, "added watches are saved again");
                 }
                 Err(error) if !failed_before => {
-                    tracing::error!(%path, %error, "added watches cannot be written: a restart would lose them");
+                    tracing::error!(%path, %error, "cannot save added watches: a restart would lose them");
                 }
                 Ok(()) | Err(_) => {}
             }
         }
     }
 
-    /// The next list to write; `None` when there will be none.
+    /// Waits for the next list to write. `None` at the end.
     fn next(&self) -> Option<Vec<Arc<Watch>>> {
         let mut pending = self.pending();
         if pending.is_failing && !pending.is_closed {
@@ -257,7 +257,7 @@ impl Mailbox {
         let idle = |pending: &mut Pending| pending.latest.is_none() && !pending.is_closed;
         let pending = self.changed.wait_while(pending, idle);
         let pending = pending.unwrap_or_else(PoisonError::into_inner);
-        // More may follow at once.
+        // Further changes may follow immediately.
         let open = |pending: &mut Pending| !pending.is_closed;
         let waited = self.changed.wait_timeout_while(pending, TOGETHER, open);
         let mut pending = waited.unwrap_or_else(PoisonError::into_inner).0;
@@ -392,7 +392,7 @@ mod tests {
     #[test]
     fn a_disk_that_cannot_be_written_ends_nothing_and_is_tried_again() {
         let (place, directory) = directory();
-        // Nobody can write a file where a directory is.
+        // A file cannot replace a directory.
         let obstacle = place.path().join("watches.json.new");
         fs::create_dir(&obstacle).unwrap();
         let keeper = WatchWriter::start(Arc::clone(&directory)).unwrap();

@@ -1,4 +1,4 @@
-//! What an agent knows of topics, requested for all of them at once and kept for a second.
+//! The agent's facts about topics, requested for all topics at once and cached for a second.
 
 use std::collections::HashMap;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -9,11 +9,11 @@ use ros2probe_api::participants::ParticipantList;
 use ros2probe_api::topics::TopicList;
 use ros2probe_daemon::recording::{DiscoveredTopic, GraphSnapshot, by_name};
 
-/// How long an answer about announcements is waited for, and how old it may be.
+/// Longest wait for an answer about the graph, and its longest age.
 const GRAPH_TIMEOUT: Duration = Duration::from_secs(2);
 const GRAPH_AGE: Duration = Duration::from_secs(1);
 
-/// What an agent says of topics, asked for all of them at once.
+/// Cached facts about topics.
 pub(super) struct GraphCache<'a> {
     agent: &'a Agent,
     domain_id: u32,
@@ -33,7 +33,7 @@ impl<'a> GraphCache<'a> {
         }
     }
 
-    /// What was known last, where the agent does not answer any more.
+    /// Facts about these topics. The last known ones if the agent no longer answers.
     pub(super) fn of(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
         if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
@@ -64,7 +64,7 @@ impl<'a> GraphCache<'a> {
     }
 }
 
-/// What is behind the lock is whole at any moment.
+/// Locks the cache. A poisoned lock is usable, since the contents are always consistent.
 pub(super) fn locked<'l, 'a>(
     graph_cache: &'l Mutex<GraphCache<'a>>,
 ) -> MutexGuard<'l, GraphCache<'a>> {

@@ -8,7 +8,7 @@ use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr
 
 const SPACE: u8 = b' ';
 
-/// Standard input without lines and echo, until it is dropped.
+/// Standard input without line mode and echo. Dropping it restores the settings.
 pub(super) struct Keys(Termios);
 
 impl Keys {
@@ -28,7 +28,7 @@ impl Keys {
 
 impl Drop for Keys {
     fn drop(&mut self) {
-        // A failure here has no reader.
+        // A failure here cannot be reported.
         let _ = tcsetattr(io::stdin(), OptionalActions::Now, &self.0);
     }
 }
@@ -46,6 +46,6 @@ pub(super) fn read_keys(give: Sender<Command>) {
         }
     };
     let thread = std::thread::Builder::new().name("keys".to_owned());
-    // Without it there are no keys, which costs a convenience.
+    // Without this thread only the keys are missing.
     let _ = thread.spawn(read);
 }

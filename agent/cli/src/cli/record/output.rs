@@ -1,4 +1,4 @@
-//! What a recording prints on stderr, as the original does: its state, its files and its end.
+//! Messages of a recording on stderr, in the original's form: its state, its files and its end.
 
 use std::collections::BTreeSet;
 use std::io::{self, IsTerminal as _};
@@ -16,12 +16,12 @@ use ros2probe_daemon::recording::{
 use super::super::notes::{SILENT, is_sampled, sampled};
 use super::graph_cache::{GraphCache, locked};
 
-/// What ends a capture's recording that lacks something the capture holds.
+/// Exit code of a conversion whose bag lacks messages of the capture.
 const INCOMPLETE: u8 = 3;
 
-/// What was said of a recording so far.
+/// Messages printed so far.
 pub(super) struct RecordingOutput<'a> {
-    /// Asked why topics are silent, where that can be answered.
+    /// Source of reasons for silent topics, if available.
     graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
     begun: Instant,
     sampled: BTreeSet<String>,
@@ -29,7 +29,7 @@ pub(super) struct RecordingOutput<'a> {
     files: usize,
     paused: Option<bool>,
     progress: bool,
-    /// Tenths of a file.
+    /// Compression progress of a file, in tenths.
     compressing: u64,
 }
 
@@ -54,7 +54,7 @@ impl<'a> RecordingOutput<'a> {
                 self.clear();
                 log(
                     "INFO",
-                    "Completing the bag; Ctrl-C again to skip what takes long",
+                    "Completing the bag; Ctrl-C again to skip slow steps",
                 );
             }
             Activity::Compressing { done, of } => {
@@ -71,7 +71,7 @@ impl<'a> RecordingOutput<'a> {
         }
     }
 
-    /// Names the topics that are sampled from the start.
+    /// Reports topics that are sampled from the start.
     pub(super) fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
         let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
@@ -86,7 +86,7 @@ impl<'a> RecordingOutput<'a> {
         self.sampled.extend(topics);
     }
 
-    /// After a while, once: why nothing came of topics.
+    /// Reports once, after some time, why topics are silent.
     fn explain(&mut self, recorder: &Recorder<'_>) {
         if self.begun.elapsed() < SILENT {
             return;
@@ -163,18 +163,18 @@ impl<'a> RecordingOutput<'a> {
     }
 }
 
-/// What is in the bag and what is not. 1 where the storage refused something or nothing of a capture
-/// could be read, [`INCOMPLETE`] where something of a capture is not in the bag.
+/// Reports the messages in the bag and the missing ones. Returns exit code 1 if the storage failed
+/// or nothing of a capture was readable, and [`INCOMPLETE`] if messages of a capture are missing.
 pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> ExitCode {
     for line in shortfalls(&ended.report) {
         log("WARN", &line);
     }
     if let Some(error) = &ended.error {
-        // With its causes.
+        // Includes the causes.
         let error = format!("{:#}", anyhow!(error.to_string()));
         log(
             "ERROR",
-            &format!("{error}: the recording ends here, what came before is whole"),
+            &format!("{error}: the recording ends here; earlier messages are complete"),
         );
     }
     if let Some(summary) = &ended.summary {
@@ -186,7 +186,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
     if is_complete {
         log("INFO", "Recording stopped");
     } else {
-        let text = "Recording stopped; not everything that was sent is in the bag, see above";
+        let text = "Recording stopped; some sent messages are not in the bag, see above";
         log("WARN", text);
     }
     let is_unreadable = outcome.fault.is_some() && ended.report.messages == 0;
@@ -199,7 +199,7 @@ pub(super) fn report(ended: &Finished, outcome: &Outcome, is_replay: bool) -> Ex
     }
 }
 
-/// A line as the original logs it.
+/// Prints a line in the original's log format.
 pub(super) fn log(level: &str, text: &str) {
     let now = SystemTime::now().duration_since(UNIX_EPOCH);
     let now = now.unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Signals end a recording in order, and write what waits in `--snapshot-mode`.
+//! Signals that end a recording in order, and SIGUSR1, which writes the ring of `--snapshot-mode`.
 
 use std::io;
 use std::sync::Arc;
@@ -11,7 +11,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::super::interrupt::INTERRUPTED;
 use super::output::log;
 
-/// How far a recording is, for the thread that hears signals.
+/// Phase of a recording, shared with the signal thread.
 #[derive(Clone)]
 pub(super) struct Phase(Arc<AtomicU8>);
 
@@ -24,7 +24,7 @@ impl Phase {
         Self(Arc::new(AtomicU8::new(Self::STARTING)))
     }
 
-    /// From now on there is a bag, which a signal completes.
+    /// Marks that a bag exists, which a signal completes.
     pub(super) fn begin(&self) {
         if !self.turn(Self::BEGUN) {
             // The process is about to end.
@@ -34,7 +34,7 @@ impl Phase {
         }
     }
 
-    /// Whether nothing was begun yet, and now never will be.
+    /// Cancels a recording that has not begun. Returns `false` if it has begun.
     fn cancel(&self) -> bool {
         self.turn(Self::CANCELLED)
     }
@@ -47,8 +47,8 @@ impl Phase {
     }
 }
 
-/// Ctrl-C and SIGTERM end the recording: the first one in order, the second one without what takes
-/// long, the third one at once. SIGUSR1 writes what waits.
+/// Handles Ctrl-C and SIGTERM: the first ends the recording in order, the second skips slow steps,
+/// the third ends at once. SIGUSR1 writes the ring in memory.
 pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_io()
@@ -77,19 +77,19 @@ pub(super) fn listen(give: Sender<Command>, phase: Phase) -> io::Result<()> {
                 1 if phase.cancel() => {
                     log(
                         "INFO",
-                        "Interrupted before the recording began; no bag was made",
+                        "Interrupted before the recording began; no bag was created",
                     );
                     std::process::exit(INTERRUPTED.into());
                 }
                 1 => Command::Stop,
                 2 => Command::Hurry,
                 _ => {
-                    let text = "Interrupted; `rp bag reindex` makes the bag whole";
+                    let text = "Interrupted; `rp bag reindex` completes the bag";
                     log("ERROR", text);
                     std::process::exit(INTERRUPTED.into());
                 }
             };
-            // A recording that has ended takes no command.
+            // A recording that has ended accepts no command.
             let _ = give.send(command);
         }
     };

@@ -113,7 +113,7 @@ fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more()
             (
                 Severity::Problem,
                 "limits.participants is reached (1000): 345 refused or evicted so far; part of \
-                     the robot may not be seen"
+                     the robot may be invisible"
             ),
             (
                 Severity::Warning,

@@ -1,4 +1,4 @@
-//! `--field a.b.[0].c`: a part of a message.
+//! `--field a.b.[0].c`: selects a part of a message.
 
 use std::str::FromStr;
 
@@ -6,10 +6,10 @@ use crate::ros2::Refused;
 use ros2probe_message::value::{Items, Message};
 use ros2probe_message::{Value, python};
 
-/// Steps into a message.
+/// Path to a part of a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FieldPath {
-    /// As the original repeats it in its errors.
+    /// Text as typed, which the original repeats in its errors.
     text: String,
     steps: Vec<Step>,
 }
@@ -20,19 +20,19 @@ enum Step {
     Index(usize),
 }
 
-/// What a path leads to.
+/// Part selected by a path.
 #[derive(Debug)]
 pub(super) enum Selected<'a> {
     Message(&'a Message<'a>),
     Value(&'a Value<'a>),
-    /// Of an array, where it is no value of its own.
+    /// An element of an array without a value of its own.
     Element(Value<'a>),
 }
 
 impl FromStr for FieldPath {
     type Err = Refused;
 
-    /// Names joined by points; an element is `.[0]`, `.0` or `[0]`.
+    /// Parses names joined by points. An element is `.[0]`, `.0` or `[0]`.
     fn from_str(text: &str) -> Result<Self, Refused> {
         let wrong = || Refused(format!("Invalid field value '{text}'"));
         let mut steps = Vec::new();

@@ -1,5 +1,5 @@
-//! Messages that were sent and never came. The original learns of them from its middleware; here the
-//! stream says which ones are lost, as the agent counts them.
+//! Reports of lost messages. The original learns of losses from its middleware; here the agent's
+//! stream reports them.
 
 use ros2probe_api::samples::{Missed, MissedReason};
 
@@ -10,8 +10,8 @@ pub struct Lost {
 }
 
 impl Lost {
-    /// The stream says that messages will not come; the words for it where they are lost, without a
-    /// space and an end of the line where the original has none.
+    /// Records messages that will not arrive. Returns the original's text, or nothing if they were
+    /// on the wire. As in the original, no line break precedes `---`.
     pub fn missed(&mut self, missed: &Missed) -> String {
         match missed.reason {
             MissedReason::Incomplete | MissedReason::Lost => {}

@@ -1,7 +1,8 @@
-//! Bytes a second of one topic, as `ros2 topic bw` reports them.
+//! Bandwidth of one topic, as `ros2 topic bw` reports it.
 //!
-//! The span is from the oldest message of the window until now, so it decays when nothing comes.
-//! A size is the serialized payload with its encapsulation, without what RTPS and UDP add.
+//! The interval reaches from the oldest message of the window to now, so the value decays during
+//! silence. A size is the serialized payload with its encapsulation, without headers of RTPS and
+//! UDP.
 
 use super::NANOSECOND;
 use super::window::Window;
@@ -15,12 +16,12 @@ pub struct Sizes {
     printed: Option<i64>,
 }
 
-/// Numbers of one report, as text with one unit.
+/// Values of one report, as text in one unit.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Bandwidth {
-    /// With `/s`.
+    /// Bytes a second, with `/s`.
     pub bandwidth: String,
-    /// Number of messages.
+    /// Number of messages in the window.
     pub window: String,
     /// Mean size.
     pub mean: String,
@@ -30,12 +31,13 @@ pub struct Bandwidth {
     pub max: String,
 }
 
-/// Now is not after the oldest message: the clock was set back, and the window is empty now.
+/// The time is not after the oldest message, because the clock was set back. The window is empty
+/// now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimeReset;
 
 impl Sizes {
-    /// No message yet.
+    /// Creates an empty window of `window` messages.
     #[must_use]
     pub fn new(window: usize) -> Self {
         Self {
@@ -46,17 +48,18 @@ impl Sizes {
         }
     }
 
-    /// Takes a message.
+    /// Adds a message that arrived at `time`, in nanoseconds.
     pub fn arrived(&mut self, time: i64, size: u32) {
         self.sizes.push(i64::from(size));
         self.times.push(time);
         self.newest = time;
     }
 
-    /// The report of now, as soon as there are two messages.
+    /// Report at `now`. `None` with fewer than two messages.
     ///
     /// # Errors
-    /// [`TimeReset`].
+    ///
+    /// Returns [`TimeReset`] if the clock was set back.
     pub fn report(&mut self, now: i64) -> Result<Option<Bandwidth>, TimeReset> {
         let (Some(oldest), Some(found)) = (self.times.oldest(), self.sizes.statistics()) else {
             return Ok(None);
@@ -82,10 +85,11 @@ impl Sizes {
         }))
     }
 
-    /// The report of now where silence is not reported (Lyrical and later).
+    /// Report at `now` if a message came since the last one (Lyrical and later).
     ///
     /// # Errors
-    /// [`TimeReset`].
+    ///
+    /// Returns [`TimeReset`] if the clock was set back.
     pub fn report_of_new(&mut self, now: i64) -> Result<Option<Bandwidth>, TimeReset> {
         if self.printed == Some(self.newest) {
             return Ok(None);
@@ -105,7 +109,7 @@ impl Bandwidth {
     }
 }
 
-/// One for all numbers of a report, decimal, and never more than mega.
+/// Decimal unit of all values in a report; the largest is mega.
 #[derive(Clone, Copy)]
 enum Unit {
     Bytes,
@@ -128,7 +132,7 @@ impl Unit {
         match self {
             Self::Bytes => format!("{bytes:.0} B"),
             Self::Kilobytes => format!("{:.2} KB", bytes / 1000.0),
-            // In two steps as the original: one division by a million can round differently.
+            // Two divisions, as in the original: one division by a million can round differently.
             Self::Megabytes => format!("{:.2} MB", bytes / 1000.0 / 1000.0),
         }
     }
@@ -151,7 +155,7 @@ mod tests {
             text(&mut sizes, 11 * SECOND),
             "60 B/s from 2 messages\n\tMessage size mean: 30 B min: 28 B max: 32 B\n"
         );
-        // Nothing new: 60 bytes in 4 s.
+        // No further message: 60 bytes in 4 s.
         assert!(text(&mut sizes, 14 * SECOND).starts_with("15 B/s from 2"));
         assert_eq!(sizes.report_of_new(14 * SECOND), Ok(None));
     }

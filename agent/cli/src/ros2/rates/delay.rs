@@ -1,6 +1,6 @@
-//! The age of one topic's messages by their header, as `ros2 topic delay` reports it.
+//! Age of one topic's messages by the stamp in their header, as `ros2 topic delay` reports it.
 //!
-//! The age is that of the capture: what a subscriber's process adds is not in it.
+//! The age is that at capture; time spent in a subscriber's process is not included.
 
 use super::NANOSECOND;
 use super::window::Window;
@@ -14,7 +14,7 @@ pub struct Ages {
     printed: Option<i64>,
 }
 
-/// Numbers of one report, as text.
+/// Values of one report, as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Age {
     /// Mean age in seconds.
@@ -25,12 +25,12 @@ pub struct Age {
     pub max: String,
     /// Standard deviation, in seconds.
     pub standard_deviation: String,
-    /// Number of messages.
+    /// Number of messages in the window.
     pub window: String,
 }
 
 impl Ages {
-    /// No message yet.
+    /// Creates an empty window of `window` messages.
     #[must_use]
     pub fn new(window: usize) -> Self {
         Self {
@@ -41,8 +41,8 @@ impl Ages {
         }
     }
 
-    /// Takes a message. The first one is not counted, nor is one before the first, when the clock
-    /// was set back.
+    /// Adds a message. The first message is not counted. One earlier than the first restarts the
+    /// measurement, since the clock was set back.
     pub fn arrived(&mut self, time: i64, stamp: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
@@ -53,12 +53,12 @@ impl Ages {
         self.newest = time;
     }
 
-    /// A message passed of which the stamp was not seen: the ages that are known are reported again.
+    /// Records a message whose stamp was not seen. The known ages are then reported again.
     pub fn passed(&mut self, time: i64) {
         self.newest = self.newest.max(time);
     }
 
-    /// The lines of every second; nothing before the second message.
+    /// Lines of a periodic report. `None` before the second message.
     pub fn lines(&mut self) -> Option<String> {
         if self.ages.is_empty() {
             return None;
@@ -70,7 +70,7 @@ impl Ages {
         Some(text)
     }
 
-    /// The report of every second, when a message came since the one before.
+    /// Periodic report. `None` without a message since the last report.
     pub fn report(&mut self) -> Option<Age> {
         if self.printed == Some(self.newest) {
             return None;
@@ -109,7 +109,7 @@ mod tests {
         assert_eq!(ages.lines(), None);
         ages.arrived(1100 * MILLISECOND, 1099 * MILLISECOND);
         ages.arrived(1200 * MILLISECOND, 1197 * MILLISECOND);
-        // 1 ms and 3 ms: the mean is 2 ms, each is 1 ms away from it.
+        // 1 ms and 3 ms: the mean is 2 ms, and each differs from it by 1 ms.
         let text = "average delay: 0.002\n\tmin: 0.001s max: 0.003s std dev: 0.00100s window: 2\n";
         assert_eq!(ages.lines().as_deref(), Some(text));
         assert_eq!(ages.lines().as_deref(), Some("no new messages\n"));

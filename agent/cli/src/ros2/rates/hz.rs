@@ -1,6 +1,6 @@
-//! The times between messages of one topic, as `ros2 topic hz` reports them.
+//! Intervals between messages of one topic, as `ros2 topic hz` reports them.
 //!
-//! Arrival is when the message was captured, not when it was read.
+//! A message arrives when it is captured, not when it is read.
 
 use super::window::Window;
 use super::{NANOSECOND, SECOND};
@@ -14,7 +14,7 @@ pub struct Intervals {
     printed: Option<i64>,
 }
 
-/// Numbers of one report, as text.
+/// Values of one report, as text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rate {
     /// Messages a second.
@@ -25,12 +25,12 @@ pub struct Rate {
     pub max: String,
     /// Standard deviation of the intervals, in seconds.
     pub standard_deviation: String,
-    /// Number of intervals.
+    /// Number of intervals in the window.
     pub window: String,
 }
 
 impl Intervals {
-    /// No message yet.
+    /// Creates an empty window of `window` intervals.
     #[must_use]
     pub fn new(window: usize) -> Self {
         Self {
@@ -41,8 +41,8 @@ impl Intervals {
         }
     }
 
-    /// Takes a message. The first one only begins; so does one before the first, when the clock was
-    /// set back.
+    /// Adds a message. The first message begins the measurement. One earlier than the first
+    /// restarts it, since the clock was set back.
     pub fn arrived(&mut self, time: i64) {
         if self.first.is_none_or(|first| first > time) {
             self.first = Some(time);
@@ -53,8 +53,8 @@ impl Intervals {
         self.newest = time;
     }
 
-    /// The report that a message brings about (Humble, Jazzy): when it came a second or more
-    /// after the one of the report before. The first interval only says from when to count.
+    /// Report caused by a message (Humble, Jazzy): one that arrived at least a second after that of
+    /// the last report. The first interval only starts the count.
     pub fn report_at_message(&mut self) -> Option<Rate> {
         if self.between.is_empty() {
             return None;
@@ -63,14 +63,15 @@ impl Intervals {
             self.printed = Some(self.newest);
             return None;
         };
-        // A clock set back puts the newest below the printed: silence until it is a second above.
+        // After the clock is set back, the newest message is before the printed one. Reports resume
+        // a second after the printed one.
         if self.newest < printed.saturating_add(SECOND) {
             return None;
         }
         self.report()
     }
 
-    /// The report of every second (Kilted and later): when a message came since the one before.
+    /// Periodic report (Kilted and later). `None` without a message since the last report.
     pub fn report_at_second(&mut self) -> Option<Rate> {
         if self.printed == Some(self.newest) {
             return None;
@@ -121,7 +122,7 @@ mod tests {
     #[test]
     fn a_message_a_second_after_the_last_report_brings_the_next() {
         let mut intervals = Intervals::new(10_000);
-        // Messages every 100 ms: the second one is the first to be remembered as reported.
+        // Messages every 100 ms: the second one starts the count of seconds.
         for step in 0..=10 {
             assert_eq!(at(&mut intervals, step * 100), None, "{step}");
         }

@@ -1,8 +1,8 @@
-//! What `ros2 topic hz`, `bw` and `delay` say, by dialect: text from samples and a clock.
+//! Text of `ros2 topic hz`, `bw` and `delay`, by dialect, from samples and a clock.
 //!
-//! A state machine without clock or I/O: time comes in with the samples and with the stream's clock,
-//! so a live stream and a capture print the same. Every sample on the wire counts, at the time it
-//! was captured.
+//! A state machine without clock or I/O: times come with the samples and with the stream's clock. A
+//! live stream and a capture therefore print the same. Every sample on the wire counts at the time
+//! of its capture.
 
 pub mod bandwidth;
 pub mod delay;
@@ -22,29 +22,30 @@ use super::{Dialect, Refused};
 use ros2probe_daemon::subscriptions::begins_with_header;
 
 const SECOND: i64 = 1_000_000_000;
-/// Of a nanosecond, in seconds.
+/// One nanosecond in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.
 const CLEAR: &str = "\x1b[H\x1b[2J\n";
-/// A clock that jumped further has been set: the seconds between are not made up for.
+/// Largest step of the clock. After a larger one, the clock was set and the skipped seconds are not
+/// reported.
 const LONGEST_JUMP: i64 = 3600 * SECOND;
-/// So many messages wait for the clock at most; it comes ten times a second.
+/// Most messages that wait for the clock, which ticks ten times a second.
 const WAITING: usize = 65_536;
-/// A larger step in the numbers is another beginning.
+/// Largest gap of sequence numbers within one measurement; a larger one restarts it.
 const MAX_UNSEEN: u64 = 10_000;
 
-/// What is asked for.
+/// Measured quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quantity {
-    /// `hz`
+    /// Rate of messages, `hz`.
     Rate,
-    /// `bw`
+    /// Bytes a second, `bw`.
     Bandwidth,
-    /// `delay`
+    /// Age of messages, `delay`.
     Delay,
 }
 
-/// One command: what it measures, of which topics, in whose words.
+/// One command: its quantity, topics and dialect.
 #[derive(Debug)]
 pub struct Rates {
     quantity: Quantity,
@@ -53,13 +54,13 @@ pub struct Rates {
     all: bool,
     topics: Vec<Watched>,
     places: HashMap<String, usize>,
-    /// Messages that the clock has not passed, with the places of their topics.
+    /// Messages after the last tick of the clock, with the indices of their topics.
     waiting: Vec<(Arrival, usize)>,
-    /// Number and time of the newest message of each writer of which not every one is seen.
+    /// Number and time of the newest message of each sampled writer.
     last_sampled: HashMap<String, (u64, i64)>,
-    /// Topics of which it was said that they are sampled.
+    /// Topics that were reported as sampled.
     sampled_reported: HashSet<String>,
-    /// When the next report of every second is due.
+    /// Time of the next periodic report.
     next: Option<i64>,
     output: Output,
 }
@@ -73,50 +74,50 @@ pub struct Output {
     pub err: String,
 }
 
-/// Why a command is over.
+/// Reason for the end of a command.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum End {
-    /// There is nothing to do.
+    /// No topic to measure.
     Idle,
-    /// It cannot be done; the text says why.
+    /// The command failed, with this text.
     Refused(Refused),
 }
 
-/// A topic by the name that was typed and the one that it has.
+/// A topic by its typed and its full name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Named {
-    /// As typed: what is printed.
+    /// Name as typed, which is printed.
     pub typed: String,
-    /// With its namespace.
+    /// Name with its namespace.
     pub name: String,
 }
 
 /// One message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Arrival {
-    /// When it was captured, in nanoseconds since the epoch.
+    /// Time of its capture, in nanoseconds since the epoch.
     pub time: i64,
     /// Bytes of its serialized payload with encapsulation.
     pub size: u32,
-    /// The stamp in its header, in nanoseconds since the epoch.
+    /// Stamp in its header, in nanoseconds since the epoch.
     pub header_stamp: Option<i64>,
 }
 
-/// Who wrote a message, and its number among those of this writer.
+/// Writer and sequence number of a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Origin<'a> {
-    /// GUID.
+    /// GUID of the writer.
     pub writer: &'a str,
-    /// From 1.
+    /// Sequence number, from 1.
     pub number: u64,
 }
 
 #[derive(Debug)]
 struct Watched {
     topic: Named,
-    /// Nothing as long as the topic is not there.
+    /// `None` until the topic exists.
     message_type: Option<String>,
-    /// Not every message is seen.
+    /// Whether only samples of the messages are seen.
     sampled: bool,
     series: Series,
 }
@@ -129,7 +130,7 @@ enum Series {
 }
 
 impl Rates {
-    /// Of these topics.
+    /// Measures these topics.
     #[must_use]
     pub fn of(quantity: Quantity, dialect: Dialect, window: usize, topics: Vec<Named>) -> Self {
         let mut rates = Self::empty(quantity, dialect, window, false);
@@ -139,7 +140,7 @@ impl Rates {
         rates
     }
 
-    /// Of all topics, also of those that appear later.
+    /// Measures all topics, including those that appear later.
     #[must_use]
     pub fn of_all(quantity: Quantity, dialect: Dialect, window: usize) -> Self {
         Self::empty(quantity, dialect, window, true)
@@ -161,10 +162,11 @@ impl Rates {
         }
     }
 
-    /// The topics that are there at the beginning, in order, with their types.
+    /// Adds the topics that exist at the start, in order, with their types.
     ///
     /// # Errors
-    /// When the command is over with that.
+    ///
+    /// Returns the reason if the command ends here.
     pub fn opened(&mut self, present: &[(String, Vec<String>)]) -> Result<(), End> {
         if self.all {
             let present = present.iter();
@@ -207,10 +209,11 @@ impl Rates {
         Ok(())
     }
 
-    /// A topic is there, with these types. What is not asked for is left alone.
+    /// Adds a topic that appeared, with its types. Topics that are not measured are ignored.
     ///
     /// # Errors
-    /// When the topic has several types.
+    ///
+    /// The topic has several types.
     pub fn appeared(&mut self, name: &str, types: &[String]) -> Result<(), End> {
         if self.all && !self.places.contains_key(name) && self.measurable(types) {
             self.add(Named::absolute(name));
@@ -245,11 +248,12 @@ impl Rates {
         Ok(())
     }
 
-    /// A message of a topic. It counts once the clock has passed it: messages by different ways,
-    /// as by network and by shared memory, come in no order.
+    /// Adds a message. It counts once the clock has passed it: messages from network and shared
+    /// memory arrive out of order.
     ///
     /// # Errors
-    /// When its delay is asked for and it has no header.
+    ///
+    /// The delay is measured and the message has no header.
     pub fn arrived(&mut self, name: &str, arrival: Arrival) -> Result<(), End> {
         let Some(place) = self.places.get(name).copied() else {
             return Ok(());
@@ -272,16 +276,17 @@ impl Rates {
         Ok(())
     }
 
-    /// Everything before this time was given.
+    /// Advances the clock: all messages before `now` have been added.
     pub fn clock(&mut self, now: i64) {
         self.settle(now);
         self.tick(now);
     }
 
-    /// As [`Self::arrived`], where not every message is seen: those with the numbers between this
-    /// one and the last of its writer count as well, at times between theirs.
+    /// As [`Self::arrived`], for a sampled topic. Messages with sequence numbers between this one
+    /// and the writer's last one also count, at interpolated times.
     ///
     /// # Errors
+    ///
     /// As [`Self::arrived`].
     pub fn sampled(&mut self, name: &str, arrival: Arrival, origin: Origin<'_>) -> Result<(), End> {
         let Some(place) = self.places.get(name).copied() else {
@@ -316,14 +321,14 @@ impl Rates {
         self.arrived(name, arrival)
     }
 
-    /// That these topics are sampled was said before.
+    /// Marks these topics as already reported to be sampled.
     pub fn sampled_reported<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         for name in names {
             self.sampled_reported.insert(name.to_owned());
         }
     }
 
-    /// Nothing more is given.
+    /// Counts all remaining messages at the end of the stream.
     pub fn finish(&mut self) {
         self.settle(i64::MAX);
     }
@@ -363,7 +368,7 @@ impl Rates {
         }
     }
 
-    /// Reports every second up to this one that is due.
+    /// Emits all periodic reports due up to this time.
     fn tick(&mut self, now: i64) {
         if self.reported_at_message() || self.topics.iter().all(|one| one.message_type.is_none()) {
             return;
@@ -373,7 +378,7 @@ impl Rates {
                 self.clear();
                 now.saturating_add(SECOND)
             }
-            // Set back, or far ahead: the seconds are counted from here.
+            // The clock was set back or far ahead: the seconds are counted from here.
             Some(next) if next.saturating_sub(now) > 2 * SECOND => now.saturating_add(SECOND),
             Some(next) if now.saturating_sub(next) > LONGEST_JUMP => now,
             Some(next) => next,
@@ -386,7 +391,7 @@ impl Rates {
         self.next = Some(due);
     }
 
-    /// What was said since the last time.
+    /// Returns and clears the text since the last call.
     pub fn take(&mut self) -> Output {
         mem::take(&mut self.output)
     }
@@ -409,7 +414,7 @@ impl Rates {
         });
     }
 
-    /// With `--all`, delays are those of the types that have a header.
+    /// Returns whether a topic can be measured. With `--all`, delays need a type with a header.
     fn measurable(&self, types: &[String]) -> bool {
         let mut types = types.iter();
         self.quantity != Quantity::Delay || types.any(|one| begins_with_header(one))
@@ -559,7 +564,7 @@ impl Rates {
 }
 
 impl Named {
-    /// A name that was typed in full, or was not typed at all.
+    /// A topic by its full name alone.
     #[must_use]
     pub fn absolute(name: &str) -> Self {
         let name = name.to_owned();

@@ -1,11 +1,11 @@
-//! The table of several topics.
+//! Table of several topics.
 //!
-//! Columns are three spaces apart; headings are centred, cells are on the left and filled up, also
-//! the last ones; an empty line follows.
+//! Columns are three spaces apart. Headings are centred; cells are left-aligned and padded,
+//! including the last one. An empty line follows.
 
 use std::fmt::Write as _;
 
-/// Nothing of no rows.
+/// Text of the table. Empty without rows.
 #[must_use]
 pub fn table<const COLUMNS: usize>(
     headings: [&str; COLUMNS],
@@ -40,8 +40,8 @@ fn length(text: &str) -> usize {
     text.chars().count()
 }
 
-/// As Python's `str.center`: of an odd remainder the larger half is on the left where the width is
-/// odd, on the right where it is even.
+/// Centres as Python's `str.center`. For an odd remainder, the larger half is on the left if the
+/// width is odd, and on the right if it is even.
 fn centre(text: &str, width: usize) -> String {
     let room = width.saturating_sub(length(text));
     let left = room / 2 + (room & width & 1);
@@ -55,7 +55,7 @@ mod tests {
 
     #[test]
     fn a_heading_is_centred_as_python_does() {
-        // "ab".center(5) and so on.
+        // Results of `"ab".center(5)` and others.
         for (text, width, expected) in [
             ("ab", 5, "  ab "),
             ("abc", 6, " abc  "),

@@ -52,7 +52,7 @@ fn at(milliseconds: i64) -> i64 {
     START + milliseconds * MILLISECOND
 }
 
-/// A message at each of these times, of 100 bytes and 2 ms of age; returns what was said.
+/// Adds a message at each of these times, of 100 bytes and 2 ms of age. Returns the output.
 fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>) -> String {
     for time in times {
         let header_stamp = Some(at(time - 2));
@@ -85,7 +85,7 @@ fn a_topic_that_is_not_there_is_told_once_and_waited_for() {
     assert_eq!(rates.take().out, "Subscribed to [x]\n");
     rates.clock(at(6000));
     messages(&mut rates, "/x", [6100, 6600]);
-    // The seconds count from when it was there.
+    // The seconds count from the topic's appearance.
     rates.clock(at(6999));
     assert_eq!(rates.take().out, "");
     rates.clock(at(7000));
@@ -276,7 +276,7 @@ fn a_delay_needs_a_header() {
 fn messages_count_in_the_order_of_their_times() {
     let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
-    // One writer is heard at once, the other 50 ms later.
+    // Messages of one writer arrive at once, those of the other 50 ms later.
     for time in [
         0, 200, 100, 400, 300, 600, 500, 800, 700, 1000, 900, 1200, 1100, 1400,
     ] {
@@ -298,7 +298,7 @@ fn messages_count_in_the_order_of_their_times() {
 fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
     let mut rates = Rates::of(Quantity::Rate, Dialect::Jazzy, 100, named(&["/imu"]));
     rates.opened(&present(&[("/imu", IMU)])).unwrap();
-    // Ten a second are sent, of which a third is seen.
+    // Ten messages a second are sent, of which a third is seen.
     for step in 0..8 {
         let time = step * 300;
         let arrival = Arrival {

@@ -1,18 +1,18 @@
-//! The newest values of something, and their mean, extremes and deviation.
+//! Newest values of a quantity, with their mean, extremes and deviation.
 //!
-//! A window is a number of values, never a span of time: an old pause stays in it until enough
-//! newer values came. That is what the original does, and what its readers compare with.
+//! A window is a number of values, not a duration: an old pause stays in it until enough newer
+//! values have arrived. This matches the original.
 
 use std::collections::VecDeque;
 
-/// At most so many of the newest values.
+/// A bounded number of the newest values.
 #[derive(Clone, Debug)]
 pub struct Window {
     values: VecDeque<i64>,
     size: usize,
 }
 
-/// What a window holds. In the unit of its values.
+/// Statistics of a window, in the unit of its values.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Statistics {
     /// Arithmetic mean.
@@ -21,21 +21,21 @@ pub struct Statistics {
     pub min: i64,
     /// The largest value.
     pub max: i64,
-    /// Of the population: the sum of squares is divided by the number of values.
+    /// Standard deviation of the population: the sum of squares is divided by the number of values.
     pub standard_deviation: f64,
     /// How many values there are.
     pub count: usize,
 }
 
 impl Window {
-    /// An empty window for so many values.
+    /// Creates an empty window for `size` values.
     #[must_use]
     pub fn new(size: usize) -> Self {
         let values = VecDeque::new();
         Self { values, size }
     }
 
-    /// Takes the next value; the oldest goes when there are too many.
+    /// Adds a value, and removes the oldest one if the window is full.
     pub fn push(&mut self, value: i64) {
         self.values.push_back(value);
         if self.values.len() > self.size {
@@ -43,12 +43,12 @@ impl Window {
         }
     }
 
-    /// Forgets all values.
+    /// Removes all values.
     pub fn clear(&mut self) {
         self.values.clear();
     }
 
-    /// Whether there is no value.
+    /// Returns whether the window is empty.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
@@ -60,19 +60,19 @@ impl Window {
         self.values.front().copied()
     }
 
-    /// How many values there are.
+    /// Number of values.
     #[must_use]
     pub fn count(&self) -> usize {
         self.values.len()
     }
 
-    /// The sum of all values.
+    /// Sum of all values.
     #[must_use]
     pub fn sum(&self) -> i128 {
         self.values.iter().map(|value| i128::from(*value)).sum()
     }
 
-    /// Nothing of an empty window.
+    /// Statistics of the window. `None` if it is empty.
     #[must_use]
     pub fn statistics(&self) -> Option<Statistics> {
         let (min, max) = (self.values.iter().min()?, self.values.iter().max()?);

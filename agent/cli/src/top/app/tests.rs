@@ -88,7 +88,7 @@ fn the_filter_narrows_while_it_is_typed_and_escape_undoes_it() {
     let mut app = app();
     keys(&mut app, "/IMU");
     assert_eq!(names(&app), ["/d"]);
-    // Keys are text now.
+    // Keys are text during an edit.
     assert_eq!(keys(&mut app, "q"), [Command::Select(None)]);
     press(&mut app, KeyCode::Backspace);
     press(&mut app, KeyCode::Enter);
@@ -124,7 +124,7 @@ fn the_selection_follows_its_topic_and_asks_for_details_once() {
     assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);
     assert_eq!(press(&mut app, KeyCode::Down), []);
     assert_eq!(press(&mut app, KeyCode::Home), [Command::Select(key("/b"))]);
-    // It goes: the one in its place is selected.
+    // After the topic has gone, the one in its place is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
         app.take(topics(&left), Instant::now()),

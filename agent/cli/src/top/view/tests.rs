@@ -18,17 +18,17 @@ const ASCII: Theme = Theme {
     colours: false,
 };
 
-/// A robot with something of everything.
+/// Robot with a topic in each state.
 pub(in crate::top) fn robot() -> TopicList<'static> {
     serde_json::from_value(robot_answer()).unwrap()
 }
 
-/// One of its topics with details.
+/// Details of one of its topics.
 fn details(number: usize) -> TopicDetails<'static> {
     serde_json::from_value(robot_answer()["topics"][number].clone()).unwrap()
 }
 
-/// One answer as JSON: long because it has a topic of each kind.
+/// The topic list as JSON, with a topic in each state.
 fn robot_answer() -> Value {
     let measured = |rate: f64, size: f64, lost: u64| {
         json!({
@@ -180,10 +180,10 @@ fn press(app: &mut App, keys: &str) {
     }
 }
 
-/// The screen as text, without what is empty at the end of lines.
+/// Screen as text, without trailing spaces.
 fn screen(app: &mut App, size: (u16, u16), theme: Theme, now: Instant) -> String {
     let mut terminal = Terminal::new(TestBackend::new(size.0, size.1)).unwrap();
-    // Twice: what is known of the panes' sizes comes with the first time.
+    // Drawn twice, since the first drawing determines the sizes of the panes.
     for _ in 0..2 {
         terminal.draw(|frame| draw(app, frame, theme, now)).unwrap();
     }

@@ -43,7 +43,7 @@ fn a_recording_that_is_interrupted_while_it_begins_leaves_nothing() {
     assert_eq!(status.code(), Some(2), "{:#?}", recording.said);
     assert!(ended < Duration::from_secs(5), "{ended:?}");
     assert!(
-        recording.said[0].contains("no bag was made"),
+        recording.said[0].contains("no bag was created"),
         "{:?}",
         recording.said
     );

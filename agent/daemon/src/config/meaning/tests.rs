@@ -111,18 +111,18 @@ capture:
     let source = source.replace("robot.slice", "/cg");
     assert_eq!(
         report(&source),
-        "f:4:25: capture.interfaces.include: selects frames on a wire, which `source: host` \
-             does not look at; use mirror_interfaces or `source: wire`"
+        "f:4:25: capture.interfaces.include: selects interfaces, which `source: host` \
+             does not capture; use mirror_interfaces or `source: wire`"
     );
     assert_eq!(
         report(&source.replace("host", "auto")),
-        "f:4:25: capture.interfaces.include: makes the wire the source, for which cgroup has \
-             no meaning"
+        "f:4:25: capture.interfaces.include: selects `source: wire`, to which cgroup does \
+             not apply"
     );
     assert_eq!(
         report("capture: {source: wire, mirror_interfaces: [mirror0], cgroup: /cg}"),
-        "f:1:44: capture.mirror_interfaces: has no meaning for `source: wire`\n\
-             f:1:63: capture.cgroup: has no meaning for `source: wire`"
+        "f:1:44: capture.mirror_interfaces: does not apply to `source: wire`\n\
+             f:1:63: capture.cgroup: does not apply to `source: wire`"
     );
     assert_eq!(
         report("capture: {source: both, mirror_interfaces: ['a b']}"),
@@ -204,10 +204,10 @@ fn of_a_newer_file_one_line_says_what_to_do() {
 fn a_key_that_is_called_otherwise_is_named() {
     assert_eq!(
         report("watchlist: []"),
-        "f:1:1: watchlist: unknown key; it is called `watch`"
+        "f:1:1: watchlist: unknown key; its name is `watch`"
     );
     let source = "watch: [{topic: /a, max_delay_ms: 3}]";
-    assert!(report(source).ends_with("unknown key; it is called `max_latency_ms`"));
+    assert!(report(source).ends_with("unknown key; its name is `max_latency_ms`"));
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Each filter in a thread of its own, and what is refused there and what is not.
+//! Each filter in its own thread: refused and allowed calls.
 
 use std::io::{Read as _, Write as _};
 use std::net::ToSocketAddrs as _;
@@ -20,16 +20,16 @@ const ROLES: [Role; 7] = [
     Role::Exact,
 ];
 
-/// Makes a system call; its error, if it fails.
+/// Makes a system call. Returns its error, if it fails.
 fn call(number: c_long, arguments: [c_long; 6]) -> Option<i32> {
     let [one, two, three, four, five, six] = arguments;
-    // SAFETY: whoever calls this passes numbers and null only, which the kernel refuses or
-    // which change nothing of this process.
+    // SAFETY: callers pass only numbers and null. The kernel refuses them, or they change nothing
+    // in this process.
     let result = unsafe { libc::syscall(number, one, two, three, four, five, six) };
     (result < 0).then(|| std::io::Error::last_os_error().raw_os_error().unwrap_or(0))
 }
 
-/// Does `work` in a thread that is confined to `role`; panics where the kernel has no filters.
+/// Runs `work` in a thread confined to `role`. Panics if the kernel has no filters.
 fn confined<T: Send + 'static>(role: Role, work: impl FnOnce() -> T + Send + 'static) -> T {
     let thread = std::thread::spawn(move || {
         confine(role).unwrap();
@@ -52,7 +52,7 @@ const RAW: c_long = libc::SOCK_RAW as c_long;
 const STREAM: c_long = libc::SOCK_STREAM as c_long;
 const DATAGRAM: c_long = libc::SOCK_DGRAM as c_long;
 
-/// What nobody may, with arguments that would be harmless if they might.
+/// Calls that no role allows, with arguments that would be harmless.
 const NOBODY: [(&str, c_long, [c_long; 6]); 24] = [
     ("execve", libc::SYS_execve, [0; 6]),
     ("execveat", libc::SYS_execveat, [SELF, 0, 0, 0, 0, 0]),
@@ -116,7 +116,7 @@ fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
             }
             let writable = [0, 4096, READ_WRITE, PRIVATE, -1, 0];
             assert_eq!(call(libc::SYS_mmap, writable), None, "{role:?}");
-            // A child would be this process once more: were it made, it would end at once.
+            // If the call succeeded, the child would exit at once.
             let fork = [libc::SIGCHLD.into(), 0, 0, 0, 0, 0];
             assert_eq!(call(libc::SYS_clone, fork), Some(libc::EPERM), "{role:?}");
             assert_eq!(
@@ -160,8 +160,7 @@ fn sockets_are_made_by_who_speaks_and_of_no_other_kind() {
     }
 }
 
-/// What a connection can be led elsewhere with: `connect` after it was disconnected, and messages to
-/// an address.
+/// Ways to redirect a connection: `connect` after a disconnect, and messages with an address.
 #[test]
 fn an_accepted_connection_cannot_be_led_elsewhere() {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
@@ -248,10 +247,10 @@ fn who_looks_at_others_opens_nothing_for_writing() {
     }
 }
 
-/// What single threads may beyond the others: links, news of directories, their own scheduling.
+/// Privileges of single threads: links, file notifications, their own scheduling.
 #[test]
 fn links_news_of_files_and_scheduling_are_of_the_threads_that_need_them() {
-    // A link to no program, and no parameters to take.
+    // A link without a program, and a call without parameters.
     let link = [command::LINK_CREATE.into(), 0, 0, 0, 0, 0];
     let running_first = [0, libc::SCHED_FIFO.into(), 0, 0, 0, 0];
     let when_idle = [0, libc::SCHED_IDLE.into(), 0, 0, 0, 0];
@@ -285,7 +284,7 @@ fn threads_begin_names_are_resolved_and_memory_grows_as_before() {
     });
 }
 
-/// The handler of a signal writes to a socket, in whichever thread the kernel chooses.
+/// A signal handler writes to a socket, in a thread that the kernel chooses.
 #[test]
 fn every_thread_can_pass_a_signal_on() {
     for role in ROLES {
@@ -321,7 +320,7 @@ fn a_filter_is_some_hundred_instructions_and_made_for_both_architectures() {
         let calls = Allowed::to(role).unwrap().0.len();
         let length = program(role).unwrap().len();
         eprintln!("{role:?}: {calls} system calls, {length} instructions");
-        // The kernel takes 4096.
+        // The kernel's limit is 4096.
         assert!((100..1200).contains(&length), "{role:?}: {length}");
         for architecture in [TargetArch::x86_64, TargetArch::aarch64] {
             let filter = SeccompFilter::new(

@@ -50,7 +50,7 @@ fn durable_publishers() -> DiscoveredTopic {
     DiscoveredTopic::from(&topic)
 }
 
-/// A publisher of `/tf_static` that keeps its samples.
+/// A publisher of `/tf_static` with stored samples.
 fn static_transforms() -> GraphSnapshot {
     GraphSnapshot {
         topics: vec![PublishedTopic {
@@ -72,7 +72,7 @@ fn recorder(directory: &std::path::Path, options: FilterOptions) -> Recorder<'st
     )
 }
 
-/// With what is there when it begins and when it ends.
+/// Recorder with a graph at its start and at its end.
 fn recorder_of(
     directory: &std::path::Path,
     options: FilterOptions,
@@ -217,7 +217,7 @@ fn what_publishers_sent_before_is_named_unless_it_is_there() {
         recorder.take(&sample("/a", 2)).unwrap();
         assert_eq!(recorder.finish(None).report.sent_before.len(), expected);
     }
-    // Nothing came at all: it is in the bag by its name.
+    // Without any message, the topic is in the bag by its name.
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     let topics = [

@@ -1,5 +1,5 @@
-//! What a recording lacks because it was sent before, was not observed, or is of another domain:
-//! noted in the report at the end.
+//! Notes in the final report about messages that were sent before, were not observed, or belong to
+//! another domain.
 
 use std::collections::{BTreeMap, HashSet};
 
@@ -8,7 +8,8 @@ use crate::recording::graph::GraphSnapshot;
 use ros2probe_api::recording_report::OtherDomain;
 
 impl Recorder<'_> {
-    /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
+    /// Notes publishers with stored samples for late joiners whose first samples are not in the
+    /// bag.
     pub(super) fn note_what_was_sent_before(&mut self, graph: &GraphSnapshot) {
         let mut names: Vec<String> = Vec::new();
         for topic in graph
@@ -37,7 +38,8 @@ impl Recorder<'_> {
         self.report.sent_before = names;
     }
 
-    /// What would have been taken, had it been seen, announced, or in this domain.
+    /// Notes topics that would have been recorded if they had been visible, announced, or in this
+    /// domain.
     pub(super) fn note_what_was_not_observed(&mut self, graph: GraphSnapshot) {
         let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
         self.report.unobserved = self.unobserved(&graph);
