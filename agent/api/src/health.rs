@@ -39,7 +39,7 @@ pub struct Health {
     pub dropped_records: u64,
     /// Datagrams, captured at the host's sockets, that were dropped because their ring was full.
     pub dropped_datagrams: u64,
-    /// Datagrams that the kernel programs skipped because their buffer was in use.
+    /// Datagrams that the kernel programs skipped because they interrupted each other too often.
     pub contended_datagrams: u64,
     /// Writers whose announcement was missed; the names of their topics are unknown.
     pub unknown_writers: usize,

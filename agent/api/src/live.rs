@@ -146,7 +146,8 @@ pub struct Agent<'a> {
     pub reason: Option<String>,
     /// A replay has come to its end.
     pub finished: bool,
-    /// Packets, records and datagrams lost for want of room: above 0, counts are lower bounds.
+    /// Packets, records and datagrams dropped because a buffer was full. Above 0, counts are lower
+    /// bounds.
     pub dropped: u64,
     /// Writers whose announcement was missed.
     pub unknown_writers: usize,

@@ -121,13 +121,13 @@ impl Code {
             Self::NeedsSocket => (
                 "needs-socket",
                 403,
-                "Only by the unix socket or with a token",
+                "The unix socket or a token is required",
             ),
             Self::NotFound => ("not-found", 404, "No such path"),
             Self::NoSuchWatch => ("no-such-watch", 404, "No such watch"),
             Self::NoSuchTopic => ("no-such-topic", 404, "No such topic"),
             Self::NoSuchNode => ("no-such-node", 404, "No such node"),
-            Self::Ambiguous => ("ambiguous", 409, "Several things have the name"),
+            Self::Ambiguous => ("ambiguous", 409, "The name is ambiguous"),
             Self::MethodNotAllowed => ("method-not-allowed", 405, "Method not allowed"),
             Self::WatchDiffers => ("watch-differs", 409, "Watched with other settings"),
             Self::WatchGiven => ("watch-given", 409, "Not a client's watch"),
@@ -139,7 +139,7 @@ impl Code {
             Self::InvalidConfiguration => (
                 "invalid-configuration",
                 422,
-                "The configuration has mistakes and was not taken over",
+                "The configuration has errors and was not applied",
             ),
             Self::TooManyRequests => ("too-many-requests", 429, "Too many requests"),
             Self::TooManyStreams => ("too-many-streams", 503, "Too many streams of events"),
@@ -151,14 +151,18 @@ impl Code {
             ),
             Self::NoSuchRecording => ("no-such-recording", 404, "No such recording"),
             Self::NoSuchSnapshot => ("no-such-snapshot", 404, "No such snapshot"),
-            Self::RecordingExists => ("recording-exists", 409, "There is one of that name"),
+            Self::RecordingExists => ("recording-exists", 409, "A recording of this name exists"),
             Self::TooManyRecordings => ("too-many-recordings", 409, "Too many recordings"),
             Self::NoPlaceForRecordings => (
                 "no-place-for-recordings",
                 409,
                 "The agent has no directory for recordings",
             ),
-            Self::StorageRefuses => ("storage-refuses", 507, "The storage does not take it"),
+            Self::StorageRefuses => (
+                "storage-refuses",
+                507,
+                "The bag cannot be written to the storage",
+            ),
             Self::Ending => ("ending", 503, "The agent is shutting down"),
         }
     }
