@@ -1,4 +1,4 @@
-//! Names and values whose set depends on what they describe.
+//! Names and values whose set depends on the event or finding that they describe.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -17,19 +17,19 @@ pub struct Attributes<'a>(pub Vec<(Cow<'a, str>, Value<'a>)>);
 pub enum Value<'a> {
     /// Text.
     Text(Cow<'a, str>),
-    /// A count, a number of something.
+    /// An unsigned integer, such as a count.
     Number(u64),
-    /// A quantity.
+    /// A floating-point number, such as a rate in hertz.
     Real(f64),
-    /// Several texts.
+    /// A list of texts.
     List(Vec<Cow<'a, str>>),
-    /// A form that only a newer agent has.
+    /// A value of a type that this version does not know.
     #[serde(skip_serializing)]
     Unknown(IgnoredAny),
 }
 
 impl<'a> Attributes<'a> {
-    /// The value of one attribute, if it has one.
+    /// Returns the value of the attribute of this name, or `None` if it is missing.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&Value<'a>> {
         let mut attributes = self.0.iter();

@@ -1,4 +1,4 @@
-//! What is wrong with the graph.
+//! Problems of the ROS graph, found by comparing its endpoints and nodes.
 
 use std::borrow::Cow;
 
@@ -7,65 +7,66 @@ use serde::{Deserialize, Serialize};
 use crate::Open;
 use crate::attributes::{Attributes, Value};
 
-/// One finding.
+/// A problem of the graph.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(tag = "kind", rename_all = "snake_case")]
 pub enum Diagnosis<'a> {
-    /// Writer and reader do not talk: the one offers less than the other requests.
+    /// A writer and a reader do not match: the writer offers less than the reader requests.
     QosIncompatible {
-        /// Who offers.
+        /// GUID of the writer.
         writer: String,
-        /// Who requests.
+        /// GUID of the reader.
         reader: String,
-        /// In which policies.
+        /// Names of the incompatible QoS policies.
         #[cfg_attr(feature = "openapi", schema(example = json!(["reliability"])))]
         policies: Vec<Cow<'static, str>>,
     },
-    /// Endpoints of different types do not talk.
+    /// Endpoints of one topic have different types, so they do not match.
     TypeConflict {
-        /// ROS types.
+        /// ROS types in use.
         types: Vec<Cow<'a, str>>,
     },
-    /// Endpoints with different definitions of a type misread each other.
+    /// Endpoints have different definitions of one type and misread each other's messages.
     TypeHashConflict {
         /// ROS type.
         message_type: Cow<'a, str>,
-        /// RIHS01 hashes.
+        /// RIHS01 hashes in use.
         hashes: Vec<String>,
     },
-    /// Several nodes of one name in one domain.
+    /// Several nodes of one domain have the same name.
     DuplicateNode {
-        /// The participant of each.
+        /// GUID of each node's participant.
         participants: Vec<String>,
     },
     /// A writer without a matching reader.
     UnheardPublisher {
-        /// Who.
+        /// GUID of the writer.
         writer: String,
-        /// The nearest candidate: an endpoint with other QoS (`qos`), of another `type`, in another
-        /// `partition`, or `nobody` where there is no endpoint.
+        /// The nearest mismatch: an endpoint with other QoS (`qos`), of another `type`, or in
+        /// another `partition`; `nobody` if the topic has no reader at all.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
     UnfedSubscriber {
-        /// Who.
+        /// GUID of the reader.
         reader: String,
-        /// As for a writer.
+        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` if the topic has no writer
+        /// at all.
         reason: Cow<'static, str>,
     },
-    /// One node in several domains on one machine.
+    /// One node appears in several domains on one machine.
     NodeInSeveralDomains {
-        /// Domains.
+        /// Domain ids in which the node appears.
         domains: Cow<'a, [u32]>,
     },
 }
 
-/// A finding, also of a kind that a newer agent has.
+/// A problem of the graph; `Unknown` keeps a kind that only a newer agent reports.
 pub type Finding<'a> = Open<Diagnosis<'a>, Attributes<'a>>;
 
 impl Diagnosis<'_> {
-    /// Its `kind`.
+    /// Returns the value of `kind`.
     #[must_use]
     pub const fn kind(&self) -> &'static str {
         match self {
@@ -81,7 +82,7 @@ impl Diagnosis<'_> {
 }
 
 impl Finding<'_> {
-    /// Its `kind`; empty where it has none.
+    /// Returns the value of `kind`, or an empty string if it is missing.
     #[must_use]
     pub fn kind(&self) -> &str {
         match self {

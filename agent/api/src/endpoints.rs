@@ -6,36 +6,36 @@ use serde::{Deserialize, Serialize};
 
 use crate::measurement::Measurement;
 
-/// One writer or reader.
+/// A DDS writer or reader.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Endpoint<'a> {
-    /// GUID, as the metrics show it.
+    /// GUID in the form that the metrics use.
     #[cfg_attr(
         feature = "openapi",
         schema(example = "010f2b7d6a474f3300000000.00001103")
     )]
     pub guid: String,
-    /// Its node, as `ros_discovery_info` announces it; null when unknown.
+    /// Node of the endpoint, from `ros_discovery_info`; null when unknown.
     pub node: Option<Cow<'a, str>>,
-    /// ROS enclave of its participant; null means it is no ROS participant.
+    /// ROS enclave of the endpoint's participant; null if the participant does not use ROS.
     pub enclave: Option<Cow<'a, str>>,
     /// ROS type.
     pub message_type: Cow<'a, str>,
-    /// RIHS01 hash; null where it is not announced (Humble).
+    /// RIHS01 hash of the type; null if the endpoint does not announce it (Humble).
     pub type_hash: Option<Cow<'a, str>>,
-    /// Its participant's implementation.
+    /// DDS implementation of the endpoint's participant; null when unknown.
     pub vendor: Option<Cow<'a, str>>,
     /// Quality of service.
     pub qos: Qos<'a>,
-    /// Unix time of its first announcement.
+    /// Unix time of the first announcement, in seconds.
     pub first_seen_timestamp_seconds: f64,
-    /// What was counted of this writer; null for readers and while the topic is not watched.
+    /// Counts and times of this writer; null for readers and for topics that are not watched.
     pub measurement: Option<Measurement>,
 }
 
-/// Quality of service as announced; durations are null when they are infinite.
+/// Quality of service as announced. A null duration is infinite.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -45,7 +45,7 @@ pub struct Qos<'a> {
     pub reliability: Cow<'a, str>,
     #[cfg_attr(feature = "openapi", schema(example = "VOLATILE"))]
     pub durability: Cow<'a, str>,
-    /// `UNKNOWN` where the implementation does not say.
+    /// `UNKNOWN` if the implementation does not announce it.
     #[cfg_attr(feature = "openapi", schema(example = "KEEP_LAST (10)"))]
     pub history: Cow<'a, str>,
     pub deadline_seconds: Option<f64>,
@@ -55,21 +55,21 @@ pub struct Qos<'a> {
     pub liveliness_lease_seconds: Option<f64>,
     #[cfg_attr(feature = "openapi", schema(example = "SHARED"))]
     pub ownership: Cow<'static, str>,
-    /// Empty is the default one.
+    /// Partitions; empty for the default partition.
     pub partitions: Vec<Cow<'a, str>>,
 }
 
-/// Where something lives, as far as it is known.
+/// Host and process of a participant. A null field is unknown.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Process<'a> {
-    /// Host name when announced.
+    /// Host name, if the participant announces it.
     pub host: Option<Cow<'a, str>>,
-    /// Process id.
+    /// Process id: of the process that owns its socket, if known; otherwise as announced.
     pub process_id: Option<u32>,
     /// Process name.
     pub process: Option<Cow<'a, str>>,
-    /// Control group, as a path below the root: which container.
+    /// Path of the control group below the root; it identifies the container.
     pub cgroup: Option<Cow<'a, str>>,
 }

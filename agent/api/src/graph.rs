@@ -1,47 +1,47 @@
-//! `/graph`.
+//! `/graph`: nodes, topics, services and actions as a directed graph.
 
 use serde::{Deserialize, Serialize};
 
 use crate::Open;
 
-/// The graph.
+/// The graph of nodes, topics, services and actions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Graph {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By id.
+    /// Vertices, sorted by id.
     pub nodes: Vec<Vertex>,
-    /// By source, target and kind.
+    /// Edges, sorted by source, target and kind.
     pub edges: Vec<Edge>,
 }
 
-/// Something that others are joined to.
+/// A vertex: a node, participant, topic, service or action.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Vertex {
-    /// What edges call it.
+    /// Id by which edges refer to the vertex.
     #[cfg_attr(feature = "openapi", schema(example = "node:0:/robot1/lidar"))]
     pub id: String,
-    /// What it is.
+    /// Kind of the vertex.
     #[cfg_attr(feature = "openapi", schema(value_type = VertexKind))]
     pub kind: Open<VertexKind>,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
-    /// ROS name; a participant's GUID where a participant has no node.
+    /// ROS name; for a participant without a node, its GUID.
     pub name: String,
 }
 
-/// What a vertex is.
+/// The kind of a vertex.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum VertexKind {
     /// A ROS node.
     Node,
-    /// A participant that has endpoints of no node.
+    /// A participant whose endpoints belong to no known node.
     Participant,
     /// A topic.
     Topic,
@@ -51,23 +51,23 @@ pub enum VertexKind {
     Action,
 }
 
-/// Who gives something to whom.
+/// An edge, in the direction of messages and requests.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Edge {
-    /// Id of the vertex it begins at.
+    /// Id of the vertex at which the edge begins.
     pub source: String,
-    /// Id of the vertex it ends at.
+    /// Id of the vertex at which the edge ends.
     pub target: String,
-    /// What it means.
+    /// Kind of the edge.
     #[cfg_attr(feature = "openapi", schema(value_type = EdgeKind))]
     pub kind: Open<EdgeKind>,
-    /// Messages a second of a publisher, where they are counted.
+    /// Messages per second; null unless the edge is `publishes` and the topic is measured.
     pub rate_hertz: Option<f64>,
 }
 
-/// What an edge means. Edges go the way messages and requests go.
+/// The kind of an edge. Edges point in the direction of messages and requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]

@@ -1,117 +1,118 @@
-//! `/health`, `/-/reload` and the token of the page.
+//! `/health`, `/-/reload`, and the access token of the web page.
 
 use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
-/// How the agent is.
+/// Readiness, limits and abilities of the agent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Health {
-    /// Packets are captured and what is known is fresh.
+    /// The agent captures packets, and its state is fresh.
     pub ready: bool,
-    /// Why it is not.
+    /// Why the agent is not ready; null if it is.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
-    /// Why part of the robot is not seen although it is ready: which limits are reached.
+    /// Which limits are reached, so that part of the robot is not observed; null if none is.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub degraded: Option<String>,
-    /// Name of its host.
+    /// Name of the agent's host.
     pub host: Option<String>,
     /// Version of the agent.
     pub version: Cow<'static, str>,
-    /// Where it looks: `host`, `wire` or `replay`.
+    /// Where the agent captures: `host`, `wire` or `replay`.
     pub source: Cow<'static, str>,
-    /// The replay reached the end of its capture; no figure changes after that.
+    /// The replay has reached the end of its capture; no value changes after that.
     pub finished: bool,
-    /// Age of what is known; null while nothing is.
+    /// Age of the agent's state, in seconds; null before the first packet.
     pub age_seconds: Option<f64>,
-    /// Watches in force, of every origin.
+    /// Number of active watches, from every origin.
     pub watches: usize,
-    /// Watches that clients add outlive the agent: there is a state directory that can be written.
+    /// Watches that clients add survive a restart: the agent has a writable state directory.
     pub watches_kept: bool,
-    /// Packets lost because a ring was full: above 0, counts are lower bounds.
+    /// Packets dropped because a capture ring was full. Above 0, counts are lower bounds.
     pub dropped_packets: u64,
-    /// Measurement records lost likewise.
+    /// Measurement records dropped because their ring was full.
     pub dropped_records: u64,
-    /// Datagrams captured at the host's sockets that were lost likewise.
+    /// Datagrams, captured at the host's sockets, that were dropped because their ring was full.
     pub dropped_datagrams: u64,
-    /// Datagrams that the kernel programs could not look at.
+    /// Datagrams that the kernel programs skipped because they interrupted each other too often.
     pub contended_datagrams: u64,
-    /// Senders whose announcement was missed: their topics have no name.
+    /// Writers whose announcement was missed; the names of their topics are unknown.
     pub unknown_writers: usize,
-    /// Topics that a watch matched but `limits.topics` kept from being measured.
+    /// Topics that match a watch but are not measured because `limits.topics` is reached.
     pub topics_rejected: u64,
-    /// Why it does not look where it would see more.
+    /// Why the agent captures at a source that shows less than another one would; null otherwise.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub source_reason: Option<String>,
-    /// What it can see and what not.
+    /// Abilities of the agent, and whether it has each.
     pub abilities: Vec<Ability>,
-    /// Where packets come from: interfaces, or `sockets`.
+    /// Capture points: network interfaces, or `sockets`.
     pub interfaces: Vec<Interface>,
-    /// Bounded tables.
+    /// Fill level of the bounded tables.
     pub tables: Vec<Table>,
-    /// Caps of the configuration.
+    /// Use of the configured limits.
     pub limits: Vec<Limit>,
-    /// Capabilities that some thread of it holds, after it has given up what it does not need any
-    /// more. The thread that answers holds none.
+    /// Capabilities that at least one thread still holds after startup. The thread that serves this
+    /// answer holds no capabilities.
     pub capabilities: Vec<String>,
-    /// Its threads, as the kernel sees them.
+    /// Threads of the agent, as the kernel reports them.
     pub threads: Vec<Thread>,
-    /// Why system calls are not filtered.
+    /// Why system calls are not filtered; null if they are.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub unfiltered_reason: Option<Cow<'static, str>>,
-    /// Its process, in its own process namespace.
+    /// Process id of the agent, in its own PID namespace.
     pub process_id: u32,
-    /// Since its process started; null where that cannot be read.
+    /// Seconds since the agent's process started; null if unknown.
     pub uptime_seconds: Option<f64>,
 }
 
-/// One thing that an agent may be able to see.
+/// An ability that depends on privileges, the kernel or the configuration.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Ability {
-    /// Which: see `ros2probe_capture_ability`.
+    /// Name of the ability, from `ros2probe_capture_ability`.
     #[cfg_attr(feature = "openapi", schema(example = "socket_losses"))]
     pub ability: Cow<'static, str>,
-    /// Whether this one can.
+    /// Whether the agent has the ability.
     pub able: bool,
-    /// Why not, where there is more to say than that it was not asked for.
+    /// Why the agent lacks the ability; null if it is simply not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
 }
 
-/// A thread and what it may do.
+/// A thread of the agent and its privileges.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Thread {
-    /// Its name; `rp` for the one that answers.
+    /// Name of the thread; `rp` for the one that serves this answer.
     #[cfg_attr(feature = "openapi", schema(example = "capture"))]
     pub thread: String,
-    /// Capabilities that it holds.
+    /// Capabilities that the thread holds.
     pub capabilities: Vec<String>,
-    /// The kernel refuses all system calls but those that it makes.
+    /// A seccomp filter limits the thread to the system calls that it needs.
     pub filtered: bool,
 }
 
-/// Where packets come from.
+/// A capture point.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Interface {
-    /// Its name; `sockets` for those of this host, `any` for all interfaces of a namespace.
+    /// Name of the interface; `sockets` for the host's sockets, `any` for all interfaces of a
+    /// namespace.
     pub interface: String,
-    /// Packets that the filter let through, where they are counted so.
+    /// Packets that passed the filter; null if they are not counted per interface.
     pub packets: Option<u64>,
-    /// Packets lost because a ring was full, where they are counted so.
+    /// Packets dropped because the ring was full; null if they are not counted per interface.
     pub dropped_packets: Option<u64>,
 }
 
@@ -120,60 +121,61 @@ pub struct Interface {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Table {
-    /// Its name, as in `limits`.
+    /// Name of the table, as in `limits`.
     #[cfg_attr(feature = "openapi", schema(example = "endpoints"))]
     pub table: Cow<'static, str>,
-    /// Entries; bytes for `reassembly`.
+    /// Number of entries; for `reassembly`, bytes.
     pub entries: u64,
-    /// Its cap.
+    /// Largest number of entries, or bytes for `reassembly`.
     pub limit: u64,
-    /// Entries given up because of the cap.
+    /// Entries evicted because the table was full.
     pub evictions: u64,
 }
 
-/// A cap of the configuration.
+/// A limit of the configuration and its use.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Limit {
-    /// Its key below `limits`.
+    /// Key below `limits` in the configuration.
     #[cfg_attr(feature = "openapi", schema(example = "topics"))]
     pub limit: Cow<'static, str>,
-    /// Entries, connections or bytes that may be.
+    /// Largest number of entries, connections or bytes.
     pub cap: u64,
-    /// That are.
+    /// Entries, connections or bytes in use.
     pub used: u64,
-    /// What was refused, or given up to make room, because of it.
+    /// How often an entry was refused, or evicted to make room, because the limit was reached.
     pub reached: u64,
-    /// There is no room, or there was none within the last minute.
+    /// The limit is reached now or was reached within the last minute.
     pub at_limit: bool,
 }
 
-/// The configuration was taken over.
+/// Result of a successful reload of the configuration.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Reloaded {
-    /// Watches in force, of every origin.
+    /// Number of active watches, from every origin.
     pub watches: usize,
     /// Changed keys that take effect only after a restart.
     pub needs_restart: Vec<Cow<'static, str>>,
 }
 
-/// Grants a page all rights.
+/// An access token for the web page; it grants all rights.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct PageToken {
-    /// Sent as `Authorization: Bearer`; valid until the agent ends, or until 16 newer ones are given.
+    /// Token to send as `Authorization: Bearer`. It is valid until the agent stops or 16 newer
+    /// tokens exist.
     pub token: String,
-    /// Where the page is served on the agent's host; null where it is not.
+    /// Address of the page on the agent's host; null if the page is not served.
     #[cfg_attr(feature = "openapi", schema(example = "http://localhost:17401/"))]
     pub address: Option<String>,
 }
 
 impl Health {
-    /// Packets, records and datagrams that were not looked at.
+    /// Returns how many packets, records and datagrams were captured but not processed.
     #[must_use]
     pub const fn dropped(&self) -> u64 {
         self.dropped_packets

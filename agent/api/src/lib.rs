@@ -1,10 +1,10 @@
-//! What the agent's API answers, declared once for the server and for `rp`, its client.
+//! Answers of the agent's API, declared once for the server and for its client `rp`.
 //!
-//! A module for each noun of the API has its types. The agent borrows an answer from its snapshot and
-//! writes it; a client reads the same type and owns it. A field that an older agent does not send has
-//! its default, a field that only a newer agent sends is left out, and [`Open`] keeps values of an
-//! enumeration that this version does not know. The feature `openapi` derives the schemas of the
-//! OpenAPI document.
+//! Each noun of the API has a module. The agent serializes an answer that borrows from its
+//! snapshot; a client deserializes the same type and owns it. A field that an older agent does not
+//! send takes its default. A field that only a newer agent sends is ignored, and [`Open`] keeps
+//! values of an enumeration that this version does not know. The feature `openapi` derives the
+//! schemas of the OpenAPI document.
 //!
 //! ```
 //! use ros2probe_api::health::Health;
@@ -42,5 +42,5 @@ pub mod watches;
 
 pub use open::Open;
 
-/// The highest domain id of DDS for which RTPS has ports (RTPS 2.5, 9.6.2.3).
+/// Highest DDS domain id that RTPS maps to ports (RTPS 2.5, 9.6.2.3).
 pub const MAX_DOMAIN_ID: u32 = 232;

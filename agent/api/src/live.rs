@@ -1,7 +1,6 @@
-//! `/live`: the lines of the stream that the page follows.
+//! `/live`: the lines of the stream that the web page reads.
 //!
-//! Rows are arrays where there are many of them. Members and elements are only ever added at the
-//! end.
+//! Repeated rows are arrays, to save bytes. New members and elements are only added at the end.
 
 use std::borrow::Cow;
 
@@ -9,75 +8,75 @@ use serde::{Deserialize, Serialize};
 
 use crate::events::Event;
 
-/// One line: an object with one member.
+/// A line of the stream: an object with one member.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveLine))]
 #[serde(rename_all = "snake_case")]
 pub enum Line<'a> {
-    /// The first line: the agent, and the meaning of flags and passages.
+    /// The first line: the agent, and the meaning of the bits of flags and passages.
     Open(Open),
-    /// The whole structure; again when it has changed.
+    /// The whole graph; sent first, and again after each change.
     Graph(Graph<'a>),
-    /// The agent; again when something has changed.
+    /// The agent's state; sent first, and again after each change.
     Agent(Agent<'a>),
-    /// Everything that is wrong, the worst first; again when something has changed.
+    /// All findings, the most severe first; sent again after each change.
     Findings(Vec<Finding>),
-    /// Rates of the time before the stream was opened, once.
+    /// Rates from before the stream was opened; sent once.
     History(History),
-    /// Events since the stream was opened.
+    /// Events since the previous line of this kind.
     Events(Events<'a>),
-    /// Figures that have changed; the last line of each second, also where nothing has.
+    /// Values that changed; the last line of each second, sent even if nothing changed.
     Values(Values),
-    /// Nothing will follow.
+    /// The last line of the stream.
     End(End),
 }
 
-/// The agent, and the meaning of flags and passages.
+/// The agent, and the meaning of the bits of flags and passages.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveOpen))]
 pub struct Open {
-    /// Of this run of the agent.
+    /// Id of this run of the agent.
     pub run: String,
-    /// Name of its host.
+    /// Name of the agent's host.
     pub host: Option<String>,
     /// Version of the agent.
     pub version: Cow<'static, str>,
-    /// Where it looks: `host`, `wire` or `replay`.
+    /// Where the agent captures: `host`, `wire` or `replay`.
     pub source: Cow<'static, str>,
     /// Rights of this client: `read`, `watch` or `all`.
     pub access: String,
-    /// Time between two batches of lines.
+    /// Seconds between two batches of lines.
     pub interval_seconds: u32,
-    /// How far `/topics/{topic}/history` reaches back.
+    /// Seconds that `/topics/{topic}/history` covers.
     pub history_seconds: u64,
-    /// What the bits of a topic's flags mean, from the lowest one on.
+    /// Meaning of the bits of a topic's flags, from the lowest bit on.
     pub flags: Vec<Cow<'static, str>>,
-    /// What the bits of passages mean, likewise.
+    /// Meaning of the bits of passages, from the lowest bit on.
     pub passages: Vec<Cow<'static, str>>,
-    /// Where the capture begins; null for a live agent.
+    /// The replayed capture; null for a live agent.
     pub replay: Option<Replay>,
 }
 
-/// The capture that is replayed.
+/// The replayed capture.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveReplay))]
 pub struct Replay {
-    /// Unix time of its first packet; null before that is read.
+    /// Unix time of the first packet; null before it has been read.
     pub begin: Option<f64>,
 }
 
-/// Participants, nodes, topics and endpoints. Numbers that stand for them are valid within one
-/// stream, where none is used twice.
+/// Participants, nodes, topics and endpoints. Each has a number that is unique within the stream
+/// and never reused.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveGraph))]
 pub struct Graph<'a> {
-    /// Counts up.
+    /// Version of the graph; each change increments it.
     pub version: u64,
     /// Participants.
     pub participants: Vec<Participant<'a>>,
-    /// Nodes, one for each name of a domain.
+    /// Nodes, one for each name in a domain.
     pub nodes: Vec<Node<'a>>,
-    /// Topics, without those below services and discovery.
+    /// Topics, without those of services and discovery.
     pub topics: Vec<Topic<'a>>,
     /// Writers.
     pub publishers: Vec<Endpoint<'a>>,
@@ -85,8 +84,8 @@ pub struct Graph<'a> {
     pub subscriptions: Vec<Endpoint<'a>>,
 }
 
-/// `[id, GUID, domain, implementation, host, process id, process, control group]`; the last four
-/// are null where they are not known.
+/// `[id, GUID, domain, implementation, host, process id, process, control group]`. Each of the last
+/// four is null when unknown.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveParticipant))]
 pub struct Participant<'a>(
@@ -106,8 +105,8 @@ pub struct Participant<'a>(
 pub struct Node<'a>(pub u32, pub u32, pub Cow<'a, str>, pub Vec<u32>, pub u8);
 
 /// `[id, domain, name, DDS name, kind, types, 1 if hidden, 1 if vanished, 1 if measured, watched]`.
-/// `watched` is 1 for the configuration, 2 for the command line, 3 for a client, 0 for no watch of
-/// this name; 4 is added where a glob covers it.
+/// `watched` names the origin of a watch of exactly this name: 1 for the configuration, 2 for the
+/// command line, 3 for a client, 0 without one. A glob that covers the topic adds 4.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTopic))]
 pub struct Topic<'a>(
@@ -123,8 +122,8 @@ pub struct Topic<'a>(
     pub u8,
 );
 
-/// `[topic, node or 0, participant, GUID, passages, reliability, durability]`; passages are a set of
-/// bits, empty without a counterpart.
+/// `[topic, node or 0, participant, GUID, passages, reliability, durability]`. `passages` is a bit
+/// set, 0 if no endpoint matches.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEndpoint))]
 pub struct Endpoint<'a>(
@@ -137,34 +136,35 @@ pub struct Endpoint<'a>(
     pub Cow<'a, str>,
 );
 
-/// The agent itself.
+/// State of the agent itself.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveAgent))]
 pub struct Agent<'a> {
-    /// It observes the robot.
+    /// The agent captures packets, and its state is fresh.
     pub ready: bool,
-    /// Why not.
+    /// Why the agent is not ready; null if it is.
     pub reason: Option<String>,
     /// A replay has come to its end.
     pub finished: bool,
-    /// Packets, records and datagrams lost for want of room: above 0, counts are lower bounds.
+    /// Packets, records and datagrams dropped because a buffer was full. Above 0, counts are lower
+    /// bounds.
     pub dropped: u64,
-    /// Senders whose announcement was missed.
+    /// Writers whose announcement was missed.
     pub unknown_writers: usize,
-    /// Topics that a watch matched but `limits.topics` kept out.
+    /// Topics that match a watch but are not measured because `limits.topics` is reached.
     pub topics_rejected: u64,
-    /// Everything it may be able to observe.
+    /// Abilities of the agent, and whether it has each.
     pub abilities: Vec<Ability<'a>>,
-    /// Watches in force.
+    /// Number of active watches.
     pub watches: usize,
 }
 
-/// `[ability, 1 if it has it, why not]`.
+/// `[ability, 1 if the agent has it, why not]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveAbility))]
 pub struct Ability<'a>(pub Cow<'static, str>, pub u8, pub Option<Cow<'a, str>>);
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveSeverity))]
 #[serde(rename_all = "lowercase")]
@@ -173,32 +173,33 @@ pub enum Severity {
     Error,
     /// Something may not work.
     Warning,
-    /// Good to know.
+    /// Information that needs no action.
     Note,
 }
 
-/// One thing that is wrong, in words.
+/// A finding, described in words.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveFinding))]
 pub struct Finding {
-    /// The same as long as it is about the same.
+    /// Stable id: it stays the same while the finding concerns the same problem.
     pub id: String,
-    /// Which: as in `diagnoses` of `/topics`, or `loss`, `watch_violated`, `watch_silent`,
-    /// `agent_not_ready`, `agent_drops`, `unknown_writers`, `topics_rejected` or `ability`.
+    /// Kind of the finding: a kind of `diagnoses` in `/topics`, or `loss`, `watch_violated`,
+    /// `watch_silent`, `agent_not_ready`, `agent_drops`, `unknown_writers`, `topics_rejected` or
+    /// `ability`.
     pub kind: Cow<'static, str>,
-    /// How bad.
+    /// Severity.
     pub severity: Severity,
-    /// Its domain; null for the agent.
+    /// Domain id; null for findings about the agent.
     pub domain_id: Option<u32>,
-    /// Its topic in the graph.
+    /// Number of the topic in the graph.
     pub topic: Option<u32>,
-    /// Its node in the graph.
+    /// Number of the node in the graph.
     pub node: Option<u32>,
-    /// Unix time since when, where that is known.
+    /// Unix time at which the problem began; null when unknown.
     pub since: Option<f64>,
-    /// What is wrong.
+    /// Description of the problem.
     pub text: String,
-    /// What helps.
+    /// Suggested remedy.
     pub remedy: Option<String>,
     /// GUID of the writer.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -208,7 +209,7 @@ pub struct Finding {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reader: Option<String>,
-    /// Policies that differ.
+    /// QoS policies that differ.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[cfg_attr(feature = "openapi", schema(required = false))]
     pub policies: Vec<Cow<'static, str>>,
@@ -218,50 +219,51 @@ pub struct Finding {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveHistory))]
 pub struct History {
-    /// Time between two values.
+    /// Seconds between two values.
     pub step_seconds: u32,
     /// Unix time at which each step ended.
     pub t: Vec<f64>,
-    /// Messages a second, payload bytes a second and lost messages of all topics.
+    /// Messages per second, payload bytes per second and lost messages, each summed over all
+    /// topics.
     pub totals: [Vec<f64>; 3],
-    /// Messages a second by topic.
+    /// Messages per second of each topic.
     pub topics: Vec<Rates>,
 }
 
-/// `[topic, messages a second in each step]`, null where it was not measured.
+/// `[topic, messages per second in each step]`; null for steps in which the topic was not measured.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRates))]
 pub struct Rates(pub u32, pub Vec<Option<f64>>);
 
-/// Events.
+/// Events since the previous line of this kind.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEvents))]
 pub struct Events<'a> {
     /// Events that were overwritten before they could be sent.
     pub missed: u64,
-    /// The others, in the form of `/events`.
+    /// The other events, in the form of `/events`.
     pub list: Vec<Event<'a>>,
 }
 
-/// Figures.
+/// Values that changed since the previous line of this kind.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveValues))]
 pub struct Values {
-    /// Unix time of the facts, in the source's clock.
+    /// Unix time of the values, by the source's clock.
     pub t: f64,
-    /// Rows that differ from those that were sent last.
+    /// Rows that changed since they were last sent.
     pub topics: Vec<Row>,
-    /// Of all topics in the last second.
+    /// Totals of all topics in the last second.
     pub totals: Totals,
-    /// How far a replay is.
+    /// Progress of the replay; null for a live agent.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub replay: Option<Progress>,
 }
 
-/// `[topic, messages a second, payload bytes a second, messages, lost messages, lost in the last
-/// second, median latency, its 99th percentile, flags, Unix time of the last message]`. All but
-/// topic and flags are null while it is not measured.
+/// `[topic, messages per second, payload bytes per second, messages, lost messages, messages lost
+/// in the last second, median latency, 99th percentile of latency, flags, Unix time of the last
+/// message]`. All elements but topic and flags are null for a topic that is not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRow))]
 pub struct Row(
@@ -282,21 +284,21 @@ pub struct Row(
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTotals))]
 pub struct Totals(pub u64, pub u64, pub u64, pub u64);
 
-/// `[part of the file that was read, 1 if all of it was]`.
+/// `[part of the file that was read, from 0 to 1, 1 at its end]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveProgress))]
 pub struct Progress(pub Option<f64>, pub u8);
 
-/// Why nothing follows.
+/// Why the stream ended.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEnd))]
 pub struct End {
-    /// In words.
+    /// The reason, in words.
     pub reason: Cow<'static, str>,
 }
 
 impl Row {
-    /// Nothing is measured and nothing is wrong.
+    /// Returns the row of a topic that is not measured and has no flags.
     #[must_use]
     pub const fn empty(topic: u32) -> Self {
         Self(topic, None, None, None, None, None, None, None, 0, None)
@@ -304,7 +306,7 @@ impl Row {
 }
 
 impl Finding {
-    /// The same with what helps.
+    /// Returns the finding with a suggested remedy.
     #[must_use]
     pub fn with_remedy(self, remedy: impl Into<String>) -> Self {
         Self {

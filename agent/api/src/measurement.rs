@@ -2,137 +2,142 @@
 
 use serde::{Deserialize, Serialize};
 
-/// What was counted while the topic was watched.
+/// Counts and times of a topic or writer while it was watched.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Measurement {
-    /// Messages seen whole, each once.
+    /// Messages received whole, without duplicates.
     pub messages: u64,
-    /// Their payload bytes.
+    /// Payload bytes of these messages.
     pub bytes: u64,
-    /// Messages that were sent but never seen whole.
+    /// Messages that were sent but never received whole.
     pub lost_messages: u64,
-    /// Messages that filled a gap later.
+    /// Messages that arrived late and closed a gap.
     pub recovered_messages: u64,
-    /// Messages and fragments seen again.
+    /// Messages and fragments received more than once.
     pub duplicate_messages: u64,
-    /// Lost messages of which a part was seen.
+    /// Lost messages of which some fragments were received.
     pub incomplete_messages: u64,
-    /// Messages that the writer left out (GAP), or that readers acknowledged unseen; no losses.
+    /// Messages that the writer skipped (GAP), or that readers acknowledged although the agent did
+    /// not see them. They do not count as lost.
     pub irrelevant_messages: u64,
-    /// Lost of those that were sent; null while there were none.
+    /// Lost messages divided by sent messages; null before the first message.
     pub loss_ratio: Option<f64>,
-    /// Messages a second over the last window.
+    /// Messages per second over the last window.
     pub rate_hertz: f64,
-    /// Payload bytes a second over the same window.
+    /// Payload bytes per second over the same window.
     pub bandwidth_bytes_per_second: f64,
     /// Unix time of the last message.
     pub last_message_timestamp_seconds: Option<f64>,
-    /// Between consecutive messages of one writer.
+    /// Time between consecutive messages of one writer.
     pub interarrival: Option<Distribution>,
-    /// From the writer's timestamp to the capture; across hosts it needs synchronised clocks.
+    /// Time from the writer's timestamp to the capture; across hosts it requires synchronised
+    /// clocks.
     pub latency: Option<Distribution>,
-    /// From the message's `Header.stamp` to the capture; likewise.
+    /// Time from the message's `Header.stamp` to the capture; across hosts it requires synchronised
+    /// clocks.
     pub header_latency: Option<Distribution>,
-    /// Messages stamped after their capture: clocks are apart.
+    /// Messages whose timestamp is later than their capture: the clocks differ.
     pub negative_latency_messages: u64,
-    /// Messages stamped more than an hour before or after their capture: the sender's clock was never
-    /// set, or the timestamp is forged.
+    /// Messages whose timestamp is more than an hour before or after their capture. The sender's
+    /// clock was never set, or the timestamp is forged.
     pub implausible_latency_messages: u64,
-    /// Jumps of sequence numbers that one datagram does not prove.
+    /// Jumps of the sequence number that a single datagram suggests but does not prove.
     pub doubted_sequence_jumps: u64,
-    /// Present when some of this was read from shared memory, which is a sampled view.
+    /// Coverage of the shared-memory sampling; null if all messages were captured on the network.
     pub sampled: Option<Sampled>,
 }
 
-/// How much a sampled view saw.
+/// Coverage of shared-memory sampling.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Sampled {
-    /// Messages of which at least a part was seen.
+    /// Messages of which at least a part was read.
     pub seen_messages: u64,
-    /// Messages that there were, by their sequence numbers.
+    /// Messages that were written, by their sequence numbers.
     pub existing_messages: u64,
-    /// How often something may have gone unnoticed between two looks.
+    /// How often the buffer may have been overwritten unseen between two readings.
     pub uncertain_looks: u64,
-    /// Seen of those that there were; null while there were none.
+    /// Messages read divided by messages written; null before the first message.
     pub coverage_ratio: Option<f64>,
 }
 
-/// Seconds that something took. Percentiles are estimates from a histogram.
+/// A distribution of durations. Percentiles are estimated from a histogram.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Distribution {
-    /// How many values.
+    /// Number of values.
     pub count: u64,
     /// Mean.
     pub mean_seconds: f64,
     /// Smallest value.
     pub minimum_seconds: f64,
-    /// Half of the values are below it.
+    /// Median.
     pub p50_seconds: f64,
-    /// 95 % of the values are below it.
+    /// 95th percentile.
     pub p95_seconds: f64,
-    /// 99 % of the values are below it.
+    /// 99th percentile.
     pub p99_seconds: f64,
     /// Largest value.
     pub maximum_seconds: f64,
 }
 
-/// Part of a histogram.
+/// A bucket of a histogram.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Bucket {
-    /// Values are at most this, and above the one before; null for those above all bounds.
+    /// Inclusive upper bound in seconds; null for the last bucket. The lower bound is that of the
+    /// bucket before.
     pub upper_seconds: Option<f64>,
-    /// How many.
+    /// Number of values in this bucket.
     pub count: u64,
 }
 
-/// What became of messages on their way.
+/// Fate of messages on their way to a receiver or destination.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Delivered {
-    /// Messages that came, or left, whole.
+    /// Messages that arrived, or left, whole.
     pub messages: u64,
-    /// Their payload bytes.
+    /// Payload bytes of these messages.
     pub bytes: u64,
-    /// Messages that came by retransmission.
+    /// Messages that arrived by retransmission.
     pub recovered_messages: u64,
-    /// Messages that never came, whatever the cause.
+    /// Messages that never arrived, for any reason.
     pub lost_messages: u64,
-    /// Of these: never reached this host.
+    /// Lost messages that never reached this host.
     pub lost_before_host_messages: u64,
-    /// Of these: died in IP reassembly on this host.
+    /// Lost messages that failed IP reassembly on this host.
     pub lost_in_reassembly_messages: u64,
-    /// Of these: died in the full receive buffer of the subscriber's socket.
+    /// Lost messages that the full receive buffer of the subscriber's socket dropped.
     pub lost_in_socket_buffer_messages: u64,
-    /// Of these: it is not known yet where.
+    /// Lost messages whose cause is not known yet.
     pub pending_messages: u64,
-    /// Messages that arrived where no reader of the topic is.
+    /// Messages that arrived at a process without a reader of the topic.
     pub unmatched_messages: u64,
-    /// Messages and fragments that came again.
+    /// Messages and fragments that arrived more than once.
     pub duplicate_messages: u64,
-    /// Messages that the writer left out (GAP), or that readers acknowledged unseen; no losses.
+    /// Messages that the writer skipped (GAP), or that readers acknowledged although the agent did
+    /// not see them. They do not count as lost.
     pub irrelevant_messages: u64,
 }
 
-/// Where messages spent their time on this host.
+/// Time that messages spent in each stage on this host.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Breakdown {
-    /// From the writer's timestamp to the first datagram leaving this host.
+    /// From the writer's timestamp to the departure of the first datagram from this host.
     pub send_delay: Option<Distribution>,
-    /// From leaving to arriving, where both happen on this host.
+    /// From departure to arrival, if both happen on this host.
     pub transit: Option<Distribution>,
-    /// From the first to the last datagram of a message that came in several.
+    /// From the first to the last datagram of a message that needs several.
     pub transfer: Option<Distribution>,
-    /// From noticing that a message is missing to its arrival by retransmission.
+    /// From the detection of a missing message to its arrival by retransmission.
     pub retransmission: Option<Distribution>,
 }

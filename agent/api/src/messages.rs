@@ -1,14 +1,14 @@
 //! `/topics/{topic}/messages`: the lines of the stream of decoded messages, and
 //! `/topics/{topic}/definition`.
 //!
-//! The fields of a message are of any type `V`: the agent writes JSON text, and a client reads what
-//! it needs. The line of a message is a [`Message`] of them.
+//! Fields of a message have the generic type `V`: the agent writes JSON text, and a client
+//! deserializes the type that it needs. A line contains a [`Message`] of them.
 
 use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
-/// One line: an object with one member.
+/// A line of the stream: an object with one member.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesLine))]
 #[serde(rename_all = "snake_case")]
@@ -17,26 +17,26 @@ pub enum Line<M> {
     Type(Definition),
     /// A message.
     Message(M),
-    /// Messages that will not be shown because their bytes are not known.
+    /// Messages that cannot be shown because their bytes were not captured.
     Missed(Missed),
-    /// The stream lives.
+    /// A sign that the stream is alive, sent while no message arrives.
     Beat(Beat),
-    /// Nothing will follow.
+    /// The last line of the stream.
     End(End),
 }
 
-/// A type.
+/// A message type.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesType))]
 pub struct Definition {
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "sensor_msgs/msg/Imu"))]
     pub name: String,
-    /// Whether its definition is known, so that messages can be decoded.
+    /// Whether the definition is known, so that messages can be decoded.
     pub known: bool,
-    /// Why not.
+    /// Why the definition is unknown; null if it is known.
     pub reason: Option<String>,
-    /// The definition with those of its parts, as ROS bags have it.
+    /// The definition followed by those of its nested types, in the format of ROS bags.
     pub definition: Option<String>,
 }
 
@@ -44,50 +44,51 @@ pub struct Definition {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesMessage))]
 pub struct Message<V> {
-    /// Unix time of its arrival.
+    /// Unix time of the message's arrival.
     pub time: f64,
-    /// Unix time at which it was written, by the writer's clock.
+    /// Unix time at which the message was written, by the writer's clock.
     pub source_time: Option<f64>,
     /// GUID of its writer.
     pub writer: String,
     /// The writer's node.
     pub node: Option<String>,
-    /// Its number among those of this writer.
+    /// Sequence number of the message, counted by the writer.
     pub sequence_number: u64,
     /// Bytes of the serialized message.
     pub bytes: u32,
-    /// Messages that came between the one shown before and this one.
+    /// Messages that arrived between the one shown before and this one.
     pub skipped: u64,
-    /// Its fields, in the order of the definition. 64-bit numbers beyond 2^53, NaN and infinities are
-    /// text; of long arrays and texts there is `$length` and the beginning, `$items` or `$text`.
+    /// Fields in the order of the definition. 64-bit numbers beyond 2^53, NaN and infinities are
+    /// strings. A long array or string becomes an object with its `$length` and its beginning,
+    /// `$items` or `$text`.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<Object>))]
     pub value: Option<V>,
-    /// Why it cannot be decoded.
+    /// Why the message cannot be decoded; null if it can.
     pub error: Option<String>,
 }
 
-/// Messages that are not known.
+/// Messages that cannot be shown.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesMissed))]
 pub struct Missed {
-    /// How many.
+    /// Number of messages.
     pub messages: u64,
-    /// Why.
+    /// Why they cannot be shown.
     pub reason: Cow<'static, str>,
 }
 
-/// The stream lives.
+/// A sign that the stream is alive.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesBeat))]
 pub struct Beat {
-    /// Unix time up to which all messages have come.
+    /// Unix time up to which all messages have been sent.
     pub t: Option<f64>,
 }
 
-/// Why nothing follows.
+/// Why the stream ended.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MessagesEnd))]
 pub struct End {
-    /// In words.
+    /// The reason, in words.
     pub reason: Cow<'static, str>,
 }

@@ -1,54 +1,54 @@
-//! `/names`.
+//! `/names`: names of nodes, topics and services.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 
-/// Names.
+/// Names of nodes, topics and services.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Names<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// Every domain with a participant, also when the request selects one.
+    /// Every domain with a participant, even if the request selects one domain.
     pub domains: BTreeSet<u32>,
-    /// How many participants there are.
+    /// Number of participants.
     pub participants: usize,
-    /// Writers that send although their announcement was missed; of no known domain.
+    /// Active writers whose announcement was missed; their domain is unknown.
     pub unknown_writers: usize,
-    /// Nodes by domain and name.
+    /// Nodes, sorted by domain and name.
     pub nodes: Vec<NodeName<'a>>,
-    /// ROS topics by domain and name; with `hidden=true` also those that actions and introspection
-    /// of services consist of.
+    /// ROS topics, sorted by domain and name. With `hidden=true` they include the topics of actions
+    /// and of service introspection.
     pub topics: Vec<TopicName<'a>>,
-    /// Services by domain and name.
+    /// Services, sorted by domain and name.
     pub services: Vec<ServiceName<'a>>,
 }
 
-/// A node's name.
+/// The name of a node.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct NodeName<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// Fully qualified name.
     #[cfg_attr(feature = "openapi", schema(example = "/robot1/lidar"))]
     pub name: Cow<'a, str>,
     /// Hidden by ROS convention.
     pub hidden: bool,
-    /// Nodes that bear it; more than one is a fault.
+    /// Number of nodes with this name; more than one is a fault.
     pub instances: usize,
 }
 
-/// A topic's name.
+/// The name of a topic.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct TopicName<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
@@ -57,18 +57,18 @@ pub struct TopicName<'a> {
     pub hidden: bool,
     /// ROS types.
     pub types: Vec<Cow<'a, str>>,
-    /// How many writers.
+    /// Number of writers.
     pub publishers: usize,
-    /// How many readers.
+    /// Number of readers.
     pub subscriptions: usize,
 }
 
-/// A service's name.
+/// The name of a service.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ServiceName<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "/add_two_ints"))]
@@ -78,18 +78,18 @@ pub struct ServiceName<'a> {
     /// ROS types.
     #[cfg_attr(feature = "openapi", schema(example = json!(["example_interfaces/srv/AddTwoInts"])))]
     pub types: Vec<Cow<'a, str>>,
-    /// Readers of requests: of servers.
+    /// Readers of requests; they belong to servers.
     pub request_readers: usize,
-    /// Writers of replies: of servers.
+    /// Writers of replies; they belong to servers.
     pub reply_writers: usize,
-    /// Writers of requests: of clients.
+    /// Writers of requests; they belong to clients.
     pub request_writers: usize,
-    /// Readers of replies: of clients.
+    /// Readers of replies; they belong to clients.
     pub reply_readers: usize,
 }
 
 impl Names<'_> {
-    /// Nothing in the domain that was asked for.
+    /// Returns whether the requested domain has no nodes, topics or services.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.nodes.is_empty() && self.topics.is_empty() && self.services.is_empty()

@@ -7,58 +7,58 @@ use serde::{Deserialize, Serialize};
 use crate::diagnosis::{Diagnosis, Finding};
 use crate::endpoints::Process;
 
-/// Nodes.
+/// All nodes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct NodeList<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By domain and name.
+    /// Nodes, sorted by domain and name.
     pub nodes: Vec<Node<'a>>,
 }
 
-/// One node name. Several nodes of one name in one domain are a fault, and shown as one.
+/// A node name. Several nodes with one name in a domain are a fault; they share one entry.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Node<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// Fully qualified name.
     #[cfg_attr(feature = "openapi", schema(example = "/robot1/lidar"))]
     pub name: Cow<'a, str>,
-    /// Hidden by ROS convention: those of the command line are.
+    /// Hidden by ROS convention, such as the nodes of command-line tools.
     pub hidden: bool,
-    /// Each node of the name; more than one is a fault.
+    /// Each node with this name; more than one is a fault.
     pub instances: Vec<NodeInstance<'a>>,
-    /// Topics it publishes.
+    /// Topics that the node publishes.
     pub publishers: Vec<Named<'a>>,
-    /// Topics it subscribes to.
+    /// Topics that the node subscribes to.
     pub subscriptions: Vec<Named<'a>>,
-    /// Services it serves.
+    /// Services that the node offers.
     pub services: Vec<Named<'a>>,
-    /// Services it calls.
+    /// Services that the node calls.
     pub clients: Vec<Named<'a>>,
-    /// Actions it serves.
+    /// Actions that the node offers.
     pub action_servers: Vec<Named<'a>>,
-    /// Actions it calls.
+    /// Actions that the node calls.
     pub action_clients: Vec<Named<'a>>,
-    /// What is wrong with it; `/topics` says what is wrong with its topics.
+    /// Problems of the node. Problems of its topics are in `/topics`.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
 }
 
-/// One node of a name.
+/// One of the nodes with this name.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct NodeInstance<'a> {
-    /// Its participant.
+    /// GUID of the node's participant.
     pub participant: String,
-    /// Implementation.
+    /// DDS implementation; null when unknown.
     pub vendor: Option<Cow<'a, str>>,
-    /// Where it lives.
+    /// Host and process of the node; null when unknown.
     #[serde(flatten)]
     pub process: Option<Process<'a>>,
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// A value that this version knows, or what a newer agent answers instead.
+/// A value that this version knows, or the raw value that a newer agent sends.
 ///
 /// ```
 /// use ros2probe_api::Open;
@@ -17,9 +17,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 pub enum Open<T, U = String> {
-    /// One of those that are declared here.
+    /// A value that this version declares.
     Known(T),
-    /// Another one.
+    /// Any other value.
     Unknown(U),
 }
 

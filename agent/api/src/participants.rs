@@ -8,106 +8,107 @@ use serde::{Deserialize, Serialize};
 use crate::endpoints::Process;
 use crate::measurement::Measurement;
 
-/// Participants.
+/// All participants.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ParticipantList<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By domain and GUID.
+    /// Participants, sorted by domain and GUID.
     pub participants: Vec<Participant<'a>>,
-    /// Writers that send although their announcement was not seen; of no known domain.
+    /// Active writers whose announcement was missed; their domain is unknown.
     pub unknown_writers: Vec<UnknownWriter<'a>>,
 }
 
-/// One participant.
+/// A DDS participant.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Participant<'a> {
-    /// GUID, as the metrics show it.
+    /// GUID in the form that the metrics use.
     pub guid: String,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
-    /// Implementation.
+    /// DDS implementation.
     #[cfg_attr(feature = "openapi", schema(example = "eProsima Fast DDS"))]
     pub vendor: Cow<'a, str>,
-    /// ROS enclave; null means it is no ROS participant.
+    /// ROS enclave; null if the participant does not use ROS.
     pub enclave: Option<Cow<'a, str>>,
-    /// Where it lives.
+    /// Host and process of the participant.
     #[serde(flatten)]
     pub process: Process<'a>,
-    /// Its nodes.
+    /// Names of the participant's nodes.
     pub nodes: Vec<Cow<'a, str>>,
-    /// How many writers it has.
+    /// Number of writers.
     pub writers: usize,
-    /// How many readers it has.
+    /// Number of readers.
     pub readers: usize,
-    /// Where its discovery endpoints are reached over UDP.
+    /// UDP addresses of the discovery endpoints.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<String>))]
     pub metatraffic_addresses: Cow<'a, [SocketAddr]>,
-    /// Where its other endpoints are reached over UDP.
+    /// UDP addresses of the other endpoints.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<String>))]
     pub default_addresses: Cow<'a, [SocketAddr]>,
-    /// Lease; null is infinite.
+    /// Lease duration in seconds; null is infinite.
     pub lease_seconds: Option<f64>,
     /// Unix time of its first announcement.
     pub first_seen_timestamp_seconds: f64,
-    /// Unix time of its last sign of life.
+    /// Unix time of the last packet that proves the participant alive.
     pub last_seen_timestamp_seconds: f64,
-    /// It announces DDS security: its messages may be encrypted.
+    /// The participant announces DDS security: its messages may be encrypted.
     pub secured: bool,
-    /// Known from before the agent's start and not heard since.
+    /// Restored from saved state; no announcement has confirmed it since the agent's start.
     pub restored: bool,
 }
 
-/// A writer whose announcement was not seen.
+/// An active writer whose announcement was missed.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct UnknownWriter<'a> {
-    /// GUID.
+    /// GUID of the writer.
     pub guid: String,
     /// DDS implementation; empty when unknown.
     pub vendor: Cow<'a, str>,
-    /// Where it lives.
+    /// Host and process of the writer.
     #[serde(flatten)]
     pub process: Process<'a>,
-    /// Unix time of its first message.
+    /// Unix time of the writer's first message.
     pub first_seen_timestamp_seconds: f64,
-    /// What was counted of it.
+    /// Counts and times of the writer.
     pub measurement: Measurement,
 }
 
-/// Processes of participants on this host.
+/// Processes of ROS participants on this host.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ProcessList {
-    /// Unix time of the reading, by this host's clock.
+    /// Unix time of the readings, by this host's clock.
     pub timestamp_seconds: f64,
-    /// By process id.
+    /// Processes, sorted by id.
     pub processes: Vec<ProcessUsage>,
-    /// Processes of which the kernel shows the agent nothing: see `ProtectProc=` of its unit.
+    /// Processes that the agent cannot read; see `ProtectProc=` in its systemd unit.
     pub unreadable: usize,
 }
 
-/// What a process has used.
+/// Resource usage of a process.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ProcessUsage {
-    /// Its id, in the agent's process namespace.
+    /// Process id, in the agent's PID namespace.
     pub process_id: u32,
-    /// Its name.
+    /// Name of the process.
     pub process: String,
-    /// CPU time so far; what two readings differ by, over the time between them, is its share.
+    /// CPU time since the start, in seconds. The difference of two readings over their distance in
+    /// time is the CPU share.
     pub cpu_seconds: f64,
-    /// Resident memory.
+    /// Resident memory, in bytes.
     pub memory_bytes: u64,
-    /// Threads.
+    /// Number of threads.
     pub threads: u32,
-    /// Unix time of its start.
+    /// Unix time of the process's start; null when unknown.
     pub started_timestamp_seconds: Option<f64>,
 }

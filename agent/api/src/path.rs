@@ -1,6 +1,6 @@
-//! Names in paths and queries.
+//! Percent encoding of names in paths and queries.
 
-/// Percent-encodes a name for a path or the value of a query. Slashes stay.
+/// Returns the name percent-encoded for a path or a query value. Slashes stay as they are.
 #[must_use]
 pub fn encoded(name: &str) -> String {
     let mut path = String::with_capacity(name.len());

@@ -4,68 +4,68 @@ use std::borrow::Cow;
 
 use serde::{Deserialize, Serialize};
 
-/// A kind of problem. Codes are stable; titles and details are for people.
+/// A kind of problem. Codes are stable; titles and details may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Code {
-    /// The request cannot be read.
+    /// The request is not valid HTTP, or its path or query cannot be decoded.
     MalformedRequest,
-    /// No token, or a wrong one.
+    /// The request has no token, or an unknown one.
     Unauthorized,
-    /// The name the request was sent to is not this agent's.
+    /// The request's `Host` is not a name of this agent.
     ForeignHost,
-    /// Sent by a web page from elsewhere.
+    /// A web page of another origin sent the request.
     ForeignOrigin,
-    /// The listener does not grant it; the unix socket does.
+    /// This listener does not grant the request; the unix socket does.
     NeedsSocket,
-    /// No such path.
+    /// The path does not exist.
     NotFound,
-    /// No such watch.
+    /// The watch does not exist.
     NoSuchWatch,
-    /// No such topic.
+    /// The topic does not exist.
     NoSuchTopic,
-    /// No such node.
+    /// The node does not exist.
     NoSuchNode,
-    /// Several things have the name.
+    /// The name exists several times; the request must say which one it means.
     Ambiguous,
-    /// The path is there, the method is not.
+    /// The path exists, but not with this method.
     MethodNotAllowed,
-    /// It is watched with other settings.
+    /// The topic is already watched with other settings.
     WatchDiffers,
-    /// The configuration or the command line lists it.
+    /// The configuration or the command line lists the watch, so a client cannot change it.
     WatchGiven,
-    /// No room for another watch.
+    /// The largest number of watches is reached.
     TooManyWatches,
     /// The agent runs without a configuration file.
     NothingToReload,
-    /// More bytes than a request needs.
+    /// The request's body is too large.
     BodyTooLarge,
-    /// A body that is not said to be JSON.
+    /// The request's body is not declared as JSON.
     UnsupportedMediaType,
-    /// JSON that does not say what is possible.
+    /// The body or a parameter has an invalid value.
     InvalidRequest,
-    /// The configuration file has mistakes.
+    /// The configuration file has errors.
     InvalidConfiguration,
-    /// Too fast.
+    /// The client sends requests too fast.
     TooManyRequests,
-    /// As many clients follow events as may.
+    /// The largest number of event streams is open.
     TooManyStreams,
-    /// As many clients are connected as may.
+    /// The largest number of clients is connected.
     TooManyClients,
-    /// As many subscriptions are open as may.
+    /// The largest number of subscriptions is open.
     TooManySubscriptions,
-    /// No such recording.
+    /// The recording does not exist.
     NoSuchRecording,
-    /// No such snapshot.
+    /// The snapshot does not exist.
     NoSuchSnapshot,
-    /// There is one of that name.
+    /// A recording of this name exists.
     RecordingExists,
-    /// As many recordings as may are under way.
+    /// The largest number of recordings is running.
     TooManyRecordings,
-    /// The configuration names no directory for them.
+    /// The configuration names no directory for recordings.
     NoPlaceForRecordings,
-    /// A bag cannot be written there.
+    /// The bag cannot be written to the storage.
     StorageRefuses,
-    /// The agent is about to end.
+    /// The agent is shutting down.
     Ending,
 }
 
@@ -73,41 +73,41 @@ pub enum Code {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Problem {
-    /// What kind of problem this is; stable.
+    /// URN that identifies the kind of problem; it is stable.
     #[serde(rename = "type")]
     #[cfg_attr(
         feature = "openapi",
         schema(example = "urn:ros2probe:problem:no-such-watch")
     )]
     pub kind: String,
-    /// The kind in words.
+    /// Title of this kind of problem.
     #[serde(default)]
     #[cfg_attr(
         feature = "openapi",
         schema(required = true, example = "No such watch")
     )]
     pub title: Cow<'static, str>,
-    /// The status of the answer.
+    /// HTTP status of the answer.
     #[serde(default)]
     #[cfg_attr(
         feature = "openapi",
         schema(required = true, minimum = 400, maximum = 599)
     )]
     pub status: u16,
-    /// What is wrong with this request, and what would be right.
+    /// What is wrong with this request, and how to correct it.
     pub detail: String,
-    /// Mistakes of the configuration file, one line each: `file:line:column: key: message`.
+    /// Errors of the configuration file, one per line: `file:line:column: key: message`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub mistakes: Vec<String>,
 }
 
-/// The beginning of each problem's `type`.
+/// Prefix of each problem's `type`.
 pub const URN: &str = "urn:ros2probe:problem:";
-/// The media type of a problem.
+/// Media type of a problem.
 pub const MEDIA_TYPE: &str = "application/problem+json";
 
 impl Code {
-    /// The end of the type URN, the status and the title.
+    /// Returns the end of the type URN, the HTTP status and the title.
     const fn parts(self) -> (&'static str, u16, &'static str) {
         match self {
             Self::MalformedRequest => ("malformed-request", 400, "The request cannot be read"),
@@ -121,13 +121,13 @@ impl Code {
             Self::NeedsSocket => (
                 "needs-socket",
                 403,
-                "Only by the unix socket or with a token",
+                "The unix socket or a token is required",
             ),
             Self::NotFound => ("not-found", 404, "No such path"),
             Self::NoSuchWatch => ("no-such-watch", 404, "No such watch"),
             Self::NoSuchTopic => ("no-such-topic", 404, "No such topic"),
             Self::NoSuchNode => ("no-such-node", 404, "No such node"),
-            Self::Ambiguous => ("ambiguous", 409, "Several things have the name"),
+            Self::Ambiguous => ("ambiguous", 409, "The name is ambiguous"),
             Self::MethodNotAllowed => ("method-not-allowed", 405, "Method not allowed"),
             Self::WatchDiffers => ("watch-differs", 409, "Watched with other settings"),
             Self::WatchGiven => ("watch-given", 409, "Not a client's watch"),
@@ -139,7 +139,7 @@ impl Code {
             Self::InvalidConfiguration => (
                 "invalid-configuration",
                 422,
-                "The configuration has mistakes and was not taken over",
+                "The configuration has errors and was not applied",
             ),
             Self::TooManyRequests => ("too-many-requests", 429, "Too many requests"),
             Self::TooManyStreams => ("too-many-streams", 503, "Too many streams of events"),
@@ -151,31 +151,35 @@ impl Code {
             ),
             Self::NoSuchRecording => ("no-such-recording", 404, "No such recording"),
             Self::NoSuchSnapshot => ("no-such-snapshot", 404, "No such snapshot"),
-            Self::RecordingExists => ("recording-exists", 409, "There is one of that name"),
+            Self::RecordingExists => ("recording-exists", 409, "A recording of this name exists"),
             Self::TooManyRecordings => ("too-many-recordings", 409, "Too many recordings"),
             Self::NoPlaceForRecordings => (
                 "no-place-for-recordings",
                 409,
                 "The agent has no directory for recordings",
             ),
-            Self::StorageRefuses => ("storage-refuses", 507, "The storage does not take it"),
+            Self::StorageRefuses => (
+                "storage-refuses",
+                507,
+                "The bag cannot be written to the storage",
+            ),
             Self::Ending => ("ending", 503, "The agent is shutting down"),
         }
     }
 
-    /// The last segment of its `type`, which identifies the kind of problem.
+    /// Returns the last segment of `type`, which identifies the kind of problem.
     #[must_use]
     pub const fn as_str(self) -> &'static str {
         self.parts().0
     }
 
-    /// The status of the answer.
+    /// Returns the HTTP status of the answer.
     #[must_use]
     pub const fn status(self) -> u16 {
         self.parts().1
     }
 
-    /// In words.
+    /// Returns the title of this kind of problem.
     #[must_use]
     pub const fn title(self) -> &'static str {
         self.parts().2

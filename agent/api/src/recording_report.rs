@@ -1,47 +1,49 @@
-//! What a recording has and what it has not: part of `/recordings`, and in each bag's metadata.
+//! Completeness of a recording: part of `/recordings`, and of each bag's metadata.
 //!
-//! `missing` counts messages of topics of the bag. What belongs to no topic, or never passes where it
-//! can be observed, is listed beside it.
+//! `missing` counts messages of topics in the bag. Messages of unknown topics, and messages that
+//! never pass where the agent captures, have fields of their own.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-/// No subscriber: the one reason in [`Report::unobserved`] by which nothing is missing.
+/// The reason in [`Report::unobserved`] for a topic without a subscriber; such a topic is complete.
 pub const NO_SUBSCRIBER: &str = "no_subscriber";
 
-/// What became of what was to be recorded.
+/// Messages that a recording contains and lacks.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = RecordingReport))]
 pub struct Report {
     /// Messages in the bag.
     pub messages: u64,
-    /// Bytes of those messages.
+    /// Bytes of these messages.
     pub bytes: u64,
-    /// Messages that were sent and are not in the bag.
+    /// Messages that were sent but are not in the bag.
     pub missing: u64,
-    /// By topic.
+    /// Counts of each topic, by name.
     pub topics: BTreeMap<String, TopicReport>,
-    /// Which messages are missing, by writer and sequence number: the first ones.
+    /// The first missing messages, by writer and sequence number.
     pub missing_runs: Vec<MissingRun>,
-    /// Further runs that are counted but not named.
+    /// Further runs of missing messages, which `missing_runs` does not list.
     pub missing_runs_unnamed: u64,
-    /// Topics that late joiners are given samples of, which were sent before the recording began and
-    /// are not in the bag.
+    /// Topics that keep samples for late joiners (transient local) and whose samples from before
+    /// the recording are not in the bag.
     pub sent_before: Vec<String>,
-    /// Topics that are left out because they have several types; a bag holds one.
+    /// Topics that are not recorded because they have several types; a bag stores one type per
+    /// topic.
     pub left_out: Vec<String>,
-    /// Published topics without a message in the bag, where the reason is known: `no_subscriber`, or
-    /// how all messages pass: `shared_memory`, `data_sharing`, `same_process`, `iceoryx`.
+    /// Published topics without a message in the bag, with the reason if it is known.
+    /// `no_subscriber`: the publisher sends nothing. `shared_memory`, `data_sharing`,
+    /// `same_process`, `iceoryx`: all messages use that transport.
     #[serde(default)]
     pub unobserved: BTreeMap<String, String>,
-    /// Writers that sent and were never announced.
+    /// Active writers whose announcement was missed.
     #[serde(default)]
     pub unknown_writers: UnknownWriters,
-    /// Topics that the choice would take, in other domains.
+    /// Published topics in other domains that the filter would select.
     #[serde(default)]
     pub other_domains: Vec<OtherDomain>,
-    /// Which limit ended it, if one did.
+    /// The limit that ended the recording; null if none did.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub limit_reached: Option<String>,
 }
@@ -50,70 +52,70 @@ pub struct Report {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = RecordingUnknownWriters))]
 pub struct UnknownWriters {
-    /// How many sent.
+    /// Number of writers that sent messages.
     pub writers: u64,
-    /// Messages they sent while it was recorded.
+    /// Messages that they sent during the recording.
     pub messages: u64,
 }
 
-/// What passed in a domain that is not recorded.
+/// Traffic in a domain that is not recorded.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = RecordingOtherDomain))]
 pub struct OtherDomain {
-    /// Which one.
+    /// Domain id.
     pub domain_id: u32,
-    /// Published topics.
+    /// Number of published topics.
     pub topics: u64,
-    /// Their messages while it was recorded; null where none of them is measured.
+    /// Messages on these topics during the recording; null if none of them is measured.
     pub messages: Option<u64>,
 }
 
-/// What became of one topic's messages.
+/// Messages of a topic that a recording contains and lacks.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct TopicReport {
-    /// In the bag.
+    /// Messages in the bag.
     pub messages: u64,
-    /// Bytes of those.
+    /// Bytes of these messages.
     pub bytes: u64,
-    /// Never complete on the wire: fragments were lost.
+    /// Messages that never arrived whole: fragments were lost.
     pub incomplete: u64,
-    /// Lost on the way: nothing of them was seen.
+    /// Messages of which nothing arrived.
     #[serde(default)]
     pub lost: u64,
-    /// Came before their writer was announced, and not again.
+    /// Messages that arrived before their writer's announcement and were not sent again.
     #[serde(default)]
     pub unannounced: u64,
-    /// On the wire, but lost on the way to the agent.
+    /// Messages that were on the network but that the agent could not capture.
     pub not_captured: u64,
-    /// Dropped because the storage was too slow.
+    /// Messages dropped because the storage was too slow.
     pub dropped: u64,
-    /// Taken, and lost because the storage took no more.
+    /// Messages accepted for writing but lost because the storage failed.
     pub unwritten: u64,
-    /// Came while the recording was paused.
+    /// Messages that arrived while the recording was paused.
     pub paused: u64,
 }
 
-/// Consecutive samples of one writer that are missing for one reason.
+/// Consecutive messages of one writer that are missing for the same reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct MissingRun {
-    /// Topic.
+    /// Name of the topic.
     pub topic: String,
     /// GUID of the writer.
     pub writer: String,
-    /// Number of the first.
+    /// Sequence number of the first missing message.
     pub first_sequence_number: u64,
-    /// Number of the last.
+    /// Sequence number of the last missing message.
     pub last_sequence_number: u64,
-    /// How many of those in between.
+    /// Number of missing messages in this range.
     pub samples: u64,
     /// `incomplete`, `lost`, `unannounced`, `not_captured` or `dropped`.
     pub reason: String,
 }
 
 impl Report {
-    /// The row of a topic, which is added if it is new.
+    /// Returns the counts of a topic, adding it if it is new.
     pub fn topic(&mut self, name: &str) -> &mut TopicReport {
         if !self.topics.contains_key(name) {
             self.topics.insert(name.to_owned(), TopicReport::default());
@@ -121,8 +123,8 @@ impl Report {
         self.topics.entry(name.to_owned()).or_default()
     }
 
-    /// Whether everything that was sent is in the bag, as far as that is known. Topics without a
-    /// subscriber are complete: their publishers send nothing.
+    /// Returns whether every message that is known to have been sent is in the bag. Topics without
+    /// a subscriber are complete: their publishers send nothing.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.missing == 0

@@ -10,159 +10,161 @@ use crate::recording_report::Report;
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RecordingList {
-    /// Where they lie; null where the agent has no place for them.
+    /// Directory of the recordings; null if none is configured or writable.
     pub directory: Option<String>,
-    /// Those under way, and the last ones that ended.
+    /// Running recordings, and the last ones that ended.
     pub recordings: Vec<Recording>,
-    /// What they may take of the disk.
+    /// Limits of the disk space that recordings use.
     pub limits: RecordingLimits,
 }
 
-/// What recordings may take of the disk; one ends in order where it meets a limit.
+/// Limits of the disk space that recordings use. A recording that reaches a limit ends with a
+/// complete bag.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RecordingLimits {
-    /// Bytes of each; null = any.
+    /// Largest size of one recording, in bytes; null is unlimited.
     pub max_bytes: Option<u64>,
-    /// Bytes of all bags in the directory; null = any.
+    /// Largest size of all bags in the directory, in bytes; null is unlimited.
     pub max_total_bytes: Option<u64>,
-    /// Of the file system stays free: the larger one of these percent and those bytes.
+    /// Share of the file system that stays free, in percent. The larger of this and `reserve_bytes`
+    /// applies.
     pub reserve_percent: u8,
-    /// Likewise.
+    /// Bytes of the file system that stay free.
     pub reserve_bytes: u64,
 }
 
-/// One recording.
+/// A recording.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Recording {
-    /// Its name, that of its directory.
+    /// Name of the recording and of its directory.
     pub name: String,
-    /// Where it lies on the robot.
+    /// Path of the bag on the robot.
     pub directory: String,
-    /// Whose topics.
+    /// Domain id of the recorded topics.
     pub domain_id: u32,
     /// `recording`, `paused` or `ended`.
     #[cfg_attr(feature = "openapi", schema(value_type = String))]
     pub state: Open<RecordingState>,
-    /// Unix time of its beginning.
+    /// Unix time at which the recording began.
     pub began_timestamp_seconds: f64,
-    /// Bytes of its files.
+    /// Total size of the bag's files, in bytes.
     pub file_bytes: u64,
-    /// Files begun.
+    /// Number of files, including the one being written.
     pub files: usize,
-    /// Why it ended, if that was not asked for.
+    /// Why the recording ended; null if it still runs or a client ended it.
     pub error: Option<String>,
-    /// What was asked for.
+    /// The filter that selects topics.
     pub topics: FilterOptions,
-    /// What it has and has not.
+    /// Messages that the recording contains and lacks.
     pub report: Report,
 }
 
-/// What is to be recorded. Without any topic, every topic is.
+/// A recording to start. Without a topic filter it records every topic.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct RecordingRequest {
-    /// Name of the directory; the time when left out.
+    /// Name of the bag's directory; by default the current time.
     #[cfg_attr(
         feature = "openapi",
         schema(max_length = 128, pattern = "^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")
     )]
     pub name: Option<String>,
-    /// Which topics.
+    /// The filter that selects topics.
     pub topics: FilterOptions,
-    /// Of which domain.
+    /// Domain id of the topics.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 232))]
     pub domain_id: u32,
-    /// Split when a file reaches so many bytes; 0 = never.
+    /// Size in bytes at which a new file begins; 0 disables splitting.
     pub max_bag_size: u64,
-    /// Split when a file reaches so many seconds; 0 = never.
+    /// Duration in seconds after which a new file begins; 0 disables splitting.
     #[cfg_attr(feature = "openapi", schema(maximum = 31_536_000))]
     pub max_bag_duration_seconds: u64,
-    /// `none`, `fastwrite`, `zstd_fast` or `zstd_small`.
+    /// Preset of the MCAP storage: `none`, `fastwrite`, `zstd_fast` or `zstd_small`.
     #[cfg_attr(feature = "openapi", schema(value_type = String, example = "zstd_fast"))]
     pub storage_preset_profile: String,
-    /// `zstd` or `lz4`: compress whole files once they are complete.
+    /// Compression of complete files: `zstd` or `lz4`; empty disables it.
     #[cfg_attr(feature = "openapi", schema(value_type = String))]
     pub file_compression: String,
-    /// For whom metadata.yaml is written: a distribution; for all of them when left out.
+    /// ROS distribution whose form of metadata.yaml is written; by default a form that all read.
     #[cfg_attr(feature = "openapi", schema(value_type = String))]
     pub distro: String,
-    /// Begin paused.
+    /// Whether the recording starts paused.
     pub paused: bool,
 }
 
-/// What a recording is doing.
+/// State of a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum RecordingState {
-    /// Taking what comes.
+    /// Messages are written to the bag.
     #[default]
     Recording,
-    /// Letting it go by.
+    /// Messages are discarded until the recording resumes.
     Paused,
-    /// The bag is complete.
+    /// The recording has ended and the bag is complete.
     Ended,
 }
 
-/// What was asked for; empty asks for nothing.
+/// Filter of topics and services. An empty filter selects nothing.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = RecordedTopics))]
 #[serde(deny_unknown_fields, default)]
 pub struct FilterOptions {
-    /// These topics, by ROS name.
+    /// Topics to record, by ROS name.
     pub topics: Vec<String>,
-    /// Every topic.
+    /// Whether to record every topic.
     pub all_topics: bool,
-    /// Topics of these types, `pkg/msg/Type`.
+    /// Types whose topics are recorded, as `pkg/msg/Type`.
     pub topic_types: Vec<String>,
-    /// These services, by name: their event topics.
+    /// Services whose event topics are recorded, by name.
     pub services: Vec<String>,
-    /// Every service's event topic.
+    /// Whether to record the event topics of every service.
     pub all_services: bool,
-    /// Topics and services whose name contains this regular expression.
+    /// Topics and services are recorded if this regular expression matches a part of their name.
     pub regex: Option<String>,
-    /// None whose name contains this regular expression.
+    /// Topics and services are excluded if this regular expression matches a part of their name.
     pub exclude_regex: Option<String>,
-    /// Not these topics.
+    /// Topics to exclude, by ROS name.
     pub exclude_topics: Vec<String>,
-    /// No topics of these types.
+    /// Types whose topics are excluded.
     pub exclude_topic_types: Vec<String>,
-    /// Not these services.
+    /// Services to exclude, by name.
     pub exclude_services: Vec<String>,
-    /// Also topics with a token that begins with `_`.
+    /// Whether to record hidden topics: those with a name token that begins with `_`.
     pub include_hidden_topics: bool,
-    /// Also topics that nobody publishes: declared in the bag, without a message.
+    /// Whether to declare topics without a publisher in the bag; they contain no message.
     pub include_unpublished_topics: bool,
-    /// Not topics that nobody subscribes to.
+    /// Whether to exclude topics without a subscriber.
     pub ignore_leaf_topics: bool,
 }
 
-/// Files of a recording.
+/// The files of a recording.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct RecordingFiles {
-    /// By name.
+    /// Files, sorted by name.
     pub files: Vec<RecordingFile>,
 }
 
-/// A file.
+/// A file of a recording.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct RecordingFile {
-    /// Its name.
+    /// Name of the file.
     #[cfg_attr(feature = "openapi", schema(example = "metadata.yaml"))]
     pub file: String,
-    /// Its bytes so far.
+    /// Current size in bytes.
     pub bytes: u64,
 }
 
 impl FilterOptions {
-    /// Every topic, as `-a` of Humble.
+    /// Returns the filter of `ros2 bag record -a` in Humble, which selects every topic.
     #[must_use]
     pub fn everything() -> Self {
         Self {

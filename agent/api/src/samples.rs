@@ -1,7 +1,7 @@
 //! `/samples`: the lines of the stream, which the agent writes and clients read.
 //!
-//! Each line is a JSON object with one key, which names its kind. Where payloads were asked for, a
-//! sample's line is followed by as many raw bytes as it says, and then the next line. Times are
+//! Each line is a JSON object with one key, which names its kind. If the request includes payloads,
+//! a sample's line is followed by `payload_bytes` raw bytes and then by the next line. Times are in
 //! nanoseconds since the Unix epoch.
 
 use serde::{Deserialize, Serialize};
@@ -11,58 +11,59 @@ pub const LINES: &str = "application/x-ndjson";
 /// Media type of a stream with payloads.
 pub const SAMPLES: &str = "application/vnd.ros2probe.samples";
 
-/// One line.
+/// A line of the stream.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = SampleLine))]
 #[serde(rename_all = "snake_case")]
 pub enum Line {
-    /// The first line: the subscription is in force.
+    /// The first line: the subscription is active.
     Open(Open),
     /// A message.
     Sample(Sample),
     /// The stream is complete up to this time.
     Clock(Clock),
-    /// Messages that the stream lacks.
+    /// Messages that are missing from the stream.
     Missed(Missed),
-    /// The last line.
+    /// The last line of the stream.
     End(End),
 }
 
-/// Topics known at the start of the stream. Messages of later topics need no new line here.
+/// Selected topics at the start of the stream. Messages of later topics follow without a new line
+/// of this kind.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Open {
-    /// Topics that were asked for and are known.
+    /// Known topics that the request selects.
     pub topics: Vec<OpenTopic>,
 }
 
-/// A topic that was asked for.
+/// A topic that the request selects.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OpenTopic {
-    /// ROS name, or the DDS name where it follows no ROS convention.
+    /// ROS name, or the DDS name if it follows no ROS convention.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub topic: String,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS names of its types.
     pub types: Vec<String>,
 }
 
-/// One message. Each message has one line.
+/// A message. Each message has one line.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = SampleFacts))]
 pub struct Sample {
     /// ROS name of its topic.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub topic: String,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name of its type.
     #[serde(rename = "type")]
     #[cfg_attr(feature = "openapi", schema(example = "sensor_msgs/msg/PointCloud2"))]
     pub message_type: String,
-    /// When the datagram was captured that completed it.
+    /// Capture time of the datagram that completed the message.
     pub time_ns: i64,
     /// GUID of its writer.
     #[cfg_attr(
@@ -70,37 +71,38 @@ pub struct Sample {
         schema(example = "010f2b7d6a474f3300000000.00001103")
     )]
     pub writer: String,
-    /// Its number among those of this writer.
+    /// Sequence number of the message, counted by the writer.
     pub sequence_number: u64,
-    /// When it was written, by the writer's clock; null where the writer does not say.
+    /// Time of writing, by the writer's clock; null if the message does not contain it.
     pub source_timestamp_ns: Option<i64>,
-    /// The stamp of its header, where its type begins with one.
+    /// `stamp` of the message's `Header`; null if its type does not begin with one.
     pub header_stamp_ns: Option<i64>,
-    /// Bytes of the serialized message, encapsulation and padding included.
+    /// Size of the serialized message in bytes, including encapsulation and padding.
     pub size: u32,
-    /// Present and true where it was seen in shared memory by looking now and then: the numbers
-    /// before it that the stream lacks may have been sent all the same.
+    /// True if the message was sampled from shared memory; absent otherwise. Missing sequence
+    /// numbers before it may still have been sent.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sampled: bool,
-    /// So many raw bytes follow this line; null where payloads were not asked for.
+    /// Number of raw bytes that follow this line; null if the request does not include payloads.
     pub payload_bytes: Option<u32>,
-    /// What the writer announced: with the first of its messages, where payloads were asked for.
+    /// Type hash and QoS of the writer, with the first of its messages; null if the request does
+    /// not include payloads.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub offered: Option<Box<Offered>>,
 }
 
-/// What a writer announced.
+/// Type hash and QoS that a writer announces.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Offered {
-    /// RIHS01 hash of the type; null where it is not announced (Humble).
+    /// RIHS01 hash of the type; null if the writer does not announce it (Humble).
     pub type_hash: Option<String>,
     /// Quality of service.
     pub qos: OfferedQos,
 }
 
-/// Quality of service in ROS's words; durations are null when they are infinite.
+/// Quality of service in ROS terms. A null duration is infinite.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct OfferedQos {
@@ -108,20 +110,20 @@ pub struct OfferedQos {
     pub reliability: String,
     /// `VOLATILE`, `TRANSIENT_LOCAL`, ...
     pub durability: String,
-    /// `UNKNOWN` where the implementation does not say.
+    /// `UNKNOWN` if the implementation does not announce it.
     #[cfg_attr(feature = "openapi", schema(example = "KEEP_LAST (10)"))]
     pub history: String,
-    /// Longest time between two messages.
+    /// Longest time between two messages, in seconds.
     pub deadline_seconds: Option<f64>,
-    /// Age at which messages become void.
+    /// Age at which a message expires, in seconds.
     pub lifespan_seconds: Option<f64>,
-    /// Who says that the writer is alive.
+    /// How the writer asserts its liveliness, such as `AUTOMATIC` or `MANUAL_BY_TOPIC`.
     pub liveliness: String,
-    /// Time within which that is said.
+    /// Time within which the writer must assert its liveliness, in seconds.
     pub liveliness_lease_seconds: Option<f64>,
 }
 
-/// How far the stream has come.
+/// Progress of the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Clock {
@@ -129,7 +131,7 @@ pub struct Clock {
     pub time_ns: i64,
 }
 
-/// Messages of one writer that the stream lacks.
+/// Messages of one writer that are missing from the stream.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = MissedFacts))]
 pub struct Missed {
@@ -139,36 +141,37 @@ pub struct Missed {
     pub domain_id: u32,
     /// GUID of the writer.
     pub writer: String,
-    /// How many.
+    /// Number of missing messages.
     pub samples: u64,
-    /// Number of the first.
+    /// Sequence number of the first missing message.
     pub first_sequence_number: u64,
-    /// Number of the last.
+    /// Sequence number of the last missing message.
     pub last_sequence_number: u64,
-    /// `incomplete`: fragments were never seen; `lost`: nothing of it was seen; `unannounced`: it
-    /// came before its writer was announced, and not again; `not_captured`: its bytes were lost on the
-    /// way to the agent; `queue_full`: this reader was too slow.
+    /// `incomplete`: fragments never arrived. `lost`: nothing of the message arrived.
+    /// `unannounced`: it arrived before its writer's announcement and was not sent again.
+    /// `not_captured`: the agent could not capture its bytes. `queue_full`: this client read too
+    /// slowly.
     pub reason: MissedReason,
 }
 
-/// Why the stream lacks messages.
+/// Why messages are missing from the stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum MissedReason {
-    /// Fragments were never seen.
+    /// Fragments never arrived.
     Incomplete,
-    /// Nothing of them was seen, and they are lost.
+    /// Nothing of the messages arrived.
     Lost,
-    /// They came before their writer was announced, and not again.
+    /// The messages arrived before their writer's announcement and were not sent again.
     Unannounced,
-    /// The bytes were lost on the way to the agent.
+    /// The agent could not capture the bytes.
     NotCaptured,
-    /// The reader was too slow.
+    /// The client read too slowly.
     QueueFull,
 }
 
-/// Why nothing follows.
+/// Why the stream ended.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct End {

@@ -7,62 +7,62 @@ use serde::{Deserialize, Serialize};
 use crate::diagnosis::{Diagnosis, Finding};
 use crate::measurement::Measurement;
 
-/// Services.
+/// All services.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ServiceList<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By domain and name.
+    /// Services, sorted by domain and name.
     pub services: Vec<Service<'a>>,
 }
 
-/// One service.
+/// A service.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Service<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "/add_two_ints"))]
     pub name: Cow<'a, str>,
-    /// Hidden by ROS convention: those of actions are.
+    /// Hidden by ROS convention, such as the services of actions.
     pub hidden: bool,
     /// ROS types; more than one is a fault.
     #[cfg_attr(feature = "openapi", schema(example = json!(["example_interfaces/srv/AddTwoInts"])))]
     pub types: Vec<Cow<'a, str>>,
-    /// Who serves.
+    /// Nodes that offer the service.
     pub servers: Vec<Party<'a>>,
-    /// Who calls.
+    /// Nodes that call the service.
     pub clients: Vec<Party<'a>>,
-    /// What was counted of its requests, where their DDS topic is watched.
+    /// Counts and times of requests; null if their DDS topic is not watched.
     pub requests: Option<Measurement>,
-    /// Likewise of its replies.
+    /// Counts and times of replies; null if their DDS topic is not watched.
     pub replies: Option<Measurement>,
-    /// What is wrong with its topics.
+    /// Problems of the service's topics.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
 }
 
-/// Actions.
+/// All actions.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct ActionList<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By domain and name.
+    /// Actions, sorted by domain and name.
     pub actions: Vec<Action<'a>>,
 }
 
-/// One action.
+/// An action.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Action<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "/fibonacci"))]
@@ -70,26 +70,26 @@ pub struct Action<'a> {
     /// ROS types; more than one is a fault.
     #[cfg_attr(feature = "openapi", schema(example = json!(["example_interfaces/action/Fibonacci"])))]
     pub types: Vec<Cow<'a, str>>,
-    /// Who serves.
+    /// Nodes that offer the action.
     pub servers: Vec<Party<'a>>,
-    /// Who calls: whoever only reads the feedback is not among them.
+    /// Nodes that call the action. A node that only reads the feedback is not a client.
     pub clients: Vec<Party<'a>>,
-    /// Its topics and services, by their DDS names.
+    /// DDS names of the action's topics and services.
     pub parts: Vec<Cow<'a, str>>,
-    /// What is wrong with them.
+    /// Problems of these topics.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
 }
 
-/// A node, or a participant without one, at one end of a service or action.
+/// A node at one end of a service or action, or a participant if the node is unknown.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Party<'a> {
-    /// The node, as `ros_discovery_info` announces it; null when unknown.
+    /// Name of the node, from `ros_discovery_info`; null when unknown.
     pub node: Option<Cow<'a, str>>,
-    /// Its participant.
+    /// GUID of the participant.
     pub participant: String,
-    /// Its writers and readers there.
+    /// GUIDs of the writers and readers that it uses there.
     pub endpoints: Vec<String>,
 }

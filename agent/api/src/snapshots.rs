@@ -1,4 +1,4 @@
-//! `/snapshots`: the last seconds of topics, which the agent keeps and writes on request.
+//! `/snapshots`: the last seconds of topics, which the agent keeps in memory and writes on request.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,48 +7,48 @@ use serde::{Deserialize, Serialize};
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct SnapshotList {
-    /// In the configuration's order.
+    /// Snapshots, in the configuration's order.
     pub snapshots: Vec<Snapshot>,
 }
 
-/// What is kept of some topics.
+/// A snapshot: the most recent messages of some topics, kept in memory.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Snapshot {
-    /// Its name in the configuration.
+    /// Name of the snapshot in the configuration.
     pub name: String,
-    /// Names and globs.
+    /// Names and globs of the topics.
     pub topics: Vec<String>,
-    /// Their domain.
+    /// Domain id of the topics.
     pub domain_id: u32,
-    /// How much is kept at most.
+    /// Seconds of messages that are kept.
     pub seconds: u64,
-    /// How much memory that may take.
+    /// Largest amount of memory for the messages, in bytes.
     pub max_bytes: usize,
-    /// Whether it is written when an expectation is violated.
+    /// Whether a bag is written when an expectation is violated.
     pub on_violation: bool,
-    /// Messages in memory.
+    /// Number of messages in memory.
     pub messages: u64,
-    /// Memory they take.
+    /// Memory that the messages use, in bytes.
     pub bytes: u64,
-    /// Messages that were young enough and had to go for want of room.
+    /// Messages dropped before `seconds` had passed because `max_bytes` was reached.
     pub crowded_out: u64,
-    /// Bags written so far.
+    /// Number of bags written.
     pub written: u64,
-    /// Bags that could not be.
+    /// Number of bags that could not be written.
     pub failed: u64,
 }
 
-/// A bag of a snapshot.
+/// The bag that was written from a snapshot.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct WrittenSnapshot {
-    /// Name of its directory.
+    /// Name of the bag's directory.
     pub name: String,
-    /// Where it lies on the robot.
+    /// Path of the bag on the robot.
     pub directory: String,
-    /// Messages in it.
+    /// Number of messages in the bag.
     pub messages: u64,
 }

@@ -10,65 +10,65 @@ use crate::endpoints::Endpoint;
 use crate::measurement::{Breakdown, Bucket, Delivered, Measurement};
 use crate::watches::Expectations;
 
-/// Topics.
+/// All topics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct TopicList<'a> {
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// By domain and DDS name.
+    /// Topics, sorted by domain and DDS name.
     pub topics: Vec<Topic<'a>>,
 }
 
-/// One topic.
+/// A topic.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Topic<'a> {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
-    /// ROS name; the DDS name where it follows no ROS convention.
+    /// ROS name; the DDS name if it follows no ROS convention.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub name: Cow<'a, str>,
     /// DDS name.
     #[cfg_attr(feature = "openapi", schema(example = "rt/points"))]
     pub dds_name: Cow<'a, str>,
-    /// What it is to ROS: `topic`, `service_request`, `service_reply`, `service_event`,
+    /// Role of the topic in ROS: `topic`, `service_request`, `service_reply`, `service_event`,
     /// `action_feedback`, `action_status`, `discovery` or `dds`.
     pub kind: Cow<'a, str>,
     /// Hidden by ROS convention.
     pub hidden: bool,
-    /// Its last endpoint has gone; it is shown for some minutes more.
+    /// The topic's last endpoint is gone; the topic stays listed for some minutes.
     pub vanished: bool,
-    /// ROS types announced on it; more than one is a fault.
+    /// ROS types that its endpoints announce; more than one is a fault.
     pub message_types: Vec<Cow<'a, str>>,
-    /// RIHS01 hashes announced on it.
+    /// RIHS01 hashes that its endpoints announce.
     pub type_hashes: Vec<Cow<'a, str>>,
-    /// Its writers.
+    /// Writers of the topic.
     pub publishers: Vec<Endpoint<'a>>,
-    /// Its readers.
+    /// Readers of the topic.
     pub subscriptions: Vec<Endpoint<'a>>,
-    /// Watches that cover it, and how it stands with what they expect.
+    /// Watches that cover the topic, with the state of their expectations.
     pub watches: Vec<Watching<'a>>,
-    /// Sum over its writers; null while it is not watched.
+    /// Counts and times, summed over its writers; null if the topic is not watched.
     pub measurement: Option<Measurement>,
-    /// What reached receivers on this host, each counted.
+    /// Messages that arrived at receivers on this host, counted per receiver.
     pub received: Option<Delivered>,
-    /// What was seen leaving this host, once for each destination.
+    /// Messages that left this host, counted once per destination.
     pub sent: Option<Delivered>,
-    /// Where messages spent their time on this host.
+    /// Time that messages spent in each stage on this host.
     pub breakdown: Option<Breakdown>,
-    /// Pairs of its publishers and subscribers by how messages pass between them.
+    /// Number of publisher and subscriber pairs for each transport between them.
     pub passages: Vec<Passage>,
-    /// What is wrong with it.
+    /// Problems of the topic.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
-    /// Why it is silent, or why nothing is counted; empty where messages are counted.
+    /// Why the topic is silent or not measured; empty if messages are counted.
     pub reasons: Vec<Reason>,
 }
 
-/// One topic with every way its messages go.
+/// A topic with its histograms, deliveries and acknowledgements.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -79,29 +79,29 @@ pub struct Topic<'a> {
 pub struct TopicDetails<'a> {
     #[serde(flatten)]
     pub topic: Topic<'a>,
-    /// Times between consecutive messages of one writer, in buckets.
+    /// Histogram of the time between consecutive messages of one writer.
     pub interarrival_buckets: Vec<Bucket>,
-    /// Times from the writer's timestamp to the capture, in buckets.
+    /// Histogram of the time from the writer's timestamp to the capture.
     pub latency_buckets: Vec<Bucket>,
-    /// Every receiver and destination of its writers.
+    /// Deliveries from each writer to each receiver and destination.
     pub deliveries: Vec<Delivery<'a>>,
-    /// Every reliable reader that acknowledges.
+    /// State of acknowledgement of each reliable reader.
     pub acknowledgements: Vec<Acknowledgement<'a>>,
 }
 
-/// Pairs of publisher and subscriber between which messages pass in one way.
+/// Pairs of publisher and subscriber with the same transport between them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Passage {
-    /// `network`; `shared_memory`, of which samples are seen; `data_sharing`, `same_process` or
-    /// `iceoryx`, which are not seen.
+    /// The transport. `network` is captured in full, `shared_memory` is sampled; `data_sharing`,
+    /// `same_process` and `iceoryx` cannot be observed.
     pub passage: Cow<'static, str>,
-    /// How many pairs.
+    /// Number of pairs.
     pub pairs: usize,
-    /// Of `shared_memory`, how it is seen just now: `exact`, every message in the process that sends
-    /// it; `close`, by as many looks as `capture.shm.reading_cpu_percent` allows, because its samples
-    /// are read; `sampled`, by fewer looks; `none`.
+    /// Coverage of `shared_memory` at the moment. `exact`: every message, in the process that sends
+    /// it. `close`: sampled as often as `capture.shm.reading_cpu_percent` allows, because a client
+    /// reads its messages. `sampled`: sampled less often. `none`: not observed.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub view: Option<Cow<'static, str>>,
@@ -112,119 +112,119 @@ pub struct Passage {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Watching<'a> {
-    /// Its name or glob.
+    /// Name or glob of the watch.
     pub watch: Cow<'a, str>,
-    /// The domain it is for; null for every domain.
+    /// Domain id of the watch; null for every domain.
     pub watch_domain_id: Option<u32>,
-    /// Who asked for it: `config`, `command_line` or `api`; null when it has just gone.
+    /// Origin of the watch: `config`, `command_line` or `api`; null if it was just removed.
     pub origin: Option<Cow<'static, str>>,
-    /// How the topic stands: `ok`, `violated`, `silent`, `not_published` or `no_subscriber`.
+    /// State of the topic: `ok`, `violated`, `silent`, `not_published` or `no_subscriber`.
     pub state: Cow<'static, str>,
-    /// Expectations that are broken.
+    /// Expectations that the topic violates.
     pub violations: Vec<Cow<'a, str>>,
-    /// What it expects of the topic.
+    /// Expectations of the watch.
     #[serde(flatten)]
     pub expectations: Expectations,
 }
 
-/// One writer's messages to one receiver, or to a destination where they leave.
+/// Messages from one writer to one receiver, or to one destination outside this host.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Delivery<'a> {
-    /// Whose messages.
+    /// GUID of the writer.
     pub writer: String,
     /// `sent` or `received`.
     pub direction: Cow<'static, str>,
-    /// Address and port.
+    /// Destination address and port.
     #[cfg_attr(feature = "openapi", schema(example = "10.0.0.2:7411"))]
     pub destination: String,
-    /// The receiver: participant, process or socket; empty where receivers cannot be distinguished.
+    /// The receiver: participant, process or socket; empty if receivers cannot be distinguished.
     pub subscriber: Cow<'a, str>,
-    /// Readers of the topic in that participant.
+    /// GUIDs of the topic's readers in that participant.
     pub readers: Vec<String>,
-    /// Their nodes.
+    /// Nodes of these readers.
     pub nodes: Vec<Cow<'a, str>>,
-    /// Process of the socket.
+    /// Id of the process that owns the socket.
     pub process_id: Option<u32>,
-    /// Its name.
+    /// Name of that process.
     pub process: Option<Cow<'a, str>>,
-    /// Its control group.
+    /// Control group of that process.
     pub cgroup: Option<Cow<'a, str>>,
-    /// What became of the messages.
+    /// Fate of the messages.
     pub delivered: Delivered,
 }
 
-/// What one reliable reader acknowledged to one writer.
+/// State of acknowledgement between a reliable reader and a writer.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Acknowledgement<'a> {
-    /// To whom.
+    /// GUID of the writer.
     pub writer: String,
-    /// By whom.
+    /// GUID of the reader.
     pub reader: String,
-    /// The reader's node.
+    /// Node of the reader; null when unknown.
     pub node: Option<Cow<'a, str>>,
-    /// All messages up to this sequence number.
+    /// The reader has acknowledged all messages up to this sequence number.
     pub acknowledged_sequence_number: u64,
-    /// Messages it asked for in its last ACKNACK.
+    /// Messages that the reader requested in its last ACKNACK.
     pub missing_messages: u64,
-    /// Messages it asked for again, every request counted.
+    /// Messages that the reader requested again, counted per request.
     pub requested_messages: u64,
-    /// Messages that exist and are not acknowledged.
+    /// Messages that the writer has sent and the reader has not acknowledged.
     pub lag_messages: u64,
-    /// Age of the oldest of them; null when it is too old to know.
+    /// Age in seconds of the oldest such message; null if it is no longer known.
     pub lag_seconds: Option<f64>,
 }
 
-/// One reason.
+/// A reason why a topic is silent or not measured.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct Reason {
-    /// Which one.
+    /// Code of the reason.
     #[cfg_attr(feature = "openapi", schema(value_type = ReasonCode))]
     pub code: Open<ReasonCode>,
-    /// In words.
+    /// The reason, in words.
     pub detail: String,
 }
 
-/// Why nothing, or not everything, is seen of a topic.
+/// Why some or all messages of a topic are not observed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum ReasonCode {
-    /// The agent does not see the robot at the moment.
+    /// The agent does not capture the robot's traffic at the moment.
     AgentNotReady,
-    /// Nobody publishes it.
+    /// The topic has no publisher.
     NoPublisher,
-    /// Nobody subscribes: most writers send nothing then.
+    /// The topic has no subscriber; most writers then send nothing.
     NoSubscriber,
-    /// There are subscriptions, and none matches a publisher.
+    /// The topic has subscribers, but none matches a publisher.
     NoMatchedSubscriber,
     /// A publisher's participant uses DDS security: messages may be encrypted.
     Encrypted,
-    /// Nobody asked for it to be measured.
+    /// No watch covers the topic.
     NotWatched,
-    /// It is watched, but `limits.topics` are measured already.
+    /// A watch covers the topic, but `limits.topics` is reached.
     WatchRejected,
-    /// All its endpoints are on other hosts, and the agent looks at this host's sockets.
+    /// All endpoints are on other hosts, and the agent captures at this host's sockets only.
     OutsideView,
-    /// Messages go through Fast DDS's shared memory, and none was seen there.
+    /// Messages use Fast DDS's shared memory, and the agent has read none of them there.
     SharedMemory,
-    /// Subscribers read the publisher's history in memory: invisible.
+    /// Subscribers read the publisher's history in shared memory, which cannot be observed.
     DataSharing,
-    /// Publishers and subscribers are in one process: invisible.
+    /// Publishers and subscribers share a process, which cannot be observed.
     SameProcess,
-    /// Messages go through Cyclone DDS's iceoryx: invisible.
+    /// Messages use Cyclone DDS's iceoryx, which cannot be observed.
     Iceoryx,
-    /// All is as it should be, and no message was seen, or none lately.
+    /// No problem is known, but no message has been seen at all or recently.
     Quiet,
 }
 
-/// The last seconds of a topic. Columns have one length; null = not measured then, or no such value
-/// in that second.
+/// The last seconds of a topic. All columns have the same length. A null value means that the topic
+/// was not measured in that second, or that no value exists.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -232,28 +232,28 @@ pub struct History {
     /// ROS name.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub topic: String,
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
-    /// Time between two rows.
+    /// Seconds between two rows.
     pub interval_seconds: u32,
-    /// Unix time of the facts.
+    /// Unix time of the state that this answer describes.
     pub timestamp_seconds: f64,
-    /// Unix time at which each second ended, in the source's clock.
+    /// Unix time at which each second ended, by the source's clock.
     pub times: Vec<f64>,
-    /// Messages received whole in each.
+    /// Messages received whole in each second.
     pub messages: Vec<Option<u32>>,
-    /// Messages settled as lost in each.
+    /// Messages confirmed as lost in each second.
     pub lost_messages: Vec<Option<u32>>,
-    /// Messages a second over the 10 s before.
+    /// Messages per second over the 10 s before.
     pub rate_hertz: Vec<Option<f64>>,
-    /// Payload bytes a second over the 10 s before.
+    /// Payload bytes per second over the 10 s before.
     pub bandwidth_bytes_per_second: Vec<Option<f64>>,
     /// Median time from the writer's timestamp to the capture.
     pub latency_p50_seconds: Vec<Option<f64>>,
-    /// Its 99th percentile.
+    /// 99th percentile of that time.
     pub latency_p99_seconds: Vec<Option<f64>>,
     /// Median time between messages of one writer.
     pub interarrival_p50_seconds: Vec<Option<f64>>,
-    /// Its 99th percentile.
+    /// 99th percentile of that time.
     pub interarrival_p99_seconds: Vec<Option<f64>>,
 }

@@ -6,16 +6,17 @@ use serde::{Deserialize, Serialize};
 
 use crate::Open;
 
-/// What is watched.
+/// All watches.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
 pub struct WatchList {
-    /// Those of the configuration, of the command line, and then of clients, as they came.
+    /// Watches of the configuration, then of the command line, then of clients in the order of
+    /// their creation.
     pub watches: Vec<Watch>,
 }
 
-/// One watch.
+/// A watch.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -24,56 +25,57 @@ pub struct WatchList {
     reason = "the document describes expectations where they are declared"
 )]
 pub struct Watch {
-    /// ROS name or glob.
+    /// ROS name or glob of the topics.
     #[cfg_attr(feature = "openapi", schema(example = "/points"))]
     pub topic: String,
-    /// Only in this domain; every domain when it is null.
+    /// Domain id; null for every domain.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 232))]
     pub domain_id: Option<u32>,
-    /// Who asked for it.
+    /// Origin of the watch.
     #[cfg_attr(feature = "openapi", schema(value_type = Origin))]
     pub origin: Open<Origin>,
-    /// What has become of it.
+    /// State of the watch.
     #[cfg_attr(feature = "openapi", schema(value_type = WatchState))]
     pub state: Open<WatchState>,
-    /// Series per writer and subscriber.
+    /// Whether metrics have series per writer and subscriber.
     pub per_subscriber: bool,
-    /// The part of the messages of which spans are exported.
+    /// Share of messages for which spans are exported, from 0 to 1.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1))]
     pub trace: f64,
-    /// `last`: the last message of each transient-local writer is kept for recordings that begin later.
+    /// `last`: the agent keeps the last message of each transient-local writer for recordings that
+    /// begin later.
     pub retain: Retain,
     #[serde(flatten)]
     pub expectations: Expectations,
-    /// The topics it covers now, and a name that does not exist yet.
+    /// Topics that the watch covers; a watched name without a topic is listed too.
     pub topics: Vec<WatchedTopic>,
 }
 
-/// What is kept of a topic's messages for recordings that begin later.
+/// Messages that the agent keeps for recordings that begin later.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
 pub enum Retain {
-    /// Nothing.
+    /// No messages.
     #[default]
     None,
-    /// The last one of each writer that keeps its own for late joiners (transient local).
+    /// The last message of each writer that keeps messages for late joiners (transient local).
     Last,
 }
 
-/// What should hold for each topic; what is left out is not expected.
+/// Expectations of each topic. A missing field expects nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = ExpectationsView))]
 pub struct Expectations {
-    /// At least this many messages a second.
+    /// Smallest rate, in messages per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
+    /// Largest rate, in messages per second.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_rate_hz: Option<f64>,
-    /// At most this part of the messages may be lost, 0 to 1.
+    /// Largest share of lost messages, from 0 to 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_loss_ratio: Option<f64>,
@@ -87,31 +89,31 @@ pub struct Expectations {
     pub max_silence_s: Option<f64>,
 }
 
-/// Who asked for a watch.
+/// Origin of a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum Origin {
     /// The configuration file.
     Config,
-    /// `--watch`.
+    /// The option `--watch`.
     CommandLine,
     /// A client of this API.
     Api,
 }
 
-/// What has become of a watch.
+/// State of a watch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = Stage))]
 #[serde(rename_all = "snake_case")]
 pub enum WatchState {
-    /// Taken over with the next packets.
+    /// The watch takes effect with the next packets.
     Starting,
-    /// No such topic yet: it is measured as soon as it appears.
+    /// No such topic exists yet; it is measured as soon as it appears.
     Waiting,
     /// Its topics are measured.
     Measuring,
-    /// There is such a topic, but `limits.topics` are measured already.
+    /// The topic exists, but `limits.topics` is reached.
     Rejected,
 }
 
@@ -120,60 +122,61 @@ pub enum WatchState {
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = TopicView))]
 #[serde(default)]
 pub struct WatchedTopic {
-    /// Domain.
+    /// Domain id.
     pub domain_id: u32,
     /// ROS name.
     pub topic: String,
-    /// How it stands with what is expected.
+    /// State of the topic's expectations.
     #[cfg_attr(feature = "openapi", schema(value_type = TopicState))]
     pub state: Open<TopicState>,
-    /// Expectations that are broken.
+    /// Expectations that the topic violates.
     pub violations: Vec<Cow<'static, str>>,
-    /// Messages counted while it was watched.
+    /// Messages counted since the topic is watched.
     pub messages: u64,
-    /// Messages a second over the last window.
+    /// Messages per second over the last window.
     pub rate_hertz: f64,
 }
 
-/// How a topic stands with what is expected of it.
+/// State of a topic's expectations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "snake_case")]
 pub enum TopicState {
     /// All expectations hold.
     Ok,
-    /// One is broken.
+    /// At least one expectation is violated.
     Violated,
-    /// Nothing came for longer than `max_silence_s`.
+    /// No message arrived for longer than `max_silence_s`.
     Silent,
-    /// Nobody publishes it.
+    /// The topic has no publisher.
     NotPublished,
-    /// Nobody subscribes to it.
+    /// The topic has no subscriber.
     NoSubscriber,
 }
 
-/// How a topic is to be watched. Every field may be left out, and so may the body.
+/// Settings of a watch. All fields are optional, and so is the body.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(deny_unknown_fields, default)]
 pub struct WatchRequest {
-    /// Only in this domain; every domain when left out. The same as the query's.
+    /// Domain id; null for every domain. The query parameter of this name has the same effect.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 232))]
     pub domain_id: Option<u32>,
-    /// Series per writer and subscriber of each covered topic, besides those per topic.
+    /// Whether metrics have series per writer and subscriber of each covered topic.
     pub per_subscriber: bool,
-    /// The part of each covered topic's messages of which spans are exported, 0 to 1.
+    /// Share of each covered topic's messages for which spans are exported, from 0 to 1.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1))]
     pub trace: f64,
-    /// `last`: keep the last message of each transient-local writer for recordings that begin later.
+    /// `last`: the agent keeps the last message of each transient-local writer for recordings that
+    /// begin later.
     pub retain: Retain,
-    /// At least this many messages a second.
+    /// Smallest rate, in messages per second.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1_000_000))]
     pub min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
+    /// Largest rate, in messages per second.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1_000_000))]
     pub max_rate_hz: Option<f64>,
-    /// At most this part of the messages may be lost, 0 to 1.
+    /// Largest share of lost messages, from 0 to 1.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1))]
     pub max_loss_ratio: Option<f64>,
     /// Longest time from the writer's timestamp to the capture, in milliseconds.

@@ -1,5 +1,5 @@
-//! What the core costs: per datagram, per kernel record, per discovery announcement, per tick, and
-//! for a whole capture.
+//! Costs of the core: per datagram, kernel record, discovery announcement and tick, and for a whole
+//! capture.
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic on its own input")]
 
 use std::hint::black_box;
@@ -26,7 +26,7 @@ fn guid(index: u16) -> Guid {
     Guid::new(ALICE, EntityId([0, high, low, 3]))
 }
 
-/// An observer of one participant with this many measured writers.
+/// Returns an observer of one participant with this many measured writers.
 fn observer(writers: u16) -> Observer {
     let mut observer = Observer::new(Settings::default());
     observer.input(Input::Watchlist(Arc::new(
@@ -71,7 +71,8 @@ fn samples(criterion: &mut Criterion) {
         bencher.iter(|| {
             number += 1;
             let mut datagram = template.clone();
-            // Behind header, INFO_TS, and the fixed fields of DATA before the low number.
+            // The offset follows the header, INFO_TS, and the fixed fields of DATA before the low
+            // number.
             if let Some(low) = datagram.get_mut(20 + 12 + 4 + 16..20 + 12 + 4 + 20) {
                 low.copy_from_slice(&u32::try_from(number).unwrap().to_le_bytes());
             }
@@ -105,7 +106,7 @@ fn samples(criterion: &mut Criterion) {
     let mut fragment = 0;
     group.bench_function("record of ten fragments", |bencher| {
         bencher.iter(|| {
-            // 2.72 MB in 203 datagrams of ten fragments.
+            // A sample of 2.72 MB, in 203 datagrams of ten fragments each.
             let record = Record {
                 kind: kind::DATA_FRAG,
                 submessage_flags: 1,

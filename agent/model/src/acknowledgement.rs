@@ -1,8 +1,8 @@
-//! What the readers of one reliable writer acknowledged, and how far behind they are.
+//! Acknowledgements of the readers of one reliable writer, and how far each reader lags behind.
 //!
-//! How old the oldest unacknowledged sample is needs the times of samples: the latest are kept
-//! exactly, older ones ever more coarsely, so that a reader that hangs for an hour is told in
-//! bounded memory. Nothing is kept of a writer that nobody acknowledges.
+//! The age of the oldest unacknowledged sample requires the times of samples. The latest times are
+//! exact; older ones are thinned out, so a reader that hangs for an hour needs bounded memory.
+//! Writers without acknowledgements keep no state.
 
 use std::collections::VecDeque;
 
@@ -12,40 +12,40 @@ use ros2probe_wire::{Guid, Timestamp};
 use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
 
-/// Times of samples that are kept of one writer.
+/// Sample times that are kept per writer.
 const TIMES: usize = 256;
-/// Readers of one writer.
+/// Largest number of readers per writer.
 const READERS: usize = 512;
 
-/// All readers that acknowledge to one writer.
+/// All readers that send ACKNACKs to one writer.
 #[derive(Debug, Default)]
 pub struct Acknowledgements {
-    /// By GUID.
+    /// Readers, sorted by GUID.
     readers: Vec<Reader>,
-    /// Samples and when they were first seen, by number.
+    /// Sequence numbers and the times at which they were first seen, sorted by number.
     times: VecDeque<(u64, Timestamp)>,
-    /// Readers for which there was no room.
+    /// Readers that were not added because the list was full.
     pub refused: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Reader {
     guid: Guid,
-    /// All below are acknowledged.
+    /// All samples below this number are acknowledged.
     base: u64,
     missing: u64,
     requested: u64,
     acknacks: u64,
     last_seen: Timestamp,
-    /// The last one seen leaving, not arriving yet.
+    /// The last ACKNACK that was seen leaving this host but not yet arriving.
     leaving: Option<SequenceNumberSet>,
 }
 
 impl Acknowledgements {
-    /// Entries and cap of every list.
+    /// Returns the length and cap of each list.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             readers,
             times,
@@ -57,13 +57,13 @@ impl Acknowledgements {
         ]
     }
 
-    /// Whether nobody acknowledged.
+    /// Returns whether no reader has acknowledged.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.readers.is_empty()
     }
 
-    /// Takes in an ACKNACK.
+    /// Records an ACKNACK.
     pub fn acknack(&mut self, acknack: AckNack<'_>) {
         let guid = acknack.record().reader();
         let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
@@ -84,19 +84,20 @@ impl Acknowledgements {
         self.trim();
     }
 
-    /// Those of these readers that acknowledged at all have all samples below this number.
+    /// Returns the number below which all of these readers have acknowledged everything; `None` if
+    /// none of them has sent an ACKNACK.
     pub fn floor(&self, is_meant: impl Fn(Guid) -> bool) -> Option<u64> {
         let meant = self.readers.iter().filter(|reader| is_meant(reader.guid));
         meant.map(|reader| reader.base).min()
     }
 
-    /// The writer's newest sample is this one.
+    /// Records the writer's newest sample and its time.
     pub fn wrote(&mut self, number: u64, at: Timestamp) {
         if self.readers.is_empty() {
             return;
         }
         if self.times.back().is_some_and(|(last, _)| *last >= number) {
-            // A writer that began anew.
+            // The numbers restart, so the writer restarted under its GUID.
             self.times.clear();
         }
         if self.times.len() >= TIMES {
@@ -109,7 +110,7 @@ impl Acknowledgements {
         self.times.push_back((number, at));
     }
 
-    /// Forgets readers that are no more.
+    /// Removes readers for which `is_there` returns false.
     pub fn retain(&mut self, is_there: impl Fn(Guid) -> bool) {
         self.readers.retain(|reader| is_there(reader.guid));
         if self.readers.is_empty() {
@@ -117,7 +118,7 @@ impl Acknowledgements {
         }
     }
 
-    /// How it stands with each reader of `writer`, whose next sample will be `next`.
+    /// Returns the state of each reader of `writer`; `next` is the number of its next sample.
     pub fn facts(
         &self,
         writer: Guid,
@@ -148,7 +149,7 @@ impl Acknowledgements {
         }
         let after = self.times.partition_point(|(number, _)| *number < base);
         let (number, at) = self.times.get(after)?;
-        // A sample between two whose times are known was written no earlier than the first.
+        // A sample between two known times was written no earlier than the first of them.
         let at = match after
             .checked_sub(1)
             .and_then(|before| self.times.get(before))
@@ -160,12 +161,12 @@ impl Acknowledgements {
         Some(now.nanoseconds_since(*at).max(0) as f64 / 1e9)
     }
 
-    /// Forgets the times of what everybody acknowledged.
+    /// Removes the times of samples that all readers acknowledged.
     fn trim(&mut self) {
         let Some(base) = self.readers.iter().map(|reader| reader.base).min() else {
             return;
         };
-        // One before it tells how old those can be that follow.
+        // One earlier time stays: it is the lower bound for the samples after it.
         while let Some((second, _)) = self.times.get(1)
             && *second < base
         {
@@ -193,7 +194,7 @@ impl Reader {
         self.last_seen = self.last_seen.max(Timestamp(record.time));
         self.base = acknack.base();
         self.missing = content.iter().count() as u64;
-        // Where both ends are local it is seen leaving, then arriving.
+        // If both ends are on this host, the ACKNACK is seen leaving and then arriving.
         let is_leaving = record.flags & flag::OUTGOING != 0;
         if !is_leaving && self.leaving.take() == Some(content) {
             return;
@@ -215,7 +216,7 @@ mod tests {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, number, 4]))
     }
 
-    /// [`Acknowledgements::acknack`] of the ACKNACK that a record reports.
+    /// Passes the ACKNACK of a record to [`Acknowledgements::acknack`].
     fn put(all: &mut Acknowledgements, record: &Record) {
         let Body::AckNack(acknack) = record.body() else {
             panic!("{record:?}")

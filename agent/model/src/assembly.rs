@@ -1,9 +1,9 @@
-//! Puts the bytes of samples together that somebody wants whole: in one DATA, or in DATA_FRAGs by
-//! their fragment numbers, in any order and however often they come.
+//! Reassembles the payloads of samples that subscriptions request: from one DATA, or from
+//! DATA_FRAGs in any order and with duplicates.
 //!
-//! It believes no size: memory grows with the bytes that came, to twice as many at most, within a
-//! budget for all. When that is spent, the sample that has waited longest is given up. Whether a
-//! sample counts is not decided here.
+//! Announced sizes are not trusted: memory grows with the bytes that arrived, to at most twice as
+//! many, within one budget for all samples. When the budget is exhausted, the oldest sample is
+//! dropped. Counting of samples happens elsewhere.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -14,20 +14,20 @@ use ros2probe_wire::{Guid, Timestamp};
 
 use super::size::Size;
 
-/// What keeping one sample or one fragment that came too early costs besides its bytes.
+/// Memory per sample, and per fragment that arrived early, in addition to its bytes.
 const OVERHEAD: usize = 128;
-/// Samples under way at once.
+/// Largest number of unfinished samples.
 const SAMPLES: usize = 16_384;
-/// A sample that got nothing for so long will not be complete, nor counted.
+/// An unfinished sample is dropped after this long without a fragment.
 const FORGET: u64 = 30 * SECOND;
-/// Least memory that is asked for at once.
+/// Smallest allocation for a sample.
 const LEAST: usize = 4096;
 
-/// The samples under way.
+/// All unfinished samples.
 #[derive(Debug)]
 pub struct Assembly {
     parts: HashMap<(Guid, u64), Part>,
-    /// The same, in the order in which they began.
+    /// The same samples in the order in which they began.
     ages: BTreeMap<u64, (Guid, u64)>,
     begun: u64,
     bytes: usize,
@@ -40,19 +40,19 @@ struct Part {
     age: u64,
     size: usize,
     fragment_size: usize,
-    /// The bytes up to the first fragment that has not come.
+    /// The bytes before the first missing fragment.
     head: Vec<u8>,
-    /// Number of that fragment, from 1.
+    /// Number of the first missing fragment, from 1.
     next: u32,
-    /// Fragments behind it, by the number of the first of those that came together.
+    /// Fragments after the missing one, by the number of the first in each consecutive group.
     ahead: BTreeMap<u32, Box<[u8]>>,
-    /// Bytes of `ahead`, and what keeping them costs.
+    /// Bytes of `ahead`, including the overhead of each entry.
     ahead_bytes: usize,
     touched: Timestamp,
 }
 
 impl Assembly {
-    /// Empty, for at most `limit` bytes.
+    /// Creates an empty assembly that holds at most `limit` bytes.
     #[must_use]
     pub fn new(limit: usize) -> Self {
         Self {
@@ -65,10 +65,10 @@ impl Assembly {
         }
     }
 
-    /// Entries, or bytes, and cap of every table.
+    /// Returns the size and cap of each table, in entries or bytes.
     #[must_use]
     pub fn sizes(&self) -> [Size; 3] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             parts,
             ages,
@@ -98,13 +98,13 @@ impl Assembly {
         ]
     }
 
-    /// Bytes held, their cap, and samples given up because of it.
+    /// Returns the bytes held, their cap, and the number of samples dropped because of it.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         (self.bytes, self.limit, self.evictions)
     }
 
-    /// Keeps what a DATA or DATA_FRAG brings; `other_bytes` bytes are spent elsewhere.
+    /// Adds the bytes of a DATA or DATA_FRAG. `other_bytes` bytes of the budget are used elsewhere.
     pub fn put(&mut self, sample: Sample<'_>, payload: &[u8], other_bytes: usize) {
         let Some((size, fragment_size)) = sizes(sample, payload) else {
             return;
@@ -121,7 +121,7 @@ impl Assembly {
         let Some(part) = self.parts.get_mut(&key) else {
             return;
         };
-        // Fragments of a writer that contradicts itself are of no use.
+        // Fragments that contradict earlier ones of the same sample cannot be used.
         if part.size != size || part.fragment_size != fragment_size {
             return;
         }
@@ -143,30 +143,30 @@ impl Assembly {
         }
     }
 
-    /// Whether all bytes of this sample came.
+    /// Returns whether all bytes of this sample have arrived.
     #[must_use]
     pub fn is_whole(&self, writer: Guid, number: u64) -> bool {
         let part = self.parts.get(&(writer, number));
         part.is_some_and(|part| part.head.len() == part.size)
     }
 
-    /// The bytes of a sample that was counted, if all of them came; nothing of it is kept.
+    /// Removes a sample that was counted and returns its bytes, or `None` if some are missing.
     pub fn take(&mut self, writer: Guid, number: u64) -> Option<Bytes> {
         let part = self.remove((writer, number))?;
         (part.head.len() == part.size).then(|| part.head.into())
     }
 
-    /// Keeps nothing of this sample any more.
+    /// Drops this sample.
     pub fn forget(&mut self, writer: Guid, number: u64) {
         self.remove((writer, number));
     }
 
-    /// Nobody wants the samples of this writer any more.
+    /// Drops all samples of a writer that no subscription requests any longer.
     pub fn release(&mut self, writer: Guid) {
         self.retain(|key, _| key.0 != writer);
     }
 
-    /// Forgets what has got nothing for a long time.
+    /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: Timestamp) {
         self.retain(|_, part| part.touched.0.saturating_add(FORGET) > now.0);
     }
@@ -209,7 +209,7 @@ impl Part {
         self.head.capacity() + self.ahead_bytes
     }
 
-    /// Takes in consecutive fragments, the first of which is number `start`.
+    /// Adds consecutive fragments, the first of which has the number `start`.
     fn put(&mut self, start: u32, bytes: &[u8]) {
         if start > self.next {
             let known = self.ahead.get(&start).map_or(0, |known| known.len());
@@ -230,7 +230,7 @@ impl Part {
         }
     }
 
-    /// Appends those that are new, of fragments that begin at `start`, which is not too early.
+    /// Appends the new ones of fragments that begin at `start`, which is not after the next one.
     fn append(&mut self, start: u32, bytes: &[u8]) {
         let skipped = usize::try_from(self.next - start).unwrap_or(usize::MAX);
         let Some(known) = skipped.checked_mul(self.fragment_size) else {
@@ -238,7 +238,7 @@ impl Part {
         };
         let left = self.size - self.head.len();
         let bytes = bytes.get(known..).unwrap_or_default();
-        // The last fragment may have padding behind it, and only that one may be short.
+        // Only the last fragment may be short, and it may have padding after it.
         let len = if bytes.len() >= left {
             left
         } else {
@@ -257,10 +257,10 @@ impl Part {
     }
 }
 
-/// Size of the sample and of its fragments; `None` where the bytes are of no use.
+/// Returns the sizes of the sample and of its fragments, or `None` if the bytes cannot be used.
 fn sizes(sample: Sample<'_>, payload: &[u8]) -> Option<(usize, usize)> {
     if sample.record().flags & flag::INLINE_QOS_UNREAD != 0 || !sample.is_message() {
-        // Where the payload begins is not known, or it is a disposal.
+        // The start of the payload is unknown, or the sample is a disposal.
         return None;
     }
     match sample {
@@ -287,7 +287,7 @@ mod tests {
         Guid::new(GuidPrefix([number; 12]), EntityId([0, 0, 1, 3]))
     }
 
-    /// [`Assembly::put`] of the sample that a record reports.
+    /// Passes the sample of a record to [`Assembly::put`].
     fn put(assembly: &mut Assembly, record: &Record, payload: &[u8], other_bytes: usize) {
         assembly.put(record.sample().unwrap(), payload, other_bytes);
     }
@@ -305,7 +305,7 @@ mod tests {
         }
     }
 
-    /// A payload in which every place can be told.
+    /// Returns a payload in which every offset has a recognisable value.
     fn payload(size: usize) -> Vec<u8> {
         (0..size).map(|place| (place * 7 % 251) as u8).collect()
     }
@@ -374,7 +374,7 @@ mod tests {
             &[0; 500],
             0,
         );
-        // A datagram that claims more fragments than it has bytes for.
+        // This datagram claims more fragments than its bytes can hold.
         put(
             &mut assembly,
             &fragment(writer(1), 1, 2, 2, 2500, 1000),
@@ -459,7 +459,7 @@ mod tests {
         assert!(assembly.evictions > 49_000);
         let newest = assembly.parts.keys().map(|(_, number)| *number).max();
         assert_eq!(newest, Some(49_999));
-        // One that is larger than the budget is given up as it grows.
+        // A sample that is larger than the budget is dropped as it grows.
         for start in 1..3000 {
             let record = fragment(writer(2), 1, start, 1, 3_000_000, 1000);
             put(&mut assembly, &record, &[0; 1000], 0);

@@ -1,5 +1,6 @@
-//! How often participants, endpoints and nodes came and went: the counters behind an alert on a
-//! flapping robot. Bounded: few kinds, and no more domains than ports allow.
+//! Counters of participants, endpoints and nodes that appeared, changed and vanished, for alerts on
+//! unstable robots. The number of counters is bounded by the kinds of events and the domains that
+//! ports allow.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +9,7 @@ use ros2probe_wire::discovery::Role;
 
 use super::size::Size;
 
-/// Who.
+/// Kind of the entity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Entity {
     /// A participant.
@@ -21,23 +22,23 @@ pub enum Entity {
     Node,
 }
 
-/// What happened.
+/// Kind of the change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Event {
-    /// Announced for the first time, or again after it was gone.
+    /// Announced for the first time, or again after it had gone.
     Appeared,
     /// Announced with other properties.
     Changed,
-    /// It said goodbye.
+    /// Removed by its own disposal.
     Disposed,
-    /// Its lease ran out.
+    /// Removed because its lease expired.
     Expired,
-    /// It went with its participant.
+    /// Removed together with its participant.
     Cascaded,
 }
 
 impl Entity {
-    /// Of an endpoint.
+    /// Returns the entity for an endpoint of this role.
     #[must_use]
     pub const fn of(role: Role) -> Self {
         match role {
@@ -46,7 +47,7 @@ impl Entity {
         }
     }
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -59,7 +60,7 @@ impl Entity {
 }
 
 impl Event {
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -72,41 +73,41 @@ impl Event {
     }
 }
 
-/// One kind of discovery event.
+/// The number of discovery events of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ChurnCount {
-    /// Domain.
+    /// Domain of the entities.
     pub domain_id: DomainId,
     /// `participant`, `writer`, `reader`, `node`.
     pub entity: &'static str,
     /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.
     pub event: &'static str,
-    /// How often.
+    /// Number of events.
     pub count: u64,
 }
 
-/// The counters.
+/// The counters of all domains.
 #[derive(Debug, Default)]
 pub struct Churn {
     counts: BTreeMap<(DomainId, Entity, Event), u64>,
 }
 
 impl Churn {
-    /// Entries and cap: of every domain that UDP has ports for, each entity and event.
+    /// Returns the number of counters and its cap: one per domain with UDP ports, entity and event.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self { counts } = self;
         let cap = 233 * 4 * 5;
         [Size::new("discovery.churn", counts.len(), cap)]
     }
 
-    /// Counts one.
+    /// Increments a counter.
     pub fn count(&mut self, domain_id: DomainId, entity: Entity, event: Event) {
         *self.counts.entry((domain_id, entity, event)).or_default() += 1;
     }
 
-    /// All counters that are not zero, sorted.
+    /// Returns all counters above zero, sorted.
     #[must_use]
     pub fn facts(&self) -> Vec<ChurnCount> {
         let fact =

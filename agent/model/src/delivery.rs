@@ -1,9 +1,10 @@
-//! What one receiver got of one writer's samples, or what left for one destination.
+//! Samples of one writer that one receiver got, or that left for one destination.
 //!
-//! A delivery begins with what the receiver saw first; its losses are gaps below the highest number
-//! that it saw or that a HEARTBEAT told it, and samples that left this host for where it listens.
-//! So who joins late or leaves loses nothing. Every loss has one cause; it never goes back on a
-//! cause. What leaves has no losses: what was not sent is nobody's.
+//! A delivery begins with the first sample that the receiver sees. A gap counts as lost if it is
+//! below the highest number that the receiver knows from a sample or HEARTBEAT. A sample that left
+//! this host for the receiver's address and did not arrive counts as lost, too. A receiver
+//! therefore loses nothing before it joins or after it leaves. Each loss has one cause, which never
+//! changes. Outgoing deliveries have no losses: samples that were never sent belong to no receiver.
 
 mod accounting;
 mod departed;
@@ -29,42 +30,41 @@ use super::writer::settle_window;
 use accounting::Accounting;
 pub use accounting::Totals;
 
-/// Numbers that were missed while nobody listened are excused one by one up to here; beyond, the
-/// delivery begins anew.
+/// Number of samples missed while no reader listened that are excused one by one. Above it, the
+/// delivery restarts.
 const EXCUSED: u64 = 512;
-/// What left this host a moment ago may be under way still.
+/// Samples that left this host less than this ago may still arrive.
 const UNDER_WAY: u64 = SECOND;
-/// A receiver that is silent for so long and of which nothing tells whether it lives has lost what
-/// left for it in the first moments. Whoever reads the kernel's tables notices earlier that a
-/// socket was closed.
+/// A receiver without any sign of life counts samples that left for it as lost after this silence.
+/// Socket diagnostics of the kernel report a closed socket earlier.
 const SILENCE: u64 = 18 * SECOND;
 const FIRST_MOMENTS: u64 = 5 * SECOND;
-/// Samples that are lost in one go and wait for their cause when two deliveries become one.
+/// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
-/// Who gets the samples.
+/// The receiver of the samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Receiver {
-    /// A participant, by any route.
+    /// A participant, on any route.
     Participant(GuidPrefix),
     /// The receivers at the end of this route.
     Route(Route),
 }
 
-/// What a record changes besides the delivery itself.
+/// State outside the delivery that a record changes.
 #[derive(Debug)]
 pub struct DeliveryContext<'a> {
-    /// The time of the record, or of the look at the clock.
+    /// Time of the record, or of the tick.
     pub now: Timestamp,
-    /// Whose samples.
+    /// Writer of the samples.
     pub writer: Guid,
-    /// It retransmits.
+    /// Whether the writer is reliable and retransmits samples.
     pub reliable: bool,
-    /// Its datagrams may need IP reassembly on this host.
+    /// Whether its datagrams may need IP reassembly on this host.
     pub reassembled: bool,
-    /// Memory for fragmented samples.
+    /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
-    /// Where losses are told.
+    /// Journal that receives the losses.
     pub journal: &'a mut Journal,
     /// Sums over all deliveries of the writer.
     pub totals: &'a mut Totals,
@@ -74,7 +74,7 @@ pub struct DeliveryContext<'a> {
 #[derive(Debug)]
 pub struct Delivery {
     receiver: Receiver,
-    /// By which route new samples come.
+    /// Route by which new samples arrive.
     main: Route,
     reception: Reception,
     tally: Delivered,
@@ -82,20 +82,20 @@ pub struct Delivery {
     loss_causes: LossCauses,
     first_seen: Timestamp,
     last_seen: Timestamp,
-    /// When a reader appeared for which it is, after what it saw last.
+    /// Time at which a matching reader appeared, if that is after the last sample.
     opened: Timestamp,
-    /// Since when something has left for here that has not arrived.
+    /// Time at which the oldest sample that has not arrived left this host for the receiver.
     waiting: Option<Timestamp>,
-    /// What left since then was taken for lost.
+    /// Whether samples that left since then are already counted as lost.
     presumed_lost: bool,
-    /// All its readers are best effort: nothing is sent to them again, nothing is said to them.
+    /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
     best_effort: bool,
-    /// Samples come here over the network, or should: not all by shared memory.
+    /// Whether samples use the network, at least for some readers, rather than only shared memory.
     uses_network: bool,
 }
 
 impl Delivery {
-    /// Nothing seen yet.
+    /// Creates a delivery that has seen nothing yet.
     #[must_use]
     pub fn new(receiver: Receiver, main: Route, now: Timestamp) -> Self {
         Self {
@@ -115,9 +115,9 @@ impl Delivery {
         }
     }
 
-    /// Entries, or bytes, and cap of every list.
+    /// Returns the size and cap of each list, in entries or bytes.
     pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             receiver: _,
             main: _,
@@ -137,58 +137,58 @@ impl Delivery {
         sizes.chain(loss_causes.sizes())
     }
 
-    /// Samples in fragments that begin before this may lack some that nobody lost.
+    /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
     pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.reception.allow_incomplete(until);
     }
 
-    /// Who gets the samples.
+    /// Returns the receiver of the samples.
     #[must_use]
     pub const fn receiver(&self) -> Receiver {
         self.receiver
     }
 
-    /// The receiver is known better.
+    /// Sets the participant of the receiver, once it is known.
     pub const fn identify(&mut self, prefix: GuidPrefix) {
         self.receiver = Receiver::Participant(prefix);
     }
 
-    /// By which route new samples come.
+    /// Returns the route by which new samples arrive.
     #[must_use]
     pub const fn main(&self) -> Route {
         self.main
     }
 
-    /// New samples come by another route.
+    /// Changes the route by which new samples arrive.
     pub const fn move_to(&mut self, route: Route) {
         self.main = route;
     }
 
-    /// Leaving or arriving.
+    /// Returns whether the delivery is outgoing or incoming.
     #[must_use]
     pub const fn direction(&self) -> Direction {
         self.main.direction
     }
 
-    /// What became of the samples.
+    /// Returns the counts of samples.
     #[must_use]
     pub const fn tally(&self) -> &Delivered {
         &self.tally
     }
 
-    /// First and last record.
+    /// Returns the times of the first and last record.
     #[must_use]
     pub const fn seen(&self) -> (Timestamp, Timestamp) {
         (self.first_seen, self.last_seen)
     }
 
-    /// One past the highest number known to exist.
+    /// Returns the highest sequence number known to exist, plus one.
     #[must_use]
     pub const fn next(&self) -> u64 {
         self.reception.sequence().next()
     }
 
-    /// Whether this sample is known to exist, but has not come.
+    /// Returns whether this sample is known to exist but has not arrived.
     #[must_use]
     pub fn misses(&self, number: u64) -> bool {
         let sequence = self.reception.sequence();
@@ -198,13 +198,13 @@ impl Delivery {
             && !sequence.has(number)
     }
 
-    /// Whether this sample came.
+    /// Returns whether this sample has arrived.
     #[must_use]
     pub fn has(&self, number: u64) -> bool {
         self.reception.sequence().has(number)
     }
 
-    /// This sample came by another route that may be the same receiver's.
+    /// Records that this sample arrived by another route that may lead to the same receiver.
     pub fn know(&mut self, number: u64, totals: &mut Totals) {
         self.reception.sequence_mut().know(number);
         if self.loss_causes.resolve(number) {
@@ -213,29 +213,29 @@ impl Delivery {
         }
     }
 
-    /// A reader appeared; what it saw before, if anything, was for another.
+    /// Records that a reader appeared. Earlier samples were for other readers.
     pub fn open(&mut self, at: Timestamp) {
         self.opened = self.opened.max(at);
     }
 
-    /// Whether none of its readers is reliable.
+    /// Sets whether all readers are best effort.
     pub const fn learn(&mut self, best_effort: bool) {
         self.best_effort = best_effort;
     }
 
-    /// The last reader is gone: what it has not got since its last sample it did not want.
+    /// Records that the last reader is gone: samples after its last one do not count as lost.
     pub fn close(&mut self, budget: &mut Budget) {
         (self.waiting, self.presumed_lost) = (None, false);
         self.reception.close(budget);
     }
 
-    /// A sample came, and no reader is there for it.
+    /// Counts a sample that arrived although the receiver has no reader.
     pub const fn ignore(&mut self, totals: &mut Totals) {
         self.tally.unmatched += 1;
         totals.received.unmatched += 1;
     }
 
-    /// Takes in a DATA or DATA_FRAG; whether it brought nothing new, and what it completed.
+    /// Records a DATA or DATA_FRAG. Returns whether it is a duplicate, and the sample it completes.
     pub fn sample(
         &mut self,
         sample: Sample<'_>,
@@ -258,7 +258,7 @@ impl Delivery {
         (again, whole)
     }
 
-    /// Takes in that the socket had no room for this DATA or DATA_FRAG.
+    /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
     pub fn no_room(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(sample.record());
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
@@ -271,7 +271,7 @@ impl Delivery {
         let is_confirmed =
             reception.recognise(sample, budget, &mut |decision| accounting.take(decision));
         if !is_confirmed {
-            // Its cause, should its number be believed later.
+            // The cause is kept in case later records confirm the number.
             let is_full = self
                 .loss_causes
                 .note(number, LossCause::SocketBuffer, context.now);
@@ -283,7 +283,7 @@ impl Delivery {
         self.record_cause(number, LossCause::SocketBuffer, context);
     }
 
-    /// Takes in that the kernel gave up on some IP fragments of this sample.
+    /// Records that the kernel failed to reassemble some IP fragments of this sample.
     pub fn not_reassembled(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
         self.uses_network = true;
         let sequence = self.reception.sequence();
@@ -301,8 +301,8 @@ impl Delivery {
         self.record_cause(number, LossCause::Reassembly, context);
     }
 
-    /// Takes in a HEARTBEAT for this receiver. What it has begins here, if nothing came before; but
-    /// as long as nothing comes and nothing is asked for, its samples may go by shared memory.
+    /// Records a HEARTBEAT for this receiver. A delivery without samples begins with it. While no
+    /// sample arrives and none is requested, the samples may use shared memory.
     pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(heartbeat.record());
         let end = heartbeat.last().saturating_add(1);
@@ -317,14 +317,14 @@ impl Delivery {
         self.excuse_unheard(before);
     }
 
-    /// Takes in a GAP for this receiver.
+    /// Records a GAP for this receiver.
     pub fn gap(&mut self, gap: Gap<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(gap.record());
         let (reception, budget, mut accounting) = self.split(context);
         reception.gap(gap, budget, &mut |decision| accounting.take(decision));
     }
 
-    /// Takes in an ACKNACK: a reader asks for samples again.
+    /// Records an ACKNACK in which a reader requests samples again.
     pub fn requested(&mut self, acknack: AckNack<'_>) {
         let missing = acknack.missing();
         let sequence = self.reception.sequence_mut();
@@ -333,12 +333,12 @@ impl Delivery {
         sequence.requested(missing.iter());
     }
 
-    /// Its readers have all below `base`.
+    /// Records that all readers have every sample below `base`.
     pub fn acknowledged(&mut self, base: u64) {
         self.reception.sequence_mut().acknowledged(base);
     }
 
-    /// Settles what has waited long enough.
+    /// Settles samples whose waiting time is over.
     pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
         let (now, window) = (context.now, settle_window(self.is_reliable(context)));
         let (reception, budget, mut accounting) = self.split(context);
@@ -351,18 +351,18 @@ impl Delivery {
         self.undelivered.expire(now.0);
     }
 
-    /// Settles everything, also what is pending: nothing more will come.
+    /// Settles all samples, including pending ones: the input has ended.
     pub fn settle(&mut self, context: &mut DeliveryContext<'_>) {
         let (reception, budget, mut accounting) = self.split(context);
         reception.settle(budget, &mut |decision| accounting.take(decision));
         self.conclude(Timestamp(u64::MAX), context);
     }
 
-    /// `other` turned out to be the same receiver.
+    /// Merges `other`, which turned out to be the same receiver.
     pub fn absorb(&mut self, mut other: Self, context: &mut DeliveryContext<'_>) {
         let mut runs = self.loss_causes.due(Timestamp(u64::MAX));
         runs.extend(other.loss_causes.due(Timestamp(u64::MAX)));
-        // So many at once are no matter of single fragments, nor of single repairs.
+        // Long runs are not caused by single fragments, and no retransmission repairs them.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
             .partition(|(first, last)| last - first > LONG_RUN);
@@ -391,7 +391,7 @@ impl Delivery {
         reception.absorb(other.reception, now, budget, &mut |decision| {
             accounting.take(decision);
         });
-        // What was decided there is not decided again.
+        // Decisions of the other delivery are final.
         let sequence = self.reception.sequence_mut();
         let settled = settled.min(sequence.next());
         (sequence.settled()..settled).for_each(|number| sequence.know(number));
@@ -428,7 +428,7 @@ impl Delivery {
         match outcome {
             Outcome::Open => (false, None),
             Outcome::Duplicate => {
-                // One multicast may be seen on its way out by several interfaces.
+                // Several interfaces may show the same outgoing multicast.
                 if !is_sent || !self.main.destination.is_multicast() {
                     self.count(context, |tally| tally.duplicates += 1);
                 }
@@ -469,8 +469,8 @@ impl Delivery {
         });
     }
 
-    /// A sample that comes after it was settled as lost: too late for the counters, unless its
-    /// cause was still awaited.
+    /// Handles a sample that arrives after it was settled as lost. It changes the counters only if
+    /// its cause was still pending.
     fn late(
         &mut self,
         sample: Sample<'_>,
@@ -495,7 +495,7 @@ impl Delivery {
         (true, None)
     }
 
-    /// After so many numbers that nobody here was to get, all count afresh.
+    /// Restarts the delivery after a long range of numbers that were not for this receiver.
     fn begin_anew(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_far = number.saturating_sub(sequence.next()) > EXCUSED;
@@ -526,7 +526,7 @@ impl Delivery {
         });
     }
 
-    /// What was pending until `now` never reached this host.
+    /// Settles samples pending until `now` as lost before this host.
     fn conclude(&mut self, now: Timestamp, context: &mut DeliveryContext<'_>) {
         for (first, last) in self.loss_causes.due(now) {
             let (_, _, mut accounting) = self.split(context);
@@ -539,7 +539,7 @@ impl Delivery {
         change(context.totals.of(self.main.direction));
     }
 
-    /// The reception, the memory for it, and what its decisions change.
+    /// Splits the borrow into the reception, its memory budget, and the accounting of decisions.
     const fn split<'a>(
         &'a mut self,
         context: &'a mut DeliveryContext<'_>,

@@ -1,5 +1,5 @@
-//! When samples of one writer left this host: for how long they took to leave, and to arrive where
-//! one clock sees both.
+//! Times at which one writer's samples left this host, for the send delay and, if one clock sees
+//! both ends, the transit time.
 
 use std::collections::VecDeque;
 
@@ -8,14 +8,14 @@ use ros2probe_wire::Timestamp;
 use super::route::Destination;
 use super::size::Size;
 
-/// Departures remembered: a sample is under way for a moment, to a few destinations.
+/// Departures that are kept: a sample is in transit briefly, to few destinations.
 const LIMIT: usize = 64;
 
 /// The latest departures of one writer.
 #[derive(Debug, Default)]
 pub struct Departures {
     latest: VecDeque<Departure>,
-    /// Source time of the newest sample of which something left.
+    /// Source timestamp of the newest sample that began to leave.
     newest: Timestamp,
 }
 
@@ -27,23 +27,23 @@ struct Departure {
 }
 
 impl Departures {
-    /// Entries and cap of the list.
+    /// Returns the length and cap of the list.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self { latest, newest: _ } = self;
         [Size::new("departures.latest", latest.len(), LIMIT)]
     }
 
-    /// Whether nothing of the sample of this source time has left before: for this destination or
-    /// another, or as a retransmission.
+    /// Returns whether no datagram of the sample with this source timestamp has left before, to any
+    /// destination or as a retransmission.
     pub fn is_first(&mut self, source: Timestamp) -> bool {
         let is_first = source > self.newest;
         self.newest = self.newest.max(source);
         is_first
     }
 
-    /// The sample has left whole for this place.
+    /// Records that the sample left completely for this destination.
     pub fn note(&mut self, number: u64, destination: Destination, at: Timestamp) {
         if self.latest.len() >= LIMIT {
             self.latest.pop_front();
@@ -55,7 +55,7 @@ impl Departures {
         });
     }
 
-    /// When it left for there.
+    /// Returns the time at which the sample left for this destination.
     #[must_use]
     pub fn find(&self, number: u64, destination: Destination) -> Option<Timestamp> {
         let mut latest = self.latest.iter().rev();

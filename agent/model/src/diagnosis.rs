@@ -1,10 +1,10 @@
-//! What is wrong with the graph, as far as discovery alone tells it: who cannot understand whom,
-//! which names are taken twice, who talks to nobody.
+//! Problems of the graph that discovery shows: incompatible endpoints, duplicate names, endpoints
+//! without a counterpart.
 //!
-//! Found anew only when discovery changed, topic by topic, endpoints that are alike taken together,
-//! within a budget of steps and a cap on what is kept: what did not fit is counted. A finding is a
-//! value: two lists tell by comparison what came and what went ([`changes`]). Whether a finding is
-//! worth waking somebody for is not decided here.
+//! Findings are computed when discovery changes, topic by topic. Endpoints with equal properties
+//! are grouped. Both the computing steps and the list of findings are bounded, and omitted findings
+//! are counted. A finding is a value, so comparing two lists yields the changes ([`changes`]). The
+//! severity of a finding is decided elsewhere.
 
 mod matching;
 
@@ -18,41 +18,41 @@ use super::topic_kind::TopicKind;
 pub(crate) use matching::effort;
 pub use matching::{Offer, Policies, Policy, Verdict, verdict};
 
-/// Which topic a finding is about.
+/// The topic of a finding.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TopicKey {
-    /// Its domain.
+    /// Domain of the topic.
     pub domain_id: DomainId,
-    /// Its DDS name: with the domain its identity.
+    /// DDS name; together with the domain it identifies the topic.
     pub dds_name: DdsName,
-    /// Its ROS name, or the DDS name.
+    /// ROS name, or the DDS name if the topic has none.
     pub name: TopicName,
-    /// What it is.
+    /// Role of the topic in ROS.
     pub kind: TopicKind,
 }
 
-/// One finding. What comes first in a variant identifies it, what comes last may change.
+/// A finding. The first fields of a variant identify it; the last one may change.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Diagnosis {
-    /// Writer and reader of one topic and type do not talk because of what they ask of each other.
+    /// A writer and a reader of one topic and type do not match because of their QoS.
     QosIncompatible {
         /// Topic.
         topic: TopicKey,
-        /// Who offers.
+        /// GUID of the writer, which offers less.
         writer: Guid,
-        /// Who requests more.
+        /// GUID of the reader, which requests more.
         reader: Guid,
-        /// In which policies.
+        /// Incompatible policies.
         policies: Policies,
     },
-    /// One topic with several types: those of different types do not talk.
+    /// A topic has several types; endpoints of different types do not match.
     TypeConflict {
         /// Topic.
         topic: TopicKey,
         /// ROS types, sorted.
         types: Vec<TypeName>,
     },
-    /// One type with several definitions: they do talk, and misread each other.
+    /// A type has several definitions; endpoints match but misread each other's messages.
     TypeHashConflict {
         /// Topic.
         topic: TopicKey,
@@ -61,94 +61,94 @@ pub enum Diagnosis {
         /// RIHS01 hashes, sorted.
         hashes: Vec<TypeHash>,
     },
-    /// Several nodes of one name in one domain.
+    /// Several nodes in one domain have the same name.
     DuplicateNode {
         /// Domain.
         domain_id: DomainId,
         /// Fully qualified name.
         node: NodeName,
-        /// The participant of each, sorted; one that has several of them is there as often.
+        /// The participant of each node, sorted; a participant with several such nodes is repeated.
         participants: Vec<Guid>,
     },
-    /// A writer whose samples go to no reader.
+    /// A writer without a matching reader.
     UnheardPublisher {
         /// Topic.
         topic: TopicKey,
-        /// Who.
+        /// GUID of the writer.
         writer: Guid,
-        /// Why.
+        /// The nearest mismatch.
         reason: Unmatched,
     },
-    /// A reader that gets samples of no writer.
+    /// A reader without a matching writer.
     UnfedSubscriber {
         /// Topic.
         topic: TopicKey,
-        /// Who.
+        /// GUID of the reader.
         reader: Guid,
-        /// Why.
+        /// The nearest mismatch.
         reason: Unmatched,
     },
-    /// One node that is in several domains: half of its topics are where nobody looks for them.
+    /// A node whose endpoints or names are in several domains, so nodes of one domain miss some.
     NodeInSeveralDomains {
         /// Fully qualified name.
         node: NodeName,
-        /// One of its participants, the lowest.
+        /// The lowest GUID among its participants.
         participant: Guid,
         /// Domains, sorted.
         domains: Vec<DomainId>,
     },
 }
 
-/// Why an endpoint has no counterpart: the reason that is nearest to a match.
+/// Why an endpoint has no counterpart: the mismatch that is nearest to a match.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Unmatched {
-    /// Somebody is there whose quality of service does not fit.
+    /// A counterpart exists, but its quality of service does not match.
     Qos,
-    /// Somebody is there with another type.
+    /// A counterpart exists, but with another type.
     Type,
-    /// Somebody is there in another partition.
+    /// A counterpart exists, but in another partition.
     Partition,
-    /// Nobody is there.
+    /// No counterpart exists.
     Nobody,
 }
 
-/// Writers and readers of a topic that a policy keeps apart.
+/// The pairs of a topic that one policy makes incompatible.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct QosPairs {
     /// Topic.
     pub topic: TopicKey,
-    /// In the way.
+    /// The incompatible policy.
     pub policy: Policy,
-    /// How many pairs, also of those that the list has no room for.
+    /// Number of pairs, including those that the list omits.
     pub pairs: u64,
 }
 
 /// All findings.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Diagnoses {
-    /// Sorted, each once.
+    /// Findings, sorted and without duplicates.
     pub list: Vec<Diagnosis>,
     /// Complete counts of incompatible pairs, sorted by topic and policy.
     pub qos_pairs: Vec<QosPairs>,
-    /// Findings that the list has no room for.
+    /// Findings omitted because the list is full.
     pub left_out: u64,
-    /// Pairs of kinds of endpoints that were not looked at because there are too many.
+    /// Pairs of endpoint groups that were not compared because there are too many.
     pub unexamined: u64,
 }
 
-/// How one finding differs between two lists.
+/// A difference between two lists of findings.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change<'a> {
-    /// It was not there before.
+    /// The finding is new.
     Appeared(&'a Diagnosis),
-    /// It is about the same, and says something else now.
+    /// The finding has the same identity but other details.
     Changed(&'a Diagnosis),
-    /// It is there no more; this is what it said last.
+    /// The finding is gone; this is its last value.
     Resolved(&'a Diagnosis),
 }
 
 impl Diagnosis {
-    /// All kinds, as labels.
+    /// All kinds, as label values.
     pub const KINDS: [&'static str; 7] = [
         "qos_incompatible",
         "type_conflict",
@@ -159,7 +159,7 @@ impl Diagnosis {
         "node_in_several_domains",
     ];
 
-    /// Label value.
+    /// Returns the kind as a label value.
     #[must_use]
     pub const fn kind(&self) -> &'static str {
         match self {
@@ -173,7 +173,7 @@ impl Diagnosis {
         }
     }
 
-    /// The topic it is about, if it is about one.
+    /// Returns the topic of the finding, if it concerns a topic.
     #[must_use]
     pub const fn topic(&self) -> Option<&TopicKey> {
         match self {
@@ -186,7 +186,7 @@ impl Diagnosis {
         }
     }
 
-    /// By what they are about, whatever they say. In agreement with the order of the list.
+    /// Compares identities only, without details. Consistent with the order of the list.
     #[must_use]
     pub fn cmp_identity(&self, other: &Self) -> Ordering {
         let place = |diagnosis: &Self| {
@@ -200,7 +200,7 @@ impl Diagnosis {
             .then_with(|| self.within_topic().cmp(&other.within_topic()))
     }
 
-    /// What tells findings of one kind and topic apart.
+    /// Returns the key that distinguishes findings of one kind and topic.
     fn within_topic(&self) -> (DomainId, &str, Option<Guid>, Option<Guid>) {
         match self {
             Self::QosIncompatible { writer, reader, .. } => {
@@ -221,7 +221,7 @@ impl Diagnosis {
 }
 
 impl Unmatched {
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -233,7 +233,7 @@ impl Unmatched {
     }
 }
 
-/// What happened between two lists, in their order.
+/// Returns the differences between two sorted lists, in their order.
 pub fn changes<'a>(
     before: &'a [Diagnosis],
     after: &'a [Diagnosis],

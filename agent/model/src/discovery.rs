@@ -1,9 +1,9 @@
-//! Who is there: participants, their endpoints and nodes, as discovery told.
+//! Discovered participants, their endpoints and their nodes.
 //!
-//! Identity comes from payloads. A participant lives until it is disposed or its lease ends; with
-//! it go its endpoints and nodes. An endpoint's life is its own: that its participant is announced
-//! again says nothing about it. Every table is capped: what was there before a flood of forgeries
-//! stays, and a newcomer that is worth no more is refused until there is room.
+//! Identity is read from payloads. A participant is removed, with its endpoints and nodes, when it
+//! is disposed or its lease expires. An endpoint lives on its own: a repeated announcement of its
+//! participant does not change it. Every table is capped. During a flood of forged announcements,
+//! existing entries stay and a newcomer of no higher priority is refused until an entry is free.
 
 mod disposals;
 mod endpoints;
@@ -38,21 +38,21 @@ pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
 
-/// Endpoints and nodes whose participant is not known yet: how many and how long.
+/// Most endpoints and node lists that wait for their participant.
 const PENDING: usize = 1024;
-/// Participants for which there was no room.
+/// Most participants that wait for a free entry.
 const APPLICANTS: usize = 128;
 const PENDING_NODES: usize = PENDING / 8;
-/// Bytes of those nodes together.
+/// Most bytes of waiting node lists.
 const PENDING_NODE_BYTES: usize = 1 << 20;
 const PENDING_FOR: u64 = 60 * SECOND;
-/// Longest topic or type name: `string<256>` in the builtin topics of DDS. What is longer is no
-/// name but an attempt on our memory.
+/// Longest topic or type name: `string<256>` in the builtin topics of DDS. Longer names are
+/// rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
 /// Most endpoints of one participant.
 const PER_PARTICIPANT: usize = 4096;
 
-/// Caps.
+/// Capacities of the tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Caps {
     /// Participants.
@@ -63,18 +63,18 @@ pub struct Caps {
     pub nodes: usize,
 }
 
-/// What the rest of the model has to follow up.
+/// A change that the rest of the model has to apply.
 #[derive(Debug)]
 pub enum Change {
-    /// An endpoint is there.
+    /// The endpoint is new.
     Appeared(Guid),
-    /// Its type or QoS is another.
+    /// The endpoint has another type or QoS.
     Changed(Guid),
-    /// It is no more.
+    /// The endpoint is gone.
     Gone(Guid, Box<Endpoint>),
 }
 
-/// An endpoint that came before its participant, or for which there was no room.
+/// An endpoint that waits for its participant or for a free entry.
 #[derive(Debug)]
 struct PendingEndpoint {
     at: Timestamp,
@@ -82,7 +82,7 @@ struct PendingEndpoint {
     announcement: Box<EndpointAnnouncement>,
 }
 
-/// Samples of `ros_discovery_info` that came before their participant.
+/// Samples of `ros_discovery_info` that wait for their participant.
 #[derive(Debug)]
 struct PendingNodes {
     at: Timestamp,
@@ -95,7 +95,7 @@ struct PendingNodes {
 
 /// All participants, endpoints and nodes.
 ///
-/// Boxed: a table in which much comes and goes has up to four places for each entry.
+/// Values are boxed: a hash table under churn allocates up to four slots per entry.
 #[derive(Debug)]
 pub struct Discovery {
     caps: Caps,
@@ -107,10 +107,10 @@ pub struct Discovery {
     pending_nodes: HashMap<GuidPrefix, PendingNodes>,
     disposals: Disposals,
     node_count: usize,
-    /// Writers and readers that nodes name.
+    /// Number of writers and readers that nodes list.
     named: usize,
     changes: Vec<Change>,
-    /// Counters of events.
+    /// Counters of discovery events.
     pub churn: Churn,
     evictions: Evictions,
     participant_victims: Victims,
@@ -119,21 +119,21 @@ pub struct Discovery {
     revision: u64,
 }
 
-/// Entries refused or given up because of a cap.
+/// Entries refused or evicted because a table was full.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Evictions {
     /// Participants.
     pub participants: u64,
-    /// Endpoints, pending ones included.
+    /// Endpoints, including waiting ones.
     pub endpoints: u64,
     /// Nodes.
     pub nodes: u64,
 }
 
 impl PendingNodes {
-    /// Bytes of the nodes.
+    /// Returns the bytes of the waiting nodes.
     fn held(&self) -> usize {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             at: _,
             writer: _,
@@ -147,7 +147,7 @@ impl PendingNodes {
 }
 
 impl Discovery {
-    /// Nothing discovered.
+    /// Creates an empty discovery.
     #[must_use]
     pub fn new(caps: Caps) -> Self {
         Self {
@@ -171,40 +171,40 @@ impl Discovery {
         }
     }
 
-    /// Rises with every change of what [`Self::memory`] says.
+    /// Returns a number that increases with every change of [`Self::memory`].
     #[must_use]
     pub const fn revision(&self) -> u64 {
         self.revision
     }
 
-    /// All participants.
+    /// Returns all participants.
     #[must_use]
     pub const fn participants(&self) -> &HashMap<GuidPrefix, Box<Participant>> {
         &self.participants
     }
 
-    /// All endpoints of known participants.
+    /// Returns all endpoints of known participants.
     #[must_use]
     pub const fn endpoints(&self) -> &HashMap<Guid, Box<Endpoint>> {
         &self.endpoints
     }
 
-    /// Nodes of all participants.
+    /// Returns the number of nodes of all participants.
     #[must_use]
     pub const fn node_count(&self) -> usize {
         self.node_count
     }
 
-    /// What the caps cost.
+    /// Returns the entries refused or evicted because a table was full.
     #[must_use]
     pub const fn evictions(&self) -> Evictions {
         self.evictions
     }
 
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             caps,
             watchlist: _,
@@ -267,7 +267,7 @@ impl Discovery {
             Size::new("discovery.pending_nodes.bytes", waiting, PENDING_NODE_BYTES),
             Size::new("discovery.nodes", nodes, caps.nodes),
             Size::new("discovery.nodes.named", named, caps.endpoints),
-            // Taken after each datagram.
+            // The changes are taken after each datagram.
             Size::new("discovery.changes", changes.len(), caps.endpoints),
         ];
         sizes.extend(disposals.sizes());
@@ -275,18 +275,18 @@ impl Discovery {
         sizes
     }
 
-    /// Whether this endpoint was disposed of a moment ago: what it sent may still be on its way.
+    /// Returns whether this endpoint was disposed so recently that its samples may still arrive.
     #[must_use]
     pub fn was_disposed(&self, guid: Guid, now: Timestamp) -> bool {
         self.disposals.is_recent(guid, now)
     }
 
-    /// What happened to endpoints since the last call.
+    /// Removes and returns the changes of endpoints since the last call.
     pub fn changes(&mut self) -> Vec<Change> {
         std::mem::take(&mut self.changes)
     }
 
-    /// Whether this participant is there, or something of it waits for room.
+    /// Returns whether this participant exists, or waits for a free entry.
     #[must_use]
     pub fn knows(&self, prefix: GuidPrefix) -> bool {
         let mut waiting = self.pending_endpoints.range(endpoints_of(prefix));
@@ -295,7 +295,7 @@ impl Discovery {
             || waiting.next().is_some()
     }
 
-    /// Topics that these name are worth more than others.
+    /// Sets the watchlist; topics that it names exactly have a higher priority.
     pub fn watch(&mut self, watchlist: Arc<Watchlist>) {
         self.watchlist = watchlist;
         let prefixes: Vec<_> = self.participants.keys().copied().collect();
@@ -312,8 +312,8 @@ impl Discovery {
         self.node_victims = Victims::default();
     }
 
-    /// Something of this participant was seen: its lease begins anew. Returns whether it is worth
-    /// more by that than it was: see [`Self::learn`].
+    /// Records a packet of this participant and renews its lease. Returns whether its priority
+    /// increased, as [`Self::learn`] does.
     pub fn seen(&mut self, prefix: GuidPrefix, at: Timestamp, evidence: Priority) -> bool {
         let priority = match self.participants.get_mut(&prefix) {
             Some(participant) => {
@@ -326,7 +326,7 @@ impl Discovery {
         priority.is_some_and(|priority| priority.or(evidence) != priority)
     }
 
-    /// A participant is worth more than it was. Returns whether it finds room by that.
+    /// Raises the priority of a participant. Returns whether it is admitted because of it.
     pub fn learn(
         &mut self,
         prefix: GuidPrefix,
@@ -346,14 +346,14 @@ impl Discovery {
         self.enter(prefix, participant, priority.or(evidence), at, journal)
     }
 
-    /// Asks anew which participants a socket of this host sends for.
+    /// Updates which participants a socket of this host sends for.
     pub fn locate(&mut self, is_local: impl Fn(&GuidPrefix) -> bool) {
         for (prefix, participant) in &mut self.participants {
             participant.local = is_local(prefix);
         }
     }
 
-    /// SPDP: it is there. `evidence` is what is known in its favour.
+    /// Records the SPDP announcement of a participant. `evidence` is its known priority.
     pub fn participant(
         &mut self,
         announcement: &ParticipantAnnouncement,
@@ -409,7 +409,7 @@ impl Discovery {
         self.enter(guid.prefix, participant, priority, origin.at, journal);
     }
 
-    /// SPDP: it says goodbye.
+    /// Records the SPDP disposal of a participant.
     pub fn participant_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
         if guid.entity != EntityId::PARTICIPANT {
             return;
@@ -419,7 +419,7 @@ impl Discovery {
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
-    /// Ends leases that have run out at `now`.
+    /// Removes participants whose lease has expired at `now`.
     pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) {
         let mut expired: Vec<_> = self
             .participants
@@ -427,7 +427,8 @@ impl Discovery {
             .filter_map(|(prefix, participant)| {
                 let lease = match participant.proxy.lease {
                     Duration::Finite(lease) => lease,
-                    // Who went while nobody looked is not believed in for ever.
+                    // The restored participant may have stopped while no agent ran, so its infinite
+                    // lease is limited.
                     Duration::Infinite if participant.restored.is_some() => FORSAKEN,
                     Duration::Infinite => return None,
                 };
@@ -448,7 +449,7 @@ impl Discovery {
         self.pending_nodes.retain(|_, pending| fresh(pending.at));
     }
 
-    /// Takes in a participant that is new; whether there is room for it. Else it waits for that.
+    /// Adds a new participant and returns true, or keeps it waiting if the table is full.
     fn enter(
         &mut self,
         prefix: GuidPrefix,
@@ -473,7 +474,7 @@ impl Discovery {
         true
     }
 
-    /// Takes a participant out with all it has; `event` is `None` for a silent eviction.
+    /// Removes a participant with its endpoints and nodes. `event` is `None` for a silent eviction.
     fn remove(
         &mut self,
         prefix: GuidPrefix,
@@ -510,7 +511,7 @@ impl Discovery {
         }
     }
 
-    /// A participant's domain is told better than before: all it has moves along.
+    /// Changes a participant's domain after a more reliable source, with its endpoints and nodes.
     fn move_to(&mut self, prefix: GuidPrefix, domain_id: DomainId, source: DomainSource) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
@@ -534,7 +535,7 @@ impl Discovery {
         self.rate(prefix);
     }
 
-    /// Asks anew which of a participant's endpoints are watched by name.
+    /// Updates which of a participant's endpoints are watched by exact name.
     fn rate(&mut self, prefix: GuidPrefix) {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
@@ -572,13 +573,13 @@ impl Discovery {
     }
 }
 
-/// All endpoints that this participant may have.
+/// Returns the range of GUIDs that this participant's endpoints can have.
 pub(super) const fn endpoints_of(prefix: GuidPrefix) -> RangeInclusive<Guid> {
     let [first, last] = [EntityId([0; 4]), EntityId([0xff; 4])];
     Guid::new(prefix, first)..=Guid::new(prefix, last)
 }
 
-/// Whether the DDS topic is watched by its exact name, in this domain or, with `None`, in any.
+/// Returns whether the DDS topic is watched by exact name, in this domain or, with `None`, in any.
 fn is_named(watchlist: &Watchlist, domain_id: Option<DomainId>, topic: &DdsTopic) -> bool {
     watchlist.has_names() && Naming::of(topic).is_named_by(domain_id, watchlist)
 }

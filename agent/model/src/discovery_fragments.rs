@@ -1,8 +1,8 @@
-//! Payloads of discovery samples that come in DATA_FRAGs: Cyclone DDS cuts from 1344 bytes on, and
-//! a participant with a few nodes says more than that in `ros_discovery_info`.
+//! Reassembly of discovery samples from DATA_FRAGs. Cyclone DDS fragments from 1344 bytes on, and
+//! `ros_discovery_info` of a participant with a few nodes exceeds that.
 //!
-//! Only for samples the model reads; measured ones never come here. Keeps bytes that came, within
-//! a budget, and forgets the oldest sample first.
+//! Only samples that the model reads are reassembled here; measured ones are not. Memory is bounded
+//! by the bytes that arrived and a budget; the oldest sample is dropped first.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -11,13 +11,13 @@ use ros2probe_wire::record::DataFrag;
 
 use super::size::Size;
 
-/// Largest sample kept; far more than any discovery data.
+/// Largest sample in bytes, far above any discovery data.
 const MAX_SAMPLE: u32 = 256 * 1024;
-/// All samples together.
+/// Budget in bytes for all samples.
 const BUDGET: usize = 1 << 20;
-/// Samples under way at once; real participants have one each, for a moment.
+/// Largest number of unfinished samples; real participants have one each, briefly.
 const SAMPLES: usize = 64;
-/// What keeping one fragment costs besides its bytes.
+/// Memory per fragment in addition to its bytes.
 const OVERHEAD: usize = 64;
 
 /// The unfinished samples, oldest first.
@@ -39,10 +39,10 @@ struct Sample {
 }
 
 impl DiscoveryFragments {
-    /// Entries, or bytes, and cap of every table.
+    /// Returns the size and cap of each table, in entries or bytes.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             samples,
             bytes: _,
@@ -70,13 +70,13 @@ impl DiscoveryFragments {
         ]
     }
 
-    /// Whether fragments of this sample were kept.
+    /// Returns whether fragments of this sample are kept.
     #[must_use]
     pub fn holds(&self, fragments: DataFrag<'_>) -> bool {
         self.place(fragments).is_some()
     }
 
-    /// Which fragments of this sample have not come, if some have; fragments count from 1.
+    /// Returns the missing fragments of a sample that has some, counted from 1.
     pub fn missing(&self, writer: Guid, number: u64) -> impl Iterator<Item = u32> + '_ {
         let mut samples = self.samples.iter();
         let sample = samples.find(|each| (each.writer, each.number) == (writer, number));
@@ -86,13 +86,13 @@ impl DiscoveryFragments {
         })
     }
 
-    /// Samples given up.
+    /// Returns the number of samples dropped.
     #[must_use]
     pub const fn evictions(&self) -> u64 {
         self.evictions
     }
 
-    /// Keeps the fragments of one DATA_FRAG; gives the payload when all have come.
+    /// Adds the fragments of a DATA_FRAG. Returns the payload once it is complete.
     pub fn put(&mut self, fragments: DataFrag<'_>, bytes: &[u8]) -> Option<Vec<u8>> {
         let (size, fragment_size) = (fragments.sample_size(), fragments.fragment_size());
         if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || fragments.starting() == 0 {
@@ -120,7 +120,7 @@ impl DiscoveryFragments {
                 } else {
                     fragment_size
                 };
-                // The last one may have padding behind it.
+                // The last fragment may have padding after it.
                 let Some(chunk) = chunk.get(..usize::try_from(last).ok()?) else {
                     break;
                 };

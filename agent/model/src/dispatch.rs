@@ -1,4 +1,4 @@
-//! A sample, or the reason why it is missing, as subscriptions get it.
+//! Samples, and reasons for missing ones, as subscriptions receive them.
 
 use std::sync::Arc;
 
@@ -14,84 +14,83 @@ use super::names::{DdsName, TopicName, TypeName};
 pub struct Topic {
     /// Domain.
     pub domain_id: DomainId,
-    /// ROS name, or the DDS name where it follows no ROS convention.
+    /// ROS name, or the DDS name if it follows no ROS convention.
     pub name: TopicName,
     /// DDS name.
     pub dds_name: DdsName,
     /// ROS name of the type, as in `sensor_msgs/msg/PointCloud2`.
     pub message_type: TypeName,
-    /// What the writer announced.
+    /// Properties that the writer announced.
     pub offered: Option<Arc<Offered>>,
 }
 
-/// What a writer announced with its topic.
+/// Properties that a writer announced with its topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Offered {
-    /// RIHS01 hash of its type; not before Iron.
+    /// RIHS01 hash of its type; announced since Iron.
     pub type_hash: Option<TypeHash>,
     /// Quality of service.
     pub qos: Arc<Qos>,
 }
 
-/// One message. Immutable, shared by all who want it.
+/// A message. It is immutable and shared by all subscriptions.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Sample {
     /// Its topic.
     pub topic: Arc<Topic>,
-    /// Of the datagram that completed it, or, where it waited for a lower number, of the moment in
-    /// which that came or was given up. Never goes back for one writer.
+    /// Capture time of the completing datagram. If the sample waited for a lower number, the time
+    /// at which that arrived or was given up. It never decreases for one writer.
     pub time: Timestamp,
-    /// Who wrote it.
+    /// GUID of its writer.
     pub writer: Guid,
-    /// Its number among those of this writer.
+    /// Its sequence number, counted by the writer.
     pub sequence_number: u64,
-    /// INFO_TS: when it was written, by the writer's clock.
+    /// INFO_TS: time of writing, by the writer's clock.
     pub source_timestamp: Option<Timestamp>,
-    /// Seconds and nanoseconds of its header, where the type begins with one.
+    /// Seconds and nanoseconds of its header, if the type begins with one.
     pub header_stamp: Option<(i32, u32)>,
-    /// Bytes of the serialized payload, encapsulation and padding included.
+    /// Size of the serialized payload in bytes, including encapsulation and padding.
     pub size: u32,
-    /// Seen in shared memory, where not every message is seen: the numbers before it that were not
-    /// given may have been sent all the same.
+    /// Sampled from shared memory: missing numbers before it may still have been sent.
     pub sampled: bool,
-    /// Those bytes, encapsulation included; `None` where only arrivals were asked for.
+    /// The payload, including encapsulation; `None` if the request excludes payloads.
     pub payload: Option<Bytes>,
 }
 
-/// Samples that were sent and are not given.
+/// Samples that were sent but are missing from the subscription.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Missed {
     /// Their topic.
     pub topic: Arc<Topic>,
-    /// Who wrote them.
+    /// GUID of their writer.
     pub writer: Guid,
-    /// Number of the first.
+    /// First sequence number.
     pub first: u64,
-    /// Number of the last.
+    /// Last sequence number.
     pub last: u64,
-    /// How many those are.
+    /// Number of missing samples in this range.
     pub samples: u64,
-    /// Why.
+    /// Reason.
     pub reason: MissedReason,
 }
 
-/// Why a sample is not given.
+/// Why a sample is missing from a subscription.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum MissedReason {
     /// Some of its fragments were never seen.
     Incomplete,
-    /// Nothing of it was seen, and it is lost.
+    /// No part of it was seen, and it is lost.
     Lost,
-    /// It came before its writer was announced, and not again.
+    /// It arrived before its writer's announcement and was not sent again.
     Unannounced,
-    /// It was counted, but its bytes were lost on the way to the agent or found no room.
+    /// It was counted, but its bytes were not captured or found no memory.
     NotCaptured,
-    /// Its reader was too slow.
+    /// The subscription's reader was too slow.
     QueueFull,
 }
 
 impl MissedReason {
-    /// All of them.
+    /// All reasons.
     pub const ALL: [Self; 5] = [
         Self::Incomplete,
         Self::Lost,
@@ -100,7 +99,7 @@ impl MissedReason {
         Self::QueueFull,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -113,20 +112,20 @@ impl MissedReason {
     }
 }
 
-/// What is to be given, and to which subscriptions.
+/// An outcome and the subscriptions that receive it.
 #[derive(Clone, Debug)]
 pub struct Dispatch {
     /// Ids of the requests.
     pub to: Arc<[u64]>,
-    /// What.
+    /// The sample, or why it is missing.
     pub outcome: SampleOutcome,
 }
 
-/// A sample, or that there is none.
+/// A sample, or the reason why it is missing.
 #[derive(Clone, Debug)]
 pub enum SampleOutcome {
-    /// It was counted.
+    /// The sample was counted.
     Sample(Arc<Sample>),
-    /// It will not come.
+    /// The sample will not arrive.
     Missed(Missed),
 }

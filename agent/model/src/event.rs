@@ -1,10 +1,10 @@
-//! What happened, for whoever wants to be told once rather than to ask how it stands: discovery
-//! churn, bursts of lost samples, changes of expectations.
+//! Events for consumers that follow changes instead of polling state: discovery churn, bursts of
+//! lost samples, changes of expectations.
 //!
-//! Facts without words: names, severities and attributes are the surface's. The events of a second
-//! are bounded for each class by itself, so that a storm of one leaves room for the others; what
-//! found no room is counted. The seconds are those of the source's clock: a capture gives the same
-//! events at any speed.
+//! Events are facts; the surface adds names, severities and attributes. Each class has its own
+//! bound per second, so a storm of one class leaves room for the others. Events beyond the bound
+//! are counted. Seconds follow the source's clock, so a capture yields the same events at any
+//! replay speed.
 
 use std::collections::BTreeMap;
 
@@ -20,36 +20,36 @@ use super::loss::Loss;
 use super::names::{DdsName, NodeName, TopicName, TypeName};
 use super::size::Size;
 
-/// Events of one class in a second of the source's clock.
+/// Largest number of events per class and second of the source's clock.
 const MOST: u16 = 512;
-/// So many wait that they should be taken before more comes.
+/// Number of waiting events above which they should be taken before further input.
 const MANY: usize = 1024;
-/// Writers whose losses of one second are added up.
+/// Largest number of writers whose losses within a second are combined.
 const BURSTS: usize = 1024;
-/// Longest text kept, as of a topic's name.
+/// Longest text kept in an event, such as a topic's name.
 pub(crate) const TEXT: usize = 256;
-/// Longest list kept, as of the participants of a duplicate node.
+/// Longest list kept in an event, such as the participants of a duplicate node.
 const LIST: usize = 8;
 
-/// One thing that happened.
+/// An event.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Event {
-    /// When, in the source's time.
+    /// Time, by the source's clock.
     pub at: Timestamp,
-    /// What.
+    /// Kind and details.
     pub kind: EventKind,
 }
 
-/// What happened.
+/// The kind of an event, with its details.
 #[derive(Clone, Debug, PartialEq)]
 pub enum EventKind {
-    /// A participant came, changed or went.
+    /// A participant appeared, changed or vanished.
     Participant {
-        /// How.
+        /// Kind of the change.
         change: churn::Event,
         /// Its domain.
         domain_id: DomainId,
-        /// Which one.
+        /// GUID of the participant.
         guid: Guid,
         /// Its implementation.
         vendor: VendorId,
@@ -58,13 +58,13 @@ pub enum EventKind {
         /// Process name, as announced.
         process: Option<Box<str>>,
     },
-    /// A writer or reader came, changed or went.
+    /// A writer or reader appeared, changed or vanished.
     Endpoint {
-        /// How.
+        /// Kind of the change.
         change: churn::Event,
         /// Its domain.
         domain_id: DomainId,
-        /// Which one.
+        /// GUID of the endpoint.
         guid: Guid,
         /// Writer or reader.
         role: Role,
@@ -73,50 +73,50 @@ pub enum EventKind {
         /// ROS type.
         message_type: TypeName,
     },
-    /// A node came or went.
+    /// A node appeared or vanished.
     Node {
-        /// How.
+        /// Kind of the change.
         change: churn::Event,
         /// Its domain.
         domain_id: DomainId,
-        /// The participant it lives in.
+        /// Participant of the node.
         participant: Guid,
         /// Fully qualified name.
         name: NodeName,
     },
-    /// A writer's samples of about one second were settled as lost.
+    /// Samples of a writer within about one second were settled as lost.
     Loss(LossBurst),
-    /// A watched topic stands otherwise than before with its watchlist entry.
+    /// A watched topic changed its state under a watchlist entry.
     Expectation {
         /// Its domain.
         domain_id: DomainId,
         /// ROS name.
         topic: TopicName,
-        /// The entry's pattern.
+        /// Pattern of the entry.
         watch: Box<str>,
-        /// How it stood; `None` when this is the first look.
+        /// Previous state; `None` at the first evaluation.
         from: Option<WatchState>,
-        /// How it stands.
+        /// New state.
         to: WatchState,
-        /// Which expectations are broken.
+        /// Violated expectations.
         violations: Vec<&'static str>,
     },
-    /// A watched topic is published and nothing came for longer than its entry allows.
+    /// A watched topic has a publisher, but no message arrived for longer than its entry allows.
     Silence {
         /// Its domain.
         domain_id: DomainId,
         /// ROS name.
         topic: TopicName,
-        /// The entry's pattern.
+        /// Pattern of the entry.
         watch: Box<str>,
-        /// When its last message came, if any did.
+        /// Time of the last message; `None` before the first.
         last_message: Option<Timestamp>,
     },
-    /// Something is wrong with the graph, in another way than before, or not any more.
+    /// A problem of the graph appeared, changed or was resolved.
     Diagnosis {
-        /// It is not any more.
+        /// Whether the problem is resolved.
         resolved: bool,
-        /// What it is, or was last.
+        /// The problem, in its last form.
         finding: Diagnosis,
     },
 }
@@ -124,17 +124,17 @@ pub enum EventKind {
 /// Lost samples of one writer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LossBurst {
-    /// Whose.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// Domain and DDS topic, where the writer was announced.
+    /// Domain and DDS topic, if the writer was announced.
     pub topic: Option<(DomainId, DdsName)>,
-    /// Its node, where that is known.
+    /// Node of the writer, if known.
     pub node: Option<NodeName>,
-    /// How many.
+    /// Number of lost samples.
     pub count: u64,
     /// First lost sequence number.
     pub first: u64,
-    /// Last lost sequence number; between them others may have come.
+    /// Last lost sequence number; samples in between may have arrived.
     pub last: u64,
 }
 
@@ -155,16 +155,16 @@ pub enum Class {
     Diagnosis,
 }
 
-/// What was taken.
+/// Events removed from the queue.
 #[derive(Debug, Default)]
 pub struct Taken {
-    /// In the order in which it was noticed.
+    /// Events in the order in which they were detected.
     pub events: Vec<Event>,
-    /// Events that found no room, by class.
+    /// Number of events beyond the bound, by class.
     pub overflow: Vec<(Class, u64)>,
 }
 
-/// Events that wait to be taken, and losses that are being added up.
+/// Events that wait to be taken, and losses that are being combined.
 #[derive(Debug, Default)]
 pub struct Events {
     waiting: Vec<Event>,
@@ -172,7 +172,7 @@ pub struct Events {
     bursts: BTreeMap<Guid, Burst>,
 }
 
-/// What one class has.
+/// State of one class.
 #[derive(Clone, Copy, Debug, Default)]
 struct ClassQuota {
     second: u64,
@@ -180,7 +180,7 @@ struct ClassQuota {
     overflow: u64,
 }
 
-/// A burst that has not ended.
+/// A burst of losses that is still growing.
 #[derive(Debug)]
 struct Burst {
     at: Timestamp,
@@ -188,7 +188,7 @@ struct Burst {
 }
 
 impl Class {
-    /// All of them.
+    /// All classes.
     pub const ALL: [Self; 6] = [
         Self::Participant,
         Self::Endpoint,
@@ -200,7 +200,7 @@ impl Class {
 }
 
 impl EventKind {
-    /// Its class.
+    /// Returns the class of this event.
     #[must_use]
     pub const fn class(&self) -> Class {
         match self {
@@ -215,11 +215,12 @@ impl EventKind {
 }
 
 impl Events {
-    /// Adds one, if there is quota.
+    /// Adds an event if its class has quota left.
     pub fn push(&mut self, at: Timestamp, kind: EventKind) {
         let quota = self.classes.entry(kind.class()).or_default();
         let second = at.0 / SECOND;
-        // What is settled late belongs to the second before; further back the clock was set.
+        // A late decision may belong to the second before. An earlier second means that the clock
+        // was set.
         if second != quota.second && second.checked_add(1) != Some(quota.second) {
             (quota.second, quota.in_second) = (second, 0);
         }
@@ -231,11 +232,11 @@ impl Events {
         self.waiting.push(Event { at, kind });
     }
 
-    /// Entries and cap of every list. They are taken when `MANY` wait, and one datagram or tick
-    /// adds at most `MOST` of each class and second.
+    /// Returns the length and cap of each list. Events are taken when `MANY` wait, and one datagram
+    /// or tick adds at most `MOST` of each class and second.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             waiting,
             classes,
@@ -249,13 +250,13 @@ impl Events {
         ]
     }
 
-    /// So many wait to be taken that nothing more should be given to the model before.
+    /// Returns whether so many events wait that they should be taken before further input.
     #[must_use]
     pub const fn are_many(&self) -> bool {
         self.waiting.len() >= MANY
     }
 
-    /// Adds a loss to its writer's burst.
+    /// Adds a loss to the burst of its writer.
     pub fn lose(&mut self, loss: &Loss) {
         let count = loss.last.saturating_sub(loss.first).saturating_add(1);
         if let Some(burst) = self.bursts.get_mut(&loss.writer) {
@@ -286,14 +287,14 @@ impl Events {
         );
     }
 
-    /// This writer is no more: its burst, if there is one, was on this topic.
+    /// Sets the topic of the burst of a writer that is gone.
     pub fn name(&mut self, writer: Guid, domain_id: DomainId, topic: &DdsName) {
         if let Some(burst) = self.bursts.get_mut(&writer) {
             burst.losses.topic = Some((domain_id, topic.clone()));
         }
     }
 
-    /// Ends all bursts; `complete` adds what is known of their writers.
+    /// Ends all bursts. `complete` fills in what is known about the writers.
     pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
         for (_, Burst { at, mut losses }) in std::mem::take(&mut self.bursts) {
             complete(&mut losses);
@@ -301,7 +302,7 @@ impl Events {
         }
     }
 
-    /// Everything since the last call.
+    /// Removes and returns all events since the last call.
     pub fn take(&mut self) -> Taken {
         let classes = self.classes.iter_mut();
         let overflow = classes.map(|(class, quota)| (*class, std::mem::take(&mut quota.overflow)));
@@ -312,14 +313,14 @@ impl Events {
     }
 }
 
-/// The text, or as much of it as is kept.
+/// Returns the text, truncated to the longest that is kept.
 #[must_use]
 pub fn bounded(text: &str) -> &str {
     text.get(..text.floor_char_boundary(TEXT))
         .unwrap_or_default()
 }
 
-/// A finding with no more of its lists than is kept.
+/// Returns the finding, with its lists truncated to the longest that are kept.
 #[must_use]
 pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
     let mut finding = finding.clone();
@@ -414,7 +415,7 @@ mod tests {
         let taken = events.take();
         assert_eq!(taken.events.len(), usize::from(MOST) + 1);
         assert_eq!(taken.overflow, [(Class::Node, 7)]);
-        // Taken or not, the second has had its share; the next one has its own.
+        // Taking events does not renew the quota of a second; the next second has its own.
         events.push(Timestamp(SECOND - 1), node("/b"));
         assert_eq!(events.take().overflow, [(Class::Node, 1)]);
         events.push(Timestamp(SECOND), node("/b"));

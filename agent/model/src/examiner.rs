@@ -1,5 +1,5 @@
-//! Finds what is wrong with the graph: examines discovery and topics when they changed, and keeps
-//! what it finds within caps.
+//! Finds problems of the graph: examines discovery and topics after changes, and keeps findings
+//! within caps.
 
 mod endpoints;
 mod nodes;
@@ -17,27 +17,27 @@ use crate::size::Size;
 use crate::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
-/// How long an endpoint is alone before that is a finding: nodes start one after another.
+/// Time that an endpoint may be without a counterpart, since nodes start one after another.
 const PATIENCE: u64 = 5 * SECOND;
-/// Most findings kept of each kind.
+/// Largest number of findings kept of each kind.
 const PER_KIND: usize = 256;
-/// Most series of incompatible pairs.
+/// Largest number of series for incompatible pairs.
 const MAX_QOS_PAIRS: usize = 1024;
-/// Steps that one look may take, some ten nanoseconds each, and how many for one topic.
+/// Largest number of steps per examination, about ten nanoseconds each, and per topic.
 const STEPS: usize = 500_000;
 const STEPS_PER_TOPIC: usize = 50_000;
 
-/// Finds what is wrong whenever something has changed.
+/// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Discovery's revision at the last look.
+    /// Revision of discovery at the last examination.
     revision: Option<u64>,
-    /// When patience ends with somebody who is alone.
+    /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<Timestamp>,
-    /// Since when who is alone.
+    /// Time since which each endpoint is unmatched.
     alone: HashMap<Guid, Timestamp>,
     current: Arc<Diagnoses>,
-    /// When each of them was found.
+    /// Time at which each finding appeared.
     since: Arc<Vec<Timestamp>>,
     left_out: u64,
 }
@@ -50,35 +50,35 @@ struct Findings {
     qos_pairs: Vec<QosPairs>,
     left_out: u64,
     unexamined: u64,
-    /// Steps that may still be taken, and how many for this topic.
+    /// Remaining steps, in total and for this topic.
     steps: usize,
     steps_here: usize,
 }
 
 impl Examiner {
-    /// The findings of the last look.
+    /// Returns the findings of the last examination.
     #[must_use]
     pub const fn current(&self) -> &Arc<Diagnoses> {
         &self.current
     }
 
-    /// When each of them was found, in their order.
+    /// Returns the time at which each finding appeared, in the order of the findings.
     #[must_use]
     pub const fn since(&self) -> &Arc<Vec<Timestamp>> {
         &self.since
     }
 
-    /// How many findings there are, the cap, and how many had no room so far.
+    /// Returns the number of findings, their cap, and how many were omitted so far.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
         let limit = PER_KIND * Diagnosis::KINDS.len();
         (self.current.list.len(), limit, self.left_out)
     }
 
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     #[must_use]
     pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             revision: _,
             due: _,
@@ -94,12 +94,12 @@ impl Examiner {
         ]
     }
 
-    /// Looks again the next time, whatever discovery says of itself.
+    /// Forces the next examination, even if discovery has not changed.
     pub fn forget(&mut self) {
         self.revision = None;
     }
 
-    /// Looks, unless nothing has changed since the last time.
+    /// Examines the graph if anything has changed since the last time.
     pub fn examine(&mut self, discovery: &Discovery, topics: &Topics, now: Timestamp) {
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == Some(discovery.revision()) && !is_due {
@@ -135,7 +135,7 @@ impl Examiner {
     }
 }
 
-/// When each of `after` was found: what was there before keeps its time.
+/// Returns the time at which each finding in `after` appeared; known findings keep theirs.
 fn since(
     before: &[Diagnosis],
     times: &[Timestamp],
@@ -168,7 +168,7 @@ impl Findings {
         }
     }
 
-    /// One more, if its kind has room.
+    /// Adds a finding if its kind has room.
     fn add(&mut self, diagnosis: Diagnosis) {
         let kinds = Diagnosis::KINDS.iter().zip(&mut self.counts);
         let mut own = kinds.filter(|(kind, _)| **kind == diagnosis.kind());
@@ -181,17 +181,17 @@ impl Findings {
         }
     }
 
-    /// As many more of which only the number is known.
+    /// Counts findings that are omitted.
     const fn leave_out(&mut self, count: u64) {
         self.left_out += count;
     }
 
-    /// Another topic is looked at.
+    /// Starts the step budget of the next topic.
     const fn turn(&mut self) {
         self.steps_here = STEPS_PER_TOPIC;
     }
 
-    /// Whether so many steps may still be taken; takes them.
+    /// Spends steps; returns false if the budget is exhausted.
     const fn spend(&mut self, steps: usize) -> bool {
         let may = steps <= self.steps && steps <= self.steps_here;
         if may {
@@ -215,8 +215,8 @@ impl Findings {
     }
 }
 
-/// Domains of which it is known that not everything is known: a ROS participant lives there of
-/// which no endpoint was announced in the agent's hearing, although each has some.
+/// Returns the domains that are known only in part: a ROS participant there has no announced
+/// endpoint, although each has some.
 fn half_known(discovery: &Discovery) -> BTreeSet<DomainId> {
     let participants = discovery.participants().values();
     let silent = participants.filter(|participant| {

@@ -1,18 +1,18 @@
-//! Whether a watched topic does what its watchlist entry expects.
+//! Evaluates the expectations of watchlist entries on their topics.
 //!
-//! Judged once a second of the source's clock. One bad second is no violation and one good second
-//! no recovery: it takes `BAD` and `GOOD` in a row. Rates are judged over a window that holds
-//! at least three expected messages (1 to 10 s), one message of tolerance at its edges, so that a
-//! healthy periodic topic never wavers. Silence has its own time and needs no further patience.
+//! Evaluation takes place once per second of the source's clock. A topic becomes violated after
+//! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
+//! window of at least three expected messages (1 to 10 s). One message of tolerance at the window's
+//! edges keeps a healthy periodic topic stable. Silence has its own time and no hysteresis.
 
 use ros2probe_wire::Timestamp;
 
 use super::rate::{SECONDS, Slot};
 use crate::watch::Expectations;
 
-/// Consecutive bad judgements until a topic is violated.
+/// Bad evaluations in a row until a topic is violated.
 const BAD: u8 = 2;
-/// Consecutive good ones until it is not any more.
+/// Good evaluations in a row until it recovers.
 const GOOD: u8 = 3;
 const NAMES: [&str; 5] = [
     "min_rate_hz",
@@ -30,38 +30,38 @@ const MAX_SILENCE: u8 = 1 << 4;
 /// State of one watchlist entry's expectations on one topic.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum WatchState {
-    /// All expectations hold (or there are none) and messages flow.
+    /// All expectations hold, or the entry has none, and messages arrive.
     Ok,
-    /// At least one expectation is broken, after hysteresis.
+    /// At least one expectation is violated, after hysteresis.
     Violated,
-    /// Publishers exist but nothing came for longer than `max_silence_s`.
+    /// A publisher exists, but no message arrived for longer than `max_silence_s`.
     Silent,
     /// No publisher is known.
     NotPublished,
-    /// Published, but nobody subscribes: writers may send nothing at all.
+    /// A publisher exists, but no subscriber; most writers then send nothing.
     NoSubscriber,
 }
 
-/// What a topic is judged by.
+/// The facts that an evaluation uses.
 pub struct Evidence<'a> {
-    /// When.
+    /// Time of the evaluation.
     pub now: Timestamp,
-    /// Live writers.
+    /// Number of live writers.
     pub publishers: usize,
-    /// Live readers.
+    /// Number of live readers.
     pub subscriptions: usize,
-    /// Last message of any writer.
+    /// Time of the last message of any writer.
     pub last_message: Option<Timestamp>,
-    /// Since when it has had a writer and been watched.
+    /// Time since which the topic has a writer and is watched.
     pub since: Timestamp,
-    /// Counts of the last whole seconds and how many those are.
+    /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
 }
 
-/// How one topic stands with one entry.
+/// State of one topic under one entry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Judgement {
-    /// Nothing was judged yet.
+    /// Whether no evaluation has taken place.
     fresh: bool,
     state: WatchState,
     violated: bool,
@@ -80,7 +80,7 @@ impl WatchState {
         Self::NoSubscriber,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -107,13 +107,13 @@ impl Default for Judgement {
 }
 
 impl Judgement {
-    /// The state.
+    /// Returns the state.
     #[must_use]
     pub const fn state(&self) -> WatchState {
         self.state
     }
 
-    /// Which expectations are broken.
+    /// Returns the keys of the violated expectations.
     #[must_use]
     pub fn violations(&self) -> Vec<&'static str> {
         let broken = |bit: &usize| self.broken & 1 << bit != 0;
@@ -123,8 +123,8 @@ impl Judgement {
             .collect()
     }
 
-    /// Judges once more. When the state is another one than before, gives that; at the first look,
-    /// which has none before, a state that is not the good one counts as a change.
+    /// Evaluates the topic. Returns the new state if it differs from the previous one. At the first
+    /// evaluation, any state but `Ok` counts as a change.
     pub fn judge(
         &mut self,
         expectations: &Expectations,
@@ -157,7 +157,8 @@ impl Judgement {
         };
         match self.state {
             WatchState::Silent => self.broken = broken,
-            // While it holds on without a broken expectation, the last ones stand.
+            // In a violated state without a currently violated expectation, the last ones stay
+            // listed.
             WatchState::Violated if broken != 0 => self.broken = broken,
             WatchState::Violated => {}
             _ => self.broken = 0,
@@ -209,7 +210,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
     broken
 }
 
-/// Whole seconds in which three messages of this rate are due.
+/// Returns the number of whole seconds in which three messages at this rate are due.
 fn window(rate: f64) -> u64 {
     let seconds = (3.0 / rate.max(0.01)).ceil();
     (1..SECONDS)
@@ -243,7 +244,7 @@ mod tests {
             }
         }
 
-        /// One second with these counts.
+        /// Evaluates one second with these counts.
         fn second(&mut self, slot: Slot) -> WatchState {
             self.now += SECOND;
             if slot.messages > 0 {
@@ -297,7 +298,7 @@ mod tests {
             ..Expectations::default()
         });
         for messages in [20, 19, 21, 20, 20, 19] {
-            // 19 and 21 are what jitter makes of 20 at the window's edges.
+            // With jitter, the window contains 19 to 21 messages instead of 20.
             let state = bench.second(rate(messages));
             assert!(matches!(state, WatchState::Ok | WatchState::Violated));
         }

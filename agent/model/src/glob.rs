@@ -1,18 +1,18 @@
-//! Globs over topic names: `*` stands for any characters within one token, `**` for whole tokens.
+//! Globs over topic names: `*` matches any characters within a token, `**` matches whole tokens.
 //!
-//! Matching reads the pattern's text and the name and allocates nothing. Within a token it takes
-//! time in proportion to both lengths; a run of tokens between two `**` is tried at each token of
-//! the name. So a pattern costs no more memory than its text, whoever sends it.
+//! Matching allocates nothing. Within a token it takes time proportional to the product of both
+//! lengths. The tokens between two `**` are tried at each token of the name. A pattern needs no
+//! more memory than its text, even if it is hostile.
 
-/// Between two runs of tokens.
+/// Separates two groups of tokens.
 const ANY_TOKENS: &str = "/**";
 
-/// Returns whether `pattern` covers `name`: both are absolute, or begin alike before the first
-/// slash, as DDS names do (`rq/**`). What a pattern covers that [`crate::watch::check_pattern`]
-/// refuses is not specified.
+/// Returns whether `pattern` covers `name`. Both are absolute, or begin with the same prefix before
+/// the first slash, as DDS names do (`rq/**`). The result is unspecified for patterns that
+/// [`crate::watch::check_pattern`] rejects.
 ///
-/// `**` at the end covers at least one token, elsewhere also none: `/a/**` does not cover `/a`,
-/// `/a/**/b` covers `/a/b`.
+/// A final `**` covers at least one token; elsewhere it also covers none. `/a/**` does not cover
+/// `/a`, and `/a/**/b` covers `/a/b`.
 #[must_use]
 pub fn covers(pattern: &str, name: &str) -> bool {
     let beginning = |text: &str| text.find('/').unwrap_or(text.len());
@@ -30,7 +30,7 @@ fn covers_tokens(pattern: &str, name: &str) -> bool {
     };
     let (between, last) = others.rsplit_once(ANY_TOKENS).unwrap_or(("", others));
     if last.is_empty() {
-        // Covered by `**`; the runs before it leave that much.
+        // `**` covers these tokens; the groups before it match the rest.
         let Some(end) = rest.rfind('/') else {
             return false;
         };
@@ -45,8 +45,7 @@ fn covers_tokens(pattern: &str, name: &str) -> bool {
     strip_tokens(after, last) == Some("") && strip_runs(rest, between).is_some()
 }
 
-/// What is left of `name` behind the first places where these runs of tokens match, one after
-/// another.
+/// Returns the rest of `name` after the first positions at which these groups match in order.
 fn strip_runs<'a>(name: &'a str, runs: &str) -> Option<&'a str> {
     let mut rest = name;
     for run in runs.split(ANY_TOKENS).filter(|run| !run.is_empty()) {
@@ -62,7 +61,7 @@ fn strip_runs<'a>(name: &'a str, runs: &str) -> Option<&'a str> {
     Some(rest)
 }
 
-/// What is left of `name` if its first tokens are those of `run`.
+/// Returns the rest of `name` if its first tokens match those of `run`.
 fn strip_tokens<'a>(name: &'a str, run: &str) -> Option<&'a str> {
     let mut rest = name;
     for pattern in run.split('/').skip(1) {
@@ -75,20 +74,20 @@ fn strip_tokens<'a>(name: &'a str, run: &str) -> Option<&'a str> {
     Some(rest)
 }
 
-/// The first token of `name` without its slash, and what is left.
+/// Returns the first token of `name` without its slash, and the rest.
 fn strip_token(name: &str) -> Option<(&str, &str)> {
     let name = name.strip_prefix('/')?;
     let end = name.find('/').unwrap_or(name.len());
     Some(name.split_at(end))
 }
 
-/// Where the last `count` tokens of `name` begin.
+/// Returns the offset of the last `count` tokens of `name`.
 fn last_tokens(name: &str, count: usize) -> Option<usize> {
     let mut slashes = name.rmatch_indices('/').map(|(at, _)| at);
     slashes.nth(count.checked_sub(1)?)
 }
 
-/// Whether `pattern`, in which `*` stands for any characters, covers the whole of `token`.
+/// Returns whether `pattern`, in which `*` matches any characters, covers the whole `token`.
 fn covers_token(pattern: &str, token: &str) -> bool {
     let Some((first, others)) = pattern.split_once('*') else {
         return pattern == token;
@@ -117,7 +116,7 @@ mod tests {
     use super::*;
     use crate::watch::check_pattern;
 
-    /// What another implementation says, which builds an automaton.
+    /// Matches with an independent implementation, which builds an automaton.
     fn reference(pattern: &str, name: &str) -> bool {
         let glob = GlobBuilder::new(pattern).literal_separator(true).build();
         glob.unwrap().compile_matcher().is_match(name)
@@ -160,7 +159,7 @@ mod tests {
     fn a_pattern_full_of_stars_costs_no_more_than_its_text() {
         let pattern = format!("/{}", "*a".repeat(127));
         let name = format!("/{}b", "a".repeat(253));
-        // A matcher that tries every way does not end here, an automaton takes megabytes.
+        // A backtracking matcher would not finish here, and an automaton would take megabytes.
         assert!(!covers(&pattern, &name));
     }
 
@@ -171,7 +170,7 @@ mod tests {
             name in "[ab]{0,2}(/[ab]{0,4}){0,7}",
         ) {
             prop_assume!(check_pattern(&pattern).is_ok());
-            // Two `**` in a row say nothing that one does not.
+            // Two adjacent `**` mean the same as one.
             prop_assume!(!pattern.contains("/**/**"));
             prop_assert_eq!(covers(&pattern, &name), reference(&pattern, &name));
         }

@@ -1,16 +1,16 @@
-//! Which ROS types begin with a `std_msgs/Header`, and whether a stamp can be one.
+//! ROS types that begin with a `std_msgs/Header`, and the plausibility of its stamp.
 //!
-//! The agent has no message definitions on the metering path, so this is a list: the types of the
-//! common interface packages whose first field is a header. A type that is not on it has no header
-//! latency; a stamp that is implausible (simulated time, an unset header) is left out.
+//! Message definitions are not available while messages are measured, so this module lists the
+//! types of the common interface packages that begin with a header. Other types have no header
+//! latency. Implausible stamps, such as simulated time or an unset header, are ignored.
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
-/// Stamps further than this from the capture time are not the same clock.
+/// A stamp that differs more than this from the capture time comes from another clock.
 pub const PLAUSIBLE: u64 = 3600 * SECOND;
 
-/// Types outside `sensor_msgs` and `geometry_msgs`.
+/// Types from packages other than `sensor_msgs` and `geometry_msgs`.
 const OTHERS: [&str; 37] = [
     "ackermann_msgs/msg/AckermannDriveStamped",
     "actionlib_msgs/msg/GoalStatusArray",
@@ -51,7 +51,7 @@ const OTHERS: [&str; 37] = [
     "visualization_msgs/msg/Marker",
 ];
 
-/// The messages of `sensor_msgs` that are parts of others and have no header.
+/// Messages of `sensor_msgs` that are parts of others and have no header.
 const SENSOR_PARTS: [&str; 7] = [
     "ChannelFloat32",
     "JoyFeedback",
@@ -62,7 +62,7 @@ const SENSOR_PARTS: [&str; 7] = [
     "RegionOfInterest",
 ];
 
-/// Whether messages of this ROS type begin with a header.
+/// Returns whether messages of this ROS type begin with a header.
 #[must_use]
 pub fn begins_with_header(message_type: &str) -> bool {
     if let Some(name) = message_type.strip_prefix("sensor_msgs/msg/") {
@@ -74,7 +74,7 @@ pub fn begins_with_header(message_type: &str) -> bool {
     OTHERS.binary_search(&message_type).is_ok()
 }
 
-/// The stamp as a time, if it can be of the clock that `now` is of.
+/// Returns the stamp as a time, or `None` if it comes from another clock than `now`.
 #[must_use]
 pub fn stamp_time((seconds, nanoseconds): (i32, u32), now: Timestamp) -> Option<Timestamp> {
     let seconds = u64::try_from(seconds).ok()?;

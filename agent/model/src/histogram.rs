@@ -1,19 +1,19 @@
 //! A histogram with fixed bounds: exact counts, a few hundred bytes, mergeable.
 
-/// Upper bounds in seconds: 1-2-5 steps from 100 µs to 10 s. They cover a 1 kHz controller's jitter
-/// and a 0.1 Hz diagnostic alike.
+/// Upper bounds in seconds: 1-2-5 steps from 100 µs to 10 s. They fit the jitter of a 1 kHz
+/// controller as well as a 0.1 Hz diagnostic.
 pub const BOUNDS: [f64; 16] = [
     0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0,
     10.0,
 ];
 
-/// Upper bounds for what happens within one host: the same steps from 10 µs to 1 s.
+/// Upper bounds for durations within one host: the same steps from 10 µs to 1 s.
 pub const FINE_BOUNDS: [f64; 16] = [
     0.00001, 0.00002, 0.00005, 0.0001, 0.0002, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1,
     0.2, 0.5, 1.0,
 ];
 
-/// Counts by [`BOUNDS`] or [`FINE_BOUNDS`], plus one for what lies above the last.
+/// Counts by [`BOUNDS`] or [`FINE_BOUNDS`], and one for values above the last bound.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Histogram {
     fine: bool,
@@ -24,7 +24,7 @@ pub struct Histogram {
 }
 
 impl Histogram {
-    /// Empty, with [`FINE_BOUNDS`].
+    /// Creates an empty histogram with [`FINE_BOUNDS`].
     #[must_use]
     pub fn fine() -> Self {
         Self {
@@ -33,7 +33,7 @@ impl Histogram {
         }
     }
 
-    /// Takes in one value, in seconds.
+    /// Adds a value in seconds.
     pub fn observe(&mut self, seconds: f64) {
         if self.count() == 0 {
             (self.minimum, self.maximum) = (seconds, seconds);
@@ -47,7 +47,7 @@ impl Histogram {
         self.maximum = self.maximum.max(seconds);
     }
 
-    /// Adds all of `other`, which has the same bounds.
+    /// Adds all values of `other`, which must have the same bounds.
     pub fn merge(&mut self, other: &Self) {
         if other.count() == 0 {
             return;
@@ -64,12 +64,12 @@ impl Histogram {
         self.maximum = self.maximum.max(other.maximum);
     }
 
-    /// What was observed after `earlier`, which is this one as it was before. Its range is not
-    /// known.
+    /// Returns the values added since `earlier`, an older state of this histogram. Its range is
+    /// unknown.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
-        // Begun anew meanwhile: all of it is new.
+        // The histogram was reset, so all values are new.
         if self.count() < earlier.count() {
             return difference;
         }
@@ -80,8 +80,8 @@ impl Histogram {
         difference
     }
 
-    /// The value below which this part of the values lies, as Prometheus estimates it: evenly
-    /// spread within the bucket. `f64::MAX` where it lies above all bounds.
+    /// Estimates the value below which this share of the values lies, as Prometheus does: values
+    /// are spread evenly within a bucket. Returns `f64::MAX` if it lies above all bounds.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
     pub fn quantile(&self, part: f64) -> f64 {
@@ -100,25 +100,25 @@ impl Histogram {
         lower
     }
 
-    /// How many values.
+    /// Returns the number of values.
     #[must_use]
     pub fn count(&self) -> u64 {
         self.counts.iter().sum()
     }
 
-    /// Their sum in seconds.
+    /// Returns the sum of the values in seconds.
     #[must_use]
     pub const fn sum(&self) -> f64 {
         self.sum
     }
 
-    /// Smallest and largest value; `None` while empty.
+    /// Returns the smallest and largest value, or `None` if the histogram is empty.
     #[must_use]
     pub fn range(&self) -> Option<(f64, f64)> {
         (self.count() > 0).then_some((self.minimum, self.maximum))
     }
 
-    /// `(upper bound, values in this bucket)`, not cumulative; the last bound is infinite.
+    /// Returns `(upper bound, values in this bucket)`, not cumulative; the last bound is infinite.
     pub fn buckets(&self) -> impl Iterator<Item = (f64, u64)> + '_ {
         self.bounds()
             .iter()

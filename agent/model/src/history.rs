@@ -1,8 +1,7 @@
-//! What was measured in each of the last seconds, so that charts that are opened after an incident
-//! show the incident.
+//! Measurements of the last seconds, so that charts opened after an incident show it.
 //!
-//! A second is immutable once it is taken: readers share it with the ring and never hold the
-//! capture up. Rows are bounded in number; seconds of many topics reach back less far.
+//! A finished second is immutable: readers share it with the ring and never block the capture. The
+//! number of rows is bounded, so many topics shorten the history.
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
@@ -17,46 +16,46 @@ use super::rate::SECONDS as WINDOW;
 use super::size::Size;
 use super::snapshot::TableFacts;
 
-/// Rows of all seconds together, 24 bytes each: 10 minutes of 436 topics.
+/// Largest number of rows in all seconds, 24 bytes each: 10 minutes of 436 topics.
 const ROWS: usize = 262_144;
-/// Names that are known, for each topic that may be measured: one that is measured no more is kept
-/// until there are twice as many.
+/// Topic names kept per topic that may be measured. Names of topics that are not measured any more
+/// stay until this factor is reached.
 const NAMES: usize = 2;
 
-/// The ring.
+/// A ring of the last seconds.
 #[derive(Debug)]
 pub struct History {
-    /// How many seconds are kept.
+    /// Number of seconds that are kept.
     span: usize,
-    /// Topics that can be named.
+    /// Largest number of topic names.
     most: usize,
     seconds: VecDeque<Arc<Second>>,
     rows: usize,
     names: Arc<Names>,
     before: HashMap<u32, PreviousTotals>,
-    /// The last id that was given away.
+    /// The id assigned last.
     last: u32,
-    /// Topics whose past was given up for want of room.
+    /// Topics whose history was dropped because the ring was full.
     evictions: u64,
 }
 
-/// The ring as it is at one moment, for readers.
+/// The state of the ring at one moment, for readers.
 #[derive(Clone, Debug, Default)]
 pub struct Past {
     names: Arc<Names>,
     seconds: Vec<Arc<Second>>,
 }
 
-/// What was measured in one second.
+/// Measurements of one second.
 #[derive(Debug, Default)]
 pub struct Second {
-    /// Its end, in the source's clock.
+    /// End of the second, by the source's clock.
     pub at: Timestamp,
-    /// By topic.
+    /// Rows, sorted by topic.
     rows: Box<[Row]>,
 }
 
-/// One topic in one second.
+/// Measurements of one topic in one second.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Row {
     topic: u32,
@@ -70,18 +69,18 @@ pub struct Row {
     interarrival: [Bfloat16; 2],
 }
 
-/// A row with what it takes to read it among its neighbours.
+/// A row with the rates that depend on the rows before it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
     /// The row.
     pub row: Row,
-    /// Messages a second over the last 10 s; `None` in the first second of measuring.
+    /// Messages per second over the last 10 s; `None` in the first measured second.
     pub rate_hz: Option<f64>,
-    /// Payload bytes a second over the same time.
+    /// Payload bytes per second over the last 10 s.
     pub bandwidth: Option<f64>,
 }
 
-/// The upper half of an `f32`: 8 bits of precision, more than a percentile of a histogram has.
+/// The upper half of an `f32`: 8 bits of precision, which exceeds that of a histogram's percentile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Bfloat16(u16);
 
@@ -91,7 +90,7 @@ struct Names {
     by_domain: BTreeMap<DomainId, BTreeMap<DdsName, u32>>,
 }
 
-/// What had been counted of a topic by the end of the second before.
+/// Counts of a topic at the end of the previous second.
 #[derive(Debug)]
 struct PreviousTotals {
     messages: u64,
@@ -102,7 +101,7 @@ struct PreviousTotals {
 }
 
 impl History {
-    /// Of so many seconds, for at most `topics` measured topics at once.
+    /// Creates a ring of `span` seconds, for at most `topics` measured topics at once.
     #[must_use]
     pub fn new(span: usize, topics: usize) -> Self {
         Self {
@@ -117,7 +116,7 @@ impl History {
         }
     }
 
-    /// When the next second ends.
+    /// Returns the time at which the next second ends.
     #[must_use]
     pub fn due(&self) -> Timestamp {
         let last = self.seconds.back();
@@ -126,21 +125,21 @@ impl History {
         })
     }
 
-    /// Whether a second has ended by `now`, or the clock was set back.
+    /// Returns whether a second has ended by `now`, or the clock was set back.
     #[must_use]
     pub fn is_due(&self, now: Timestamp) -> bool {
         let is_back = self.seconds.back().is_some_and(|last| now < last.at);
         now.0 > 0 && (now >= self.due() || is_back)
     }
 
-    /// Takes a second that ends at `now`: domain, DDS name and all that was counted of each topic.
+    /// Adds a second that ends at `now`, from the domain, DDS name and total counts of each topic.
     pub fn take<'a>(
         &mut self,
         now: Timestamp,
         topics: impl Iterator<Item = (DomainId, &'a DdsName, Measurement)>,
     ) {
         if self.seconds.back().is_some_and(|last| now < last.at) {
-            // Times would run backwards within a chart.
+            // The clock was set back, and times within a chart must increase.
             self.seconds.clear();
             self.rows = 0;
         }
@@ -168,7 +167,7 @@ impl History {
         }
     }
 
-    /// For readers.
+    /// Returns the current state for readers.
     #[must_use]
     pub fn past(&self) -> Past {
         Past {
@@ -177,7 +176,7 @@ impl History {
         }
     }
 
-    /// Topics whose past is kept, and their cap.
+    /// Returns the number of topics with a history, and their cap.
     #[must_use]
     pub fn table(&self) -> TableFacts {
         TableFacts {
@@ -188,10 +187,10 @@ impl History {
         }
     }
 
-    /// The size of each of its tables.
+    /// Returns the size of each table.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             span,
             most,
@@ -210,7 +209,7 @@ impl History {
         ]
     }
 
-    /// An id for a topic that has none; `None` where as many are named as may be.
+    /// Assigns an id to a new topic, or returns `None` if the table of names is full.
     fn name(&mut self, domain_id: DomainId, dds_name: &DdsName) -> Option<u32> {
         if self.names.len() >= self.most {
             self.evictions += 1;
@@ -223,7 +222,7 @@ impl History {
         Some(self.last)
     }
 
-    /// Gives up the past of topics that were measured neither in the last second nor in this one.
+    /// Drops the history of topics that were measured neither in the last second nor in this one.
     fn forget(&mut self, rows: &[Row]) {
         let last = self.seconds.back().cloned().unwrap_or_default();
         let now: HashSet<_> = rows.iter().map(|row| row.topic).collect();
@@ -261,7 +260,7 @@ impl History {
 }
 
 impl Past {
-    /// Every second of one topic, the oldest first; `None` while it was not measured.
+    /// Returns each second of one topic, oldest first; `None` for seconds without a measurement.
     pub fn topic(
         &self,
         domain_id: DomainId,
@@ -275,19 +274,19 @@ impl Past {
         Some(readings)
     }
 
-    /// The id by which [`Second::row`] knows a topic.
+    /// Returns the id of the topic for [`Second::row`].
     #[must_use]
     pub fn id(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.names.find(domain_id, dds_name)
     }
 
-    /// The seconds, the oldest first.
+    /// Returns the seconds, oldest first.
     #[must_use]
     pub fn seconds(&self) -> &[Arc<Second>] {
         &self.seconds
     }
 
-    /// One second of a topic, with its rate over the window that ends there.
+    /// Returns one second of a topic, with its rates over the window that ends there.
     fn reading(&self, place: usize, id: u32) -> Option<Reading> {
         let row = self.seconds.get(place)?.row(id)?;
         let window = usize::try_from(WINDOW).unwrap_or(usize::MAX);
@@ -296,11 +295,11 @@ impl Past {
         let mut began = None;
         for second in self.seconds.get(first..=place).unwrap_or_default() {
             let Some(row) = second.row(id) else {
-                // Counting began anew behind this.
+                // The counters were reset after this row.
                 (messages, bytes, began) = (0.0, 0.0, Some(second.at));
                 continue;
             };
-            // The first second only tells when the next one began.
+            // The first second only marks the beginning of the next one.
             if began.is_some() {
                 messages += f64::from(row.messages);
                 bytes += f64::from(row.bytes);
@@ -320,14 +319,14 @@ impl Past {
 }
 
 impl Second {
-    /// What was measured of a topic.
+    /// Returns the row of a topic.
     #[must_use]
     pub fn row(&self, topic: u32) -> Option<Row> {
         let place = self.rows.binary_search_by_key(&topic, |row| row.topic);
         self.rows.get(place.ok()?).copied()
     }
 
-    /// All topics.
+    /// Returns the rows of all topics.
     #[must_use]
     pub fn rows(&self) -> &[Row] {
         &self.rows
@@ -335,20 +334,21 @@ impl Second {
 }
 
 impl Row {
-    /// The id of its topic.
+    /// Returns the id of its topic.
     #[must_use]
     pub const fn topic(&self) -> u32 {
         self.topic
     }
 
-    /// Median and 99th percentile of the time from the writer's timestamp to the capture, in
-    /// seconds.
+    /// Returns the median and 99th percentile of the time from the writer's timestamp to the
+    /// capture, in seconds.
     #[must_use]
     pub fn latency(&self) -> Option<[f32; 2]> {
         pair(self.latency)
     }
 
-    /// Median and 99th percentile of the times between messages of one writer, in seconds.
+    /// Returns the median and 99th percentile of the time between messages of one writer, in
+    /// seconds.
     #[must_use]
     pub fn interarrival(&self) -> Option<[f32; 2]> {
         pair(self.interarrival)
@@ -365,7 +365,7 @@ impl Bfloat16 {
     fn new(value: f64) -> Self {
         #[expect(clippy::cast_possible_truncation, reason = "rounding is the purpose")]
         let bits = (value as f32).to_bits();
-        // Half of what is cut off is added; a finite number stays below the bits of NaN.
+        // Rounds to nearest; the bits of a finite number stay below those of NaN.
         Self(u16::try_from(bits.saturating_add(0x8000) >> 16).unwrap_or(0xffff))
     }
 
@@ -386,8 +386,8 @@ impl Names {
 }
 
 impl PreviousTotals {
-    /// What was counted between `before` and this. A count that fell belongs to a topic that was
-    /// forgotten meanwhile: all of it is new.
+    /// Returns the counts between `before` and this state. A count that decreased belongs to a
+    /// topic that was removed in between, so all of it is new.
     fn since(&self, topic: u32, before: &Self) -> Row {
         let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
         let count = |now, before| u32::try_from(more(now, before)).unwrap_or(u32::MAX);
@@ -472,7 +472,7 @@ mod tests {
             .collect();
         let counts: Vec<_> = rows.iter().map(|row| (row.messages, row.lost)).collect();
         assert_eq!(counts, [(10, 0), (10, 3), (0, 0)]);
-        // Of the second alone: the millisecond before is not in it.
+        // The percentiles cover this second only, without the millisecond before.
         let [median, high] = rows[1].latency().unwrap();
         assert!(median > 0.02 && high < 0.0402, "{median} {high}");
         assert_eq!((rows[2].latency(), rows[1].interarrival()), (None, None));
@@ -551,7 +551,7 @@ mod tests {
         assert_eq!(table.size + table.evictions, 9);
         assert!(past.topic(DomainId(0), "8").is_some() && past.topic(DomainId(0), "0").is_none());
         assert!(history.before.len() <= 4);
-        // More at once than can be named.
+        // More topics at once than the table of names holds.
         let all: Vec<_> = names
             .iter()
             .map(|name| (name, counted(1, 0, &[])))

@@ -1,7 +1,7 @@
-//! Identities that everybody derives alike: 128 bits out of bytes, the same on every host, in every
-//! version and byte order. FNV-1a, whose low bits alone would be poor, and a finishing mix.
+//! Identities of 128 bits, derived from bytes in the same way on every host, version and byte
+//! order. FNV-1a has weak low bits, so a finishing mix follows.
 
-/// Bytes being turned into an identity.
+/// The state of a hash.
 #[derive(Clone, Copy, Debug)]
 pub struct Identity(u128);
 
@@ -9,7 +9,7 @@ const OFFSET: u128 = 0x6c62_272e_07bb_0142_62b8_2175_6295_c58d;
 const PRIME: u128 = 0x0000_0000_0100_0000_0000_0000_0000_013b;
 
 impl Identity {
-    /// Of things called so.
+    /// Starts an identity of this kind.
     #[must_use]
     pub fn of(kind: &[u8]) -> Self {
         let mut identity = Self(OFFSET);
@@ -17,14 +17,14 @@ impl Identity {
         identity
     }
 
-    /// Further bytes; a boundary counts.
+    /// Adds bytes and a boundary after them.
     pub fn add(&mut self, bytes: &[u8]) {
         for byte in bytes.iter().chain(&[0xff]) {
             self.0 = (self.0 ^ u128::from(*byte)).wrapping_mul(PRIME);
         }
     }
 
-    /// The identity.
+    /// Returns the identity.
     #[must_use]
     pub const fn bits(self) -> u128 {
         let low = mix(self.0 as u64 ^ mix((self.0 >> 64) as u64));
@@ -33,7 +33,7 @@ impl Identity {
     }
 }
 
-/// The finisher of `MurmurHash3`: every bit of what comes in turns half of those that go out.
+/// The finisher of `MurmurHash3`: every input bit flips half of the output bits.
 const fn mix(mut bits: u64) -> u64 {
     bits = (bits ^ bits >> 33).wrapping_mul(0xff51_afd7_ed55_8ccd);
     bits = (bits ^ bits >> 33).wrapping_mul(0xc4ce_b9fe_1a85_ec53);
@@ -66,7 +66,7 @@ mod tests {
         let all: Vec<u128> = (0..4096).map(bits).collect();
         for shift in [0, 56, 64, 112] {
             let parts: BTreeSet<u16> = all.iter().map(|bits| (bits >> shift) as u16).collect();
-            // 4096 of 65536 at random meet in about 124 places.
+            // Among 65536 values, 4096 random ones collide in about 124 cases.
             assert!(
                 (3_900..4_050).contains(&parts.len()),
                 "{shift}: {}",

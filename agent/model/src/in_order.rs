@@ -1,11 +1,12 @@
-//! One writer's samples in the order in which a reliable subscriber gets them.
+//! Puts one writer's samples into the order in which a reliable subscriber receives them.
 //!
-//! A reader delivers a sample once all lower ones have come, or will not come (RTPS 2.5, 8.4.12).
-//! So a sample that was counted waits here behind a hole until its repair comes, the writer leaves
-//! it out or withdraws it, the readers acknowledge it, or it counts as lost; its time is then the
-//! time of that moment. What waits is bounded in number, bytes and time: beyond, order is given up
-//! and a late repair is given late. A stream without holes never waits, nor does one without a
-//! reliable reader, or whose readers are elsewhere: no ACKNACK is seen while a hole is waited for.
+//! A reader delivers a sample once all lower numbers have arrived or will not arrive (RTPS 2.5,
+//! 8.4.12). A counted sample therefore waits after a gap until one of these closes it: a
+//! retransmission, a GAP or HEARTBEAT of the writer, ACKNACKs of the readers, or its loss. The
+//! sample then gets the time of that moment. The waiting samples are bounded in number, bytes and
+//! time; beyond, they are dispatched, and a late retransmission follows out of order. Samples never
+//! wait without a gap, without a reliable reader, or if all readers are on other hosts, whose
+//! ACKNACKs are not seen.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -16,78 +17,78 @@ use ros2probe_wire::time::SECOND;
 use super::dispatch::{Dispatch, Sample};
 use super::size::Size;
 
-/// How long one hole is waited for: Fast DDS asks for repairs after a HEARTBEAT, every three
-/// seconds at the latest.
+/// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
+/// which follows within three seconds.
 const PATIENCE: u64 = 4 * SECOND;
-/// Samples that wait at once.
+/// Largest number of waiting samples.
 const WAITING: usize = 4096;
-/// Numbers of one unannounced writer that are remembered.
+/// Largest number of samples remembered of a writer without an announcement.
 pub(super) const MAX_UNANNOUNCED: usize = 1024;
-/// Samples from before the announcement come again within this time, or not at all.
+/// Samples from before the announcement are retransmitted within this time, or not at all.
 const AGAIN: u64 = 10 * SECOND;
-/// What keeping a sample costs besides its payload.
+/// Memory per sample in addition to its payload.
 const OVERHEAD: usize = size_of::<Due>() + 64;
-/// How long the first ACKNACK may take after the announcement.
+/// Longest time from the announcement to the first ACKNACK.
 const MATCHING: u64 = SECOND;
 
-/// How far a writer's samples are decided.
+/// How far the samples of a writer are decided.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Progress {
-    /// Rises when the writer begins anew under its GUID, and its numbers with it.
+    /// Increases when the writer restarts its sequence numbers under the same GUID.
     pub incarnation: u32,
-    /// All below came, or no reader waits for them.
+    /// All samples below arrived, or no reader waits for them.
     pub complete: u64,
-    /// No reader waits for any below this.
+    /// No reader waits for any sample below this number.
     pub awaited: u64,
-    /// The writer retransmits.
+    /// Whether the writer retransmits.
     pub reliable: bool,
-    /// And has readers that acknowledge, or may begin to.
+    /// Whether the writer has readers that acknowledge, or new ones that may.
     pub acknowledged: bool,
 }
 
-/// A sample and those who get it.
+/// A sample and the subscriptions that receive it.
 #[derive(Debug)]
 pub struct Due {
     /// Ids of the requests.
     pub to: Arc<[u64]>,
     /// The sample.
     pub sample: Sample,
-    /// What those are given who miss its bytes.
+    /// The outcome for subscriptions that miss its bytes.
     pub missed: Option<Dispatch>,
 }
 
-/// The samples that wait for lower numbers.
+/// Samples that wait for lower numbers.
 #[derive(Debug, Default)]
 pub struct InOrder {
     waiting: BTreeMap<u64, Due>,
     bytes: usize,
     incarnation: Option<u32>,
-    /// The number that is waited for, and since when.
+    /// The missing number, and since when it is waited for.
     hole: (u64, Timestamp),
-    /// Of the latest sample that was given.
+    /// Time of the last dispatched sample.
     last: Timestamp,
-    /// Numbers that were counted before the writer was announced, and were not given.
+    /// Numbers that were counted before the writer's announcement but not dispatched.
     earlier: BTreeSet<u64>,
     announced: Timestamp,
 }
 
 impl Due {
-    /// Bytes of its payload.
+    /// Returns the size of its payload in bytes.
     pub fn bytes(&self) -> usize {
         self.sample.payload.as_ref().map_or(0, bytes::Bytes::len)
     }
 
-    /// Bytes that it takes while it waits.
+    /// Returns the memory that it needs while it waits.
     pub fn cost(&self) -> usize {
         OVERHEAD + self.bytes()
     }
 }
 
 impl InOrder {
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             waiting,
             bytes: _,
@@ -103,44 +104,44 @@ impl InOrder {
         ]
     }
 
-    /// Whether anything waits, or may come again.
+    /// Returns whether no sample waits or may still be retransmitted.
     #[must_use]
     pub fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.earlier.is_empty()
     }
 
-    /// Bytes that wait.
+    /// Returns the bytes of the waiting samples.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// These were counted before the writer was announced, which it was at `now`.
+    /// Sets the numbers that were counted before the writer's announcement at `now`.
     pub fn announced(&mut self, earlier: BTreeSet<u64>, now: Timestamp) {
         (self.earlier, self.announced) = (earlier, now);
     }
 
-    /// Whether this sample was counted before the announcement and has not been given.
+    /// Returns whether this sample was counted before the announcement and is not dispatched yet.
     #[must_use]
     pub fn lacks(&self, number: u64) -> bool {
         self.earlier.contains(&number)
     }
 
-    /// The numbers that follow are of this incarnation: those of the one before were first.
+    /// Begins a new incarnation after all samples of the previous one are dispatched.
     pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(Due)) {
         if self.incarnation.replace(incarnation) != Some(incarnation) {
             self.give_all(now, give);
         }
     }
 
-    /// A sample that is to be given now: no other waits.
+    /// Returns the sample for immediate dispatch; no other sample waits.
     pub fn pass(&mut self, mut due: Due, now: Timestamp) -> Due {
         due.sample.time = now.max(self.last);
         self.last = due.sample.time;
         due
     }
 
-    /// A sample is to be given, when it is its turn.
+    /// Adds a sample that is dispatched in its turn.
     pub fn put(&mut self, due: Due) {
         let number = due.sample.sequence_number;
         self.earlier.remove(&number);
@@ -150,7 +151,7 @@ impl InOrder {
         }
     }
 
-    /// Samples from before the announcement that will not come again.
+    /// Returns samples from before the announcement that will not be retransmitted.
     pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<u64> {
         if self.earlier.is_empty() {
             return Vec::new();
@@ -164,8 +165,8 @@ impl InOrder {
         gone.into_iter().collect()
     }
 
-    /// Gives those whose turn it is at `now`; at most `room` bytes may go on waiting. Returns the
-    /// number below which nothing is waited for any more, if the order was given up.
+    /// Dispatches the samples whose turn has come at `now`; at most `room` bytes may continue to
+    /// wait. If the order was given up, returns the number below which no sample is waited for.
     pub fn turn(
         &mut self,
         progress: &Progress,
@@ -200,7 +201,7 @@ impl InOrder {
         None
     }
 
-    /// Gives all that wait: nothing more will come.
+    /// Dispatches all waiting samples at the end of the input.
     pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(Due)) {
         while let Some((_, due)) = self.waiting.pop_first() {
             self.give(due, now, give);
@@ -210,10 +211,11 @@ impl InOrder {
     fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
         self.bytes -= due.cost();
         let came = due.sample.time;
-        // Its reader may have the lower one that was not seen in shared memory: then it did not
-        // wait.
+        // Its reader may have received the lower number through unobserved shared memory, and then
+        // it did not wait.
         let now = if due.sample.sampled { came } else { now };
-        // Players order by time: those that waited for the same repair are a nanosecond apart.
+        // Players sort by time, so samples that waited for the same retransmission are one
+        // nanosecond apart.
         let after = match came < now.max(self.last) {
             true => Timestamp(self.last.0.saturating_add(1)),
             false => came,

@@ -1,4 +1,4 @@
-//! What goes into the model and what comes out of it.
+//! Inputs and outputs of the model.
 
 use std::sync::Arc;
 
@@ -14,92 +14,94 @@ use crate::sockets::SocketFacts;
 use crate::trace::Spans;
 use crate::watch::Watchlist;
 
-/// One input of the model. Times are nanoseconds since the Unix epoch.
+/// An input of the model. Times are in nanoseconds since the Unix epoch.
 #[derive(Debug)]
 pub enum Input<'a> {
-    /// Time has come this far: leases end, gaps settle, expectations are judged.
+    /// The time has reached this value: leases expire, gaps settle, expectations are evaluated.
     Time(Timestamp),
-    /// The wall clock was set forward by so many nanoseconds, or back. No time passed by that.
+    /// The wall clock was set forward by this many nanoseconds (backward if negative), without
+    /// elapsed time.
     ClockSet(i64),
-    /// A datagram that was captured whole.
+    /// A datagram that was captured in full.
     Datagram {
         /// Its addresses and time.
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
-        /// Where the kernel filter stopped walking; it has reported the part before.
+        /// Where the kernel filter stopped; it has reported the submessages before that.
         handover: Option<&'a Handover>,
     },
-    /// A datagram of which a capture file kept the beginning only. Its payloads are not read.
+    /// A datagram that the capture file truncated. Its payloads are not read.
     CutDatagram {
         /// Its addresses and time.
         envelope: &'a Envelope,
-        /// What is left of the RTPS message.
+        /// The captured part of the RTPS message.
         payload: &'a [u8],
-        /// Bytes of the whole RTPS message.
+        /// Length of the whole RTPS message in bytes.
         length: u32,
     },
-    /// A captured datagram of which discovery alone counts now.
+    /// A captured datagram that is read for discovery only.
     Announcements {
         /// Its addresses and time.
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
-        /// Takes the records of user data, for the caller to put in order with others.
+        /// Receives the records of user data, which the caller sorts among others.
         records: &'a mut Vec<Record>,
     },
-    /// A message that was read in shared memory, where others may have been missed.
+    /// A message that was sampled from shared memory, where others may have been missed.
     SharedMemory {
         /// Its source and time.
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
     },
-    /// Shared memory was not polled for longer than its rings hold: loss before now is unknown.
+    /// The polling gap exceeds the shared-memory ring; loss before this time is unknown.
     SharedMemoryGap(Timestamp),
-    /// Uprobes no longer see what processes send into shared memory: what is read there counts.
+    /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
     ProbesDetached,
-    /// A record of a complete datagram, made by the kernel filter.
+    /// A record of a complete datagram, from the kernel filter.
     Record(&'a Record),
-    /// A participant was last seen then, as the kernel filter knows without a record.
+    /// The time at which a participant last sent a packet, from the kernel filter.
     ParticipantAlive(GuidPrefix, Timestamp),
-    /// Facts about a socket, again whenever they change.
+    /// Facts about a socket; repeated when they change.
     Socket(SocketFacts),
     /// The socket with this cookie was closed.
     SocketClosed(u64),
-    /// The socket with this cookie may be open, but the kernel's table forgot it.
+    /// The kernel's table dropped the socket with this cookie, which may still be open.
     SocketForgotten(u64),
-    /// A source could not read what it captured.
+    /// A source failed to parse captured bytes.
     DecodeError {
-        /// What was being read.
+        /// The stage of parsing.
         stage: &'static str,
-        /// Why not.
+        /// The reason.
         reason: Reason,
     },
-    /// What to measure from now on.
+    /// The topics to measure from now on.
     Watchlist(Arc<Watchlist>),
-    /// Samples to give from now on. Their topics are measured meanwhile.
+    /// The samples to dispatch from now on. Their topics are measured as long as they are
+    /// requested.
     SampleRequests(Arc<Vec<SampleRequest>>),
-    /// What was known before a restart, valid for at most one lease from `now` on.
+    /// State from before a restart, valid for at most one lease from `now` on.
     Restored {
-        /// What was known.
+        /// The saved state.
         memory: &'a Memory,
-        /// When the model starts.
+        /// Time at which the model starts.
         now: Timestamp,
     },
-    /// Nothing more will come: decides what is open, without letting time pass.
+    /// The input has ended: open decisions are made without elapsed time.
     End,
 }
 
-/// What the model has for others since it was drained last.
+/// Outputs of the model since they were last drained.
 #[derive(Debug, Default)]
 pub struct Output {
-    /// Changed verdicts for the kernel filter; `None` = remove the entry.
+    /// Changed verdicts for the kernel filter; `None` removes the entry.
     pub interest: Vec<(Guid, Option<Verdict>)>,
-    /// Events, and how many were left out.
+    /// Events, and how many were dropped.
     pub events: Taken,
-    /// Samples that were asked for, and those that are missing.
+    /// Requested samples, and reports of missing ones.
     pub samples: Vec<Dispatch>,
-    /// Spans of traced samples that ended.
+    /// Completed spans of traced samples.
     pub spans: Spans,
 }

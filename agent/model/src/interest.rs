@@ -1,8 +1,8 @@
-//! Which writers and readers the kernel filter is to meter, capture or leave alone.
+//! Verdicts of the kernel filter: which writers and readers it meters, captures or ignores.
 //!
-//! Holds what is wanted and what the kernel was told, so that only differences travel. It is
-//! bounded like the kernel's map: when full, the uninteresting entries go first, for without one a
-//! writer is merely captured within the kernel's budget for unknown writers.
+//! The table keeps the wanted verdicts and those that the kernel has, so that only differences are
+//! sent. It has the cap of the kernel's map. When it is full, entries with [`Verdict::Ignore`] go
+//! first: without an entry, the kernel captures a writer within its budget for unknown writers.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -27,24 +27,24 @@ struct Entry {
 }
 
 impl Interest {
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             entries,
             changed,
             limit,
             evictions: _,
         } = self;
-        // Those that go wait for the kernel to be told.
+        // Removed entries stay until the kernel's map is updated.
         vec![
             Size::new("interest.entries", entries.len(), 2 * limit),
             Size::new("interest.changed", changed.len(), 2 * limit),
         ]
     }
 
-    /// Empty, for at most `limit` entries.
+    /// Creates an empty table for at most `limit` entries.
     #[must_use]
     pub fn new(limit: usize) -> Self {
         Self {
@@ -55,7 +55,7 @@ impl Interest {
         }
     }
 
-    /// Wants this verdict from now on.
+    /// Sets the wanted verdict.
     pub fn set(&mut self, guid: Guid, verdict: Verdict) {
         if !self.entries.contains_key(&guid) && self.entries.len() >= self.limit {
             self.evictions += 1;
@@ -72,7 +72,7 @@ impl Interest {
         }
     }
 
-    /// Wants no entry any more.
+    /// Removes the wanted verdict.
     pub fn remove(&mut self, guid: Guid) {
         let Some(entry) = self.entries.get_mut(&guid) else {
             return;
@@ -86,14 +86,14 @@ impl Interest {
         }
     }
 
-    /// What is wanted of this one.
+    /// Returns the wanted verdict.
     #[must_use]
     pub fn get(&self, guid: Guid) -> Option<Verdict> {
         self.entries.get(&guid)?.wanted
     }
 
-    /// What changed since the last call, in the order of the GUIDs; `None` = remove. Removals come
-    /// first: the kernel's map has no more room than this table.
+    /// Returns the changes since the last call, sorted by GUID; `None` removes an entry. Removals
+    /// come first, because the kernel's map has the same cap as this table.
     pub fn changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
         let mut changes = Vec::with_capacity(self.changed.len());
         for guid in std::mem::take(&mut self.changed) {
@@ -110,14 +110,13 @@ impl Interest {
         changes
     }
 
-    /// Entries, cap, and entries not kept because of it.
+    /// Returns the number of entries, its cap, and the entries dropped because of it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
         (self.entries.len(), self.limit, self.evictions)
     }
 
-    /// Makes room by forgetting one uninteresting entry, one the kernel does not know if there is
-    /// any.
+    /// Drops one uninteresting entry, if possible one that the kernel does not have.
     fn give_up_one(&mut self) -> bool {
         let mut ignored = self
             .entries

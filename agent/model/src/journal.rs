@@ -1,4 +1,4 @@
-//! The latest events, oldest first: bounded lists for whoever asks what happened, not how often.
+//! The latest events, oldest first, in bounded lists.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -10,40 +10,40 @@ use super::event::Events;
 use super::loss::{DeliveryLoss, Loss};
 use super::size::Size;
 
-/// Entries kept of discovery events and of writers' losses each.
+/// Largest number of discovery events kept, and of losses per writer kept.
 const LIMIT: usize = 1024;
-/// Entries kept of receivers' losses: several receivers may miss what one writer sent.
+/// Largest number of receivers' losses kept; several receivers may miss the same sample.
 const DELIVERY_LIMIT: usize = 4096;
-/// Latest entries among which a loss looks for the one it continues.
+/// Number of the latest entries that a new loss may extend.
 const RECENT: usize = 16;
 
-/// What happened to one participant, endpoint or node.
+/// A change of a participant, endpoint or node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DiscoveryEvent {
-    /// When.
+    /// Time of the event.
     pub at: Timestamp,
-    /// In which domain.
+    /// Domain of the entity.
     pub domain_id: DomainId,
     /// `participant`, `writer`, `reader`, `node`.
     pub entity: &'static str,
     /// `appeared`, `changed`, `disposed`, `expired`, `cascaded`.
     pub event: &'static str,
-    /// Which one; the participant's for a node.
+    /// GUID of the entity; for a node, its participant's.
     pub guid: Guid,
-    /// Topic of an endpoint, name of a node, empty for a participant.
+    /// Topic of an endpoint or name of a node; empty for a participant.
     pub name: Arc<str>,
 }
 
-/// Consecutive samples that subscriptions will not get, until they are taken.
+/// Consecutive samples that subscriptions will not receive.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Missing {
-    /// Whose.
+    /// GUID of the writer.
     pub writer: Guid,
     /// First sequence number.
     pub first: u64,
     /// Last sequence number.
     pub last: u64,
-    /// Why; an incomplete one stands alone.
+    /// Reason; an incomplete sample has an entry of its own.
     pub reason: MissedReason,
 }
 
@@ -54,15 +54,15 @@ pub struct Journal {
     losses: VecDeque<Loss>,
     delivery_losses: VecDeque<DeliveryLoss>,
     missing: Vec<Missing>,
-    /// What waits to be told.
+    /// Events that wait to be taken.
     pub events: Events,
 }
 
 impl Journal {
-    /// Entries and cap of every list.
+    /// Returns the length and cap of each list.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             discovery,
             losses,
@@ -84,17 +84,17 @@ impl Journal {
         sizes
     }
 
-    /// Discovery events, oldest first.
+    /// Returns discovery events, oldest first.
     pub fn discovery(&self) -> impl Iterator<Item = &DiscoveryEvent> {
         self.discovery.iter()
     }
 
-    /// Losses, oldest first.
+    /// Returns losses, oldest first.
     pub fn losses(&self) -> impl Iterator<Item = &Loss> {
         self.losses.iter()
     }
 
-    /// Losses of receivers, by the time when their cause was settled.
+    /// Returns losses of receivers, in the order in which their causes were settled.
     pub fn delivery_losses(&self) -> impl Iterator<Item = &DeliveryLoss> {
         self.delivery_losses.iter()
     }
@@ -107,8 +107,7 @@ impl Journal {
         self.discovery.push_back(event);
     }
 
-    /// Keeps samples that will not come for the subscriptions until the next
-    /// [`Self::take_missing`].
+    /// Keeps samples that subscriptions will not receive until the next [`Self::take_missing`].
     pub fn leave_missing(&mut self, missing: Missing) {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)
@@ -121,12 +120,12 @@ impl Journal {
         }
     }
 
-    /// Those since the last call.
+    /// Removes and returns the missing samples since the last call.
     pub fn take_missing(&mut self) -> Vec<Missing> {
         std::mem::take(&mut self.missing)
     }
 
-    /// Adds a loss, to the last entry when it continues that one.
+    /// Adds a loss, extending the last entry if the loss continues it.
     pub fn lose(&mut self, loss: Loss) {
         self.events.lose(&loss);
         if let Some(last) = self.losses.back_mut()
@@ -142,7 +141,7 @@ impl Journal {
         self.losses.push_back(loss);
     }
 
-    /// Adds a receiver's loss, to an entry of the latest when it continues that one.
+    /// Adds a receiver's loss, extending one of the latest entries if the loss continues it.
     pub fn lose_delivery(&mut self, loss: DeliveryLoss) {
         let whose = |loss: &DeliveryLoss| {
             let DeliveryLoss {

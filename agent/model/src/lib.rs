@@ -1,13 +1,14 @@
-//! The core: a state machine without clock, thread or I/O. Time and bytes come in, facts go out.
+//! The core: a state machine without clock, thread or I/O. It takes times and bytes and returns
+//! facts.
 //!
-//! - [`observer::Observer`] takes one [`input::Input`] after the other, each with its time, and is
-//!   drained of its [`input::Output`].
-//! - [`snapshot::Snapshot`] is all that it knows at a moment: participants, endpoints, topics and
-//!   what was counted of them.
-//! - [`interest`] is the verdict for each writer that the kernel programs need.
-//! - [`watch`] and [`limits`] are what an operator wants measured, and how much it may take.
+//! - [`observer::Observer`] takes [`input::Input`] values, each with its time, and is drained of its
+//!   [`input::Output`].
+//! - [`snapshot::Snapshot`] contains the state at one moment: participants, endpoints, topics and
+//!   their counts.
+//! - [`interest`] holds the verdict for each writer, which the kernel programs need.
+//! - [`watch`] and [`limits`] hold what an operator wants to measure, and the resources for it.
 //!
-//! The same input gives the same facts, live or replayed at any speed. Every table is bounded.
+//! The same input yields the same facts, live or replayed at any speed. Every table is bounded.
 //!
 //! ```
 //! use ros2probe_model::input::Input;

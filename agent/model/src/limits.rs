@@ -1,12 +1,12 @@
-//! The caps that an operator may set (`limits:`), once: key, default, range, what one entry costs,
-//! what happens when it is reached. The configuration's keys, its schema, the table of the
-//! documents and the metrics `ros2probe_limit*` come from here; caps that protect a parser or the
-//! kernel's memory are constants where they apply, and are listed in `docs/limits-*.md`.
+//! Limits that an operator can set (`limits:`), each declared once: key, default, range, size of an
+//! entry, effect when reached. The configuration's keys and schema, the documented table and the
+//! metrics `ros2probe_limit*` derive from it. Caps that protect a parser or the kernel's memory are
+//! constants in their modules and are listed in `docs/limits-*.md`.
 //!
-//! The defaults fit a Raspberry Pi 4 and `MemoryMax=` of the unit: all of them reached at once, a
-//! test adds up what their entries take.
+//! The defaults fit a Raspberry Pi 4 and `MemoryMax=` of the systemd unit. A test adds up the
+//! memory that all limits together allow.
 
-/// One cap of the configuration.
+/// A limit of the configuration.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Limit {
     /// DDS participants.
@@ -17,15 +17,15 @@ pub enum Limit {
     Topics,
     /// Watches of every origin.
     Watches,
-    /// Writers that send without a known announcement.
+    /// Active writers whose announcement was missed.
     UnknownWriters,
-    /// What one writer sends to one receiver or destination.
+    /// Pairs of a writer and a receiver or destination.
     Flows,
-    /// Bytes held while datagrams are reassembled.
+    /// Bytes of datagrams that are being reassembled.
     ReassemblyBytes,
-    /// Streams of messages and recordings.
+    /// Message streams and recordings.
     Subscriptions,
-    /// Bytes of messages put together for those and waiting for them.
+    /// Bytes of samples that are being reassembled or wait for subscriptions.
     PayloadBytes,
     /// Bags that the agent writes on request.
     Recordings,
@@ -35,7 +35,7 @@ pub enum Limit {
     MetricsClients,
 }
 
-/// All there is to say of a cap.
+/// Description of a limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Row {
     /// Its key below `limits`, and the label `limit`.
@@ -44,18 +44,18 @@ pub struct Row {
     pub default: usize,
     /// Smallest and largest accepted value.
     pub range: (usize, usize),
-    /// Entries that count against the cap.
+    /// Unit of the entries.
     pub what: &'static str,
-    /// Effect on the next entry.
+    /// Effect on further entries.
     pub reached: &'static str,
-    /// Metric with more details than `ros2probe_limit_reached_total`; empty if there is none.
+    /// Metric with more details than `ros2probe_limit_reached_total`; empty without one.
     pub metric: &'static str,
-    /// Most bytes per entry on a robot with names of usual length, including two snapshots and two
-    /// metrics pages; 1 if the cap counts bytes.
+    /// Largest memory per entry in bytes, for names of usual length, including two snapshots and
+    /// two metrics pages; 1 if the limit counts bytes.
     pub bytes: usize,
 }
 
-/// The caps in force.
+/// The values of all limits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// DDS participants.
@@ -66,15 +66,15 @@ pub struct Limits {
     pub topics: usize,
     /// Watches of every origin.
     pub watches: usize,
-    /// Writers that send without a known announcement.
+    /// Active writers whose announcement was missed.
     pub unknown_writers: usize,
-    /// What one writer sends to one receiver or destination.
+    /// Pairs of a writer and a receiver or destination.
     pub flows: usize,
-    /// Bytes held while datagrams are reassembled.
+    /// Bytes of datagrams that are being reassembled.
     pub reassembly_bytes: usize,
-    /// Streams of messages and recordings.
+    /// Message streams and recordings.
     pub subscriptions: usize,
-    /// Bytes of messages put together for those and waiting for them.
+    /// Bytes of samples that are being reassembled or wait for subscriptions.
     pub payload_bytes: usize,
     /// Bags that the agent writes on request.
     pub recordings: usize,
@@ -206,7 +206,7 @@ const METRICS_CLIENTS: Row = Row {
 };
 
 impl Limit {
-    /// All of them, in the order in which they are documented.
+    /// All limits, in the order of their documentation.
     pub const ALL: [Self; 12] = [
         Self::Participants,
         Self::Endpoints,
@@ -222,7 +222,7 @@ impl Limit {
         Self::MetricsClients,
     ];
 
-    /// The table.
+    /// Returns the description.
     #[must_use]
     pub const fn row(self) -> Row {
         match self {
@@ -241,13 +241,13 @@ impl Limit {
         }
     }
 
-    /// Its key, which is also its label.
+    /// Returns the key, which is also the label value.
     #[must_use]
     pub const fn key(self) -> &'static str {
         self.row().key
     }
 
-    /// Whether part of the robot is not seen while it is reached.
+    /// Returns whether reaching the limit hides a part of the robot.
     #[must_use]
     pub const fn blinds(self) -> bool {
         matches!(
@@ -261,7 +261,7 @@ impl Limit {
         )
     }
 
-    /// The one with this key.
+    /// Returns the limit with this key.
     #[must_use]
     pub fn find(key: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|limit| limit.key() == key)
@@ -269,7 +269,7 @@ impl Limit {
 }
 
 impl Limits {
-    /// The caps that `value` gives for each limit.
+    /// Creates the limits from a function that returns the value of each.
     pub fn of(value: impl Fn(Limit) -> usize) -> Self {
         Self {
             participants: value(Limit::Participants),
@@ -287,7 +287,7 @@ impl Limits {
         }
     }
 
-    /// One of them.
+    /// Returns the value of one limit.
     #[must_use]
     pub const fn get(&self, limit: Limit) -> usize {
         match limit {
@@ -306,11 +306,11 @@ impl Limits {
         }
     }
 
-    /// What the agent takes beside them: idle, with its rings and the kernel's maps (14 MiB), what
-    /// is kept of events, two views of all there is under way, and the history of measured topics.
+    /// Memory in addition to the limits, in bytes: the idle agent with its rings and the kernel's
+    /// maps (14 MiB), stored events, two views, and the history of measured topics.
     pub const BESIDE: usize = 29 << 20;
 
-    /// Bytes that all of them take when they are reached together.
+    /// Returns the memory in bytes that all limits together allow.
     #[must_use]
     pub fn bytes(&self) -> usize {
         let each = |limit: Limit| self.get(limit).saturating_mul(limit.row().bytes);

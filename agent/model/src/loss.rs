@@ -1,29 +1,29 @@
-//! Lost samples: whose, and where they died, as far as this host can tell.
+//! Lost samples, and where they were lost as far as this host can observe.
 //!
-//! The causes exclude each other: a sample of which anything died nearest to the reader bears that
-//! cause, so the counts of all causes add up to the losses.
+//! Causes are mutually exclusive: a sample with several has the one nearest to the reader. The
+//! counts of all causes therefore add up to the losses.
 
 use std::net::SocketAddr;
 
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
-/// Where a sample died that never arrived whole.
+/// Where a sample was lost.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum LossCause {
-    /// It did not reach this host: lost on the network, or never sent to here.
+    /// The sample did not reach this host: the network lost it, or it was sent elsewhere.
     BeforeHost,
-    /// Some of its IP fragments reached this host, and the kernel gave up waiting for the others.
+    /// The kernel gave up reassembly, because some of its IP fragments did not arrive in time.
     Reassembly,
-    /// It reached the subscriber's socket, whose receive buffer was full.
+    /// The receive buffer of the subscriber's socket was full.
     SocketBuffer,
 }
 
 /// Consecutive samples that were settled as lost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Loss {
-    /// When it was settled.
+    /// Time at which they were settled.
     pub at: Timestamp,
-    /// Whose.
+    /// GUID of the writer.
     pub writer: Guid,
     /// First lost sequence number.
     pub first: u64,
@@ -31,20 +31,20 @@ pub struct Loss {
     pub last: u64,
 }
 
-/// Consecutive samples that one receiver lost, told once the cause is known.
+/// Consecutive samples that one receiver lost, reported once the cause is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeliveryLoss {
-    /// When the cause was settled.
+    /// Time at which the cause was settled.
     pub at: Timestamp,
-    /// Whose samples.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// The participant that missed them, where it was known.
+    /// The participant that missed them, if known.
     pub participant: Option<GuidPrefix>,
-    /// Cookie of the socket by which the writer's new samples come; 0 on a wire source.
+    /// Cookie of the socket that receives the writer's new samples; 0 on a wire source.
     pub socket: u64,
-    /// Where they come to.
+    /// Destination address of the samples.
     pub destination: SocketAddr,
-    /// Where they died.
+    /// Cause of the loss.
     pub cause: LossCause,
     /// First lost sequence number.
     pub first: u64,
@@ -56,7 +56,7 @@ impl LossCause {
     /// All causes, for exporting one series each.
     pub const ALL: [Self; 3] = [Self::BeforeHost, Self::Reassembly, Self::SocketBuffer];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {

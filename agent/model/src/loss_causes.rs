@@ -1,8 +1,8 @@
-//! What is known to have died on this host of the samples of one receiver, and losses of which that
-//! may still become known.
+//! Known causes of losses on this host for one receiver, and losses whose cause may still be
+//! reported.
 //!
-//! The kernel says at once when a socket had no room, and half a minute later when it gave up on
-//! IP fragments. A loss that may be of the second kind stays pending for that long.
+//! The kernel reports a full socket buffer at once and a failed IP reassembly half a minute later.
+//! A loss that may be of the second kind stays pending until then.
 
 use std::collections::BTreeMap;
 
@@ -12,27 +12,27 @@ use ros2probe_wire::time::SECOND;
 use super::loss::LossCause;
 use super::size::Size;
 
-/// Samples remembered of one receiver: a few seconds of a busy topic's losses.
+/// Largest number of samples per receiver: a few seconds of a busy topic's losses.
 const SAMPLES: usize = 8192;
-/// Runs of pending samples of one receiver.
+/// Largest number of runs of pending samples per receiver.
 const RUNS: usize = 1024;
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
 pub const REASSEMBLY: u64 = 35 * SECOND;
 
-/// Both lists.
+/// Known causes and pending losses.
 #[derive(Debug, Default)]
 pub struct LossCauses {
     known: BTreeMap<u64, KnownLoss>,
-    /// By the first of each run.
+    /// Pending runs, by their first number.
     pending: BTreeMap<u64, Run>,
 }
 
-/// Where a sample, or part of it, died.
+/// Where a sample, or part of it, was lost.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct KnownLoss {
-    /// Where, nearest to the reader.
+    /// Cause nearest to the reader.
     pub cause: LossCause,
-    /// When the first part of it did.
+    /// Time at which its first part was lost.
     pub at: Timestamp,
 }
 
@@ -43,10 +43,10 @@ struct Run {
 }
 
 impl LossCauses {
-    /// Entries and cap of both lists.
+    /// Returns the length and cap of both lists.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self { known, pending } = self;
         [
             Size::new("loss_causes.known", known.len(), SAMPLES),
@@ -54,7 +54,7 @@ impl LossCauses {
         ]
     }
 
-    /// Some or all of this sample died; whether an older one had to be forgotten for it.
+    /// Records the loss of some or all of this sample. Returns whether an older one was dropped.
     pub fn note(&mut self, number: u64, cause: LossCause, at: Timestamp) -> bool {
         let known_loss = self.known.entry(number).or_insert(KnownLoss { cause, at });
         known_loss.cause = known_loss.cause.max(cause);
@@ -65,7 +65,7 @@ impl LossCauses {
         is_full
     }
 
-    /// It came after all, or was excused.
+    /// Removes a sample that arrived after all or was excused.
     pub fn forget(&mut self, number: u64) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
@@ -73,7 +73,7 @@ impl LossCauses {
         self.known.remove(&number)
     }
 
-    /// Shows `first..=last` in runs that bear one cause; `None` = nothing known of them.
+    /// Splits `first..=last` into runs with the same cause; `None` for an unknown cause.
     pub fn explain(
         &mut self,
         first: u64,
@@ -97,7 +97,7 @@ impl LossCauses {
         show(next, last, None);
     }
 
-    /// All below are decided.
+    /// Removes all samples below this number, which are decided.
     pub fn settled(&mut self, below: u64) {
         if self
             .known
@@ -108,7 +108,8 @@ impl LossCauses {
         }
     }
 
-    /// The cause of these stays open until then. Gives what has to be decided now for it.
+    /// Keeps the cause of these samples open until then. Returns a run that must be decided now to
+    /// make room.
     pub fn wait(&mut self, first: u64, last: u64, until: Timestamp) -> Option<(u64, u64)> {
         if let Some((_, run)) = self.pending.range_mut(..first).next_back()
             && run.last.checked_add(1) == Some(first)
@@ -126,8 +127,8 @@ impl LossCauses {
             .map(|(first, run)| (first, run.last))
     }
 
-    /// Whether this one was pending; it is no more. One in the middle of a run stays where that
-    /// would make a run too many: its cause is decided with the others'.
+    /// Removes this sample from the pending ones and returns whether it was pending. If the split
+    /// of its run would exceed the cap, the sample stays and its cause is decided with the others.
     pub fn resolve(&mut self, number: u64) -> bool {
         let Some((first, run)) = self.pending.range(..=number).next_back() else {
             return false;
@@ -148,7 +149,7 @@ impl LossCauses {
         true
     }
 
-    /// What has been pending long enough.
+    /// Removes and returns the runs whose waiting time is over.
     pub fn due(&mut self, now: Timestamp) -> Vec<(u64, u64)> {
         let mut due = Vec::new();
         self.pending.retain(|first, run| {
@@ -161,7 +162,7 @@ impl LossCauses {
         due
     }
 
-    /// Takes over what `other` knows.
+    /// Merges the causes of `other`.
     pub fn absorb(&mut self, other: Self) {
         for (number, known_loss) in other.known {
             self.note(number, known_loss.cause, known_loss.at);
@@ -233,7 +234,7 @@ mod tests {
         assert_eq!(resolved.count(), RUNS - 1);
         let [_, pending] = loss_causes.sizes();
         assert_eq!(pending.entries, pending.cap);
-        // At the ends of a run there is no split, and a hole makes room for none.
+        // Removing the end of a run splits nothing, and a removed hole frees no entry.
         assert!(loss_causes.resolve(1));
         let left = loss_causes.due(at(1)).into_iter();
         let left: u64 = left.map(|(first, last)| last - first + 1).sum();

@@ -1,115 +1,114 @@
-//! What is counted of a writer, a topic and a delivery, and where samples spent their time. Plain
-//! values that add up; the modules that count fill them.
+//! Counts of a writer, a topic and a delivery, and the time that samples spent in each stage. These
+//! are plain values that can be added; the measuring modules fill them.
 
 use ros2probe_wire::Timestamp;
 
 use super::histogram::Histogram;
 use super::loss::LossCause;
 
-/// What was counted while the topic was watched. Counters never go down while the topic lives.
+/// Counts and times while the topic was watched. Counters never decrease while the topic exists.
 #[derive(Clone, Debug, Default)]
 pub struct Measurement {
-    /// Samples received whole, each once.
+    /// Samples received whole, without duplicates.
     pub messages: u64,
-    /// Their payload bytes, encapsulation included (as `ros2 topic bw` counts).
+    /// Their payload bytes, including encapsulation (as `ros2 topic bw` counts).
     pub bytes: u64,
-    /// Samples settled as lost: a sequence gap that nothing excused or filled in time.
+    /// Samples settled as lost: a gap that was neither excused nor filled in time.
     pub lost: u64,
-    /// Samples that filled a gap later, by retransmission or reordering.
+    /// Samples that filled a gap late, by retransmission or reordering.
     pub recovered: u64,
-    /// Samples and fragments seen again.
+    /// Samples and fragments received more than once.
     pub duplicates: u64,
-    /// Samples whose fragments never became complete (also counted in `lost` once settled).
+    /// Samples whose fragments never became complete (also in `lost` once settled).
     pub incomplete: u64,
-    /// Samples excused by GAP, by the ACKNACKs of readers that have them, or because the kernel did
-    /// not know their writer yet.
+    /// Samples excused by GAP, by ACKNACKs of readers that have them, or because the kernel did not
+    /// know their writer yet.
     pub irrelevant: u64,
     /// Time of the last new sample.
     pub last_message: Option<Timestamp>,
-    /// Messages a second over the last window; for people, never for rules.
+    /// Messages per second over the last window, for display only; rules use counters.
     pub rate_hz: f64,
-    /// Payload bytes a second over the same window.
+    /// Payload bytes per second over the same window.
     pub bandwidth: f64,
     /// Seconds between consecutive samples of one writer.
     pub interarrival: Histogram,
-    /// Capture time minus INFO_TS, seconds. Needs synchronised clocks across hosts.
+    /// Capture time minus INFO_TS in seconds. Across hosts it requires synchronised clocks.
     pub source_latency: Histogram,
-    /// Capture time minus `std_msgs/Header.stamp`, seconds, where the type begins with a header.
+    /// Capture time minus `std_msgs/Header.stamp` in seconds, if the type begins with a header.
     pub header_latency: Histogram,
-    /// Samples whose time lay after their capture time (clocks apart); not in the histograms.
+    /// Samples with a timestamp after their capture (clocks differ); not in the histograms.
     pub negative_latency: u64,
-    /// Samples whose INFO_TS lies more than an hour before or after their capture time (a clock
-    /// that was never set, or a forgery); not in the histograms.
+    /// Samples with an INFO_TS more than an hour before or after their capture (a clock that was
+    /// never set, or a forgery); not in the histograms.
     pub implausible_latency: u64,
-    /// How often the writer's numbers left their run, and one record did not suffice to believe it.
+    /// Jumps of the sequence number that a single record suggests but does not prove.
     pub sequence_jumps: u64,
-    /// Present when some of this was read from shared memory, which is a sampled view: messages are
-    /// then counted by the span of their numbers, and times are those of the samples that were
-    /// seen.
+    /// Present if some samples were read from shared memory. Messages are then counted by the span
+    /// of their numbers, and times are those of the samples that were read.
     pub sampled: Option<SampledFacts>,
 }
 
-/// How much a sampled view saw.
+/// Coverage of shared-memory sampling.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SampledFacts {
-    /// Samples of which at least a part was seen.
+    /// Samples of which at least a part was read.
     pub seen: u64,
-    /// Samples that there were, by their sequence numbers.
+    /// Samples that were written, by their sequence numbers.
     pub span: u64,
-    /// How often so much time passed between two looks that something may have gone unnoticed.
+    /// How often the polling gap was so long that a sample may have been missed unnoticed.
     pub uncertain: u64,
 }
 
-/// Samples of one delivery, or of several. All but `pending` never go down.
+/// Samples of one or several deliveries. No field except `pending` ever decreases.
 ///
-/// `messages - history + lost() + irrelevant` are the sequence numbers that were decided since the
-/// delivery's first sight; what is still awaited is not in it.
+/// `messages - history + lost() + irrelevant` is the number of samples that were decided since the
+/// delivery began. Samples that may still arrive are not included.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Delivered {
-    /// Samples that came (or left) whole, each once.
+    /// Samples that arrived (or left) whole, without duplicates.
     pub messages: u64,
-    /// Their payload bytes, encapsulation included.
+    /// Their payload bytes, including encapsulation.
     pub bytes: u64,
-    /// Of `messages`: samples older than the first sight, as late joiners ask for.
+    /// Part of `messages`: samples older than the delivery, as late joiners request them.
     pub history: u64,
-    /// Of `messages`: samples that came by retransmission.
+    /// Part of `messages`: samples that arrived by retransmission.
     pub recovered: u64,
-    /// Seconds from noticing the gap to its filling, summed over `recovered`.
+    /// Time from detecting a gap to filling it in seconds, summed over `recovered`.
     pub recovery_seconds: f64,
-    /// Samples that arrived where it is known that no reader of the topic is: undelivered, and not
-    /// in `messages`.
+    /// Samples that arrived at a process known to have no reader of the topic. They are not
+    /// delivered and not in `messages`.
     pub unmatched: u64,
-    /// Samples and fragments that came again; copies of one multicast on its way out do not count.
+    /// Samples and fragments that arrived more than once, without copies of an outgoing multicast.
     pub duplicates: u64,
-    /// Samples that the writer left out (GAP), that were written while no reader was here, or that
-    /// its readers acknowledged although no copy was seen.
+    /// Samples that the writer skipped (GAP), that were written while this receiver had no reader,
+    /// or that its readers acknowledged although no copy was seen.
     pub irrelevant: u64,
     /// Samples that never reached this host.
     pub lost_before_host: u64,
-    /// Samples that died in IP reassembly on this host.
+    /// Samples that failed IP reassembly on this host.
     pub lost_in_reassembly: u64,
-    /// Samples that died in the full receive buffer of the subscriber's socket.
+    /// Samples that the full receive buffer of the subscriber's socket dropped.
     pub lost_in_socket_buffer: u64,
-    /// Lost samples whose cause is not known yet: the kernel may still wait for IP fragments.
+    /// Lost samples whose cause is unknown so far: the kernel may still wait for IP fragments.
     pub pending: u64,
 }
 
-/// Where a writer's samples spent their time. Finer buckets than the other histograms.
+/// Time that a writer's samples spent in each stage, in histograms with finer buckets.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Breakdown {
-    /// INFO_TS to the first datagram leaving this host, seconds.
+    /// From INFO_TS to the first datagram leaving this host, in seconds.
     pub send_delay: Histogram,
-    /// The last datagram of a sample leaving this host to its arrival at a socket of this host,
-    /// seconds; one value per receiver.
+    /// From the last datagram leaving this host to the sample's arrival at a socket of this host,
+    /// in seconds; one value per receiver.
     pub transit: Histogram,
-    /// First to last datagram of a sample that came in several, seconds.
+    /// From the first to the last datagram of a sample that needs several, in seconds.
     pub transfer: Histogram,
-    /// Noticing a gap to its filling by retransmission, seconds; one value per receiver.
+    /// From detecting a gap to filling it by retransmission, in seconds; one value per receiver.
     pub retransmission: Histogram,
 }
 
 impl Measurement {
-    /// Adds all of `other`, as a topic adds up its writers.
+    /// Adds all of `other`, to sum the writers of a topic.
     pub fn add(&mut self, other: &Self) {
         self.messages += other.messages;
         self.bytes += other.bytes;
@@ -137,7 +136,7 @@ impl Measurement {
 }
 
 impl SampledFacts {
-    /// Seen of those that there were; `None` while there were none.
+    /// Returns samples read divided by samples written, or `None` before the first sample.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -149,13 +148,13 @@ impl SampledFacts {
 }
 
 impl Delivered {
-    /// Samples that never came whole, whatever the cause. Never goes down.
+    /// Returns the number of samples that never arrived whole, for any cause. Never decreases.
     #[must_use]
     pub const fn lost(&self) -> u64 {
         self.lost_before_host + self.lost_in_reassembly + self.lost_in_socket_buffer + self.pending
     }
 
-    /// Samples lost by this cause.
+    /// Returns the number of samples lost by this cause.
     #[must_use]
     pub const fn lost_by(&self, cause: LossCause) -> u64 {
         match cause {
@@ -165,7 +164,7 @@ impl Delivered {
         }
     }
 
-    /// Counts losses by this cause.
+    /// Adds losses by this cause.
     pub const fn lose(&mut self, cause: LossCause, count: u64) {
         match cause {
             LossCause::BeforeHost => self.lost_before_host += count,

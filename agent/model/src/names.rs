@@ -1,7 +1,7 @@
-//! Names of topics, types and nodes, one type for each kind, so that none is taken for another.
+//! Names of topics, types and nodes. Each kind has its own type, so they cannot be confused.
 //!
-//! They are shared text: a snapshot, an event and the model itself have the same allocation. What
-//! DDS and ROS call a topic is converted by [`ros2probe_wire::names`] alone.
+//! Names are shared text: a snapshot, an event and the model itself use one allocation.
+//! [`ros2probe_wire::names`] converts between the DDS and ROS names of a topic.
 
 use std::borrow::Borrow;
 use std::fmt;

@@ -1,4 +1,4 @@
-//! What a topic is called, in DDS and in ROS, and which watches cover it.
+//! Names of a topic in DDS and ROS, and the watches that cover it.
 
 use ros2probe_wire::DomainId;
 use ros2probe_wire::names::{DdsTopic, Demangled, RosName};
@@ -7,25 +7,25 @@ use super::names::{DdsName, TopicName};
 use super::topic_kind::TopicKind;
 use crate::watch::Watchlist;
 
-/// What a topic is called and what it is.
+/// Names and properties of a topic.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Naming {
-    /// DDS name; of a CPU buffer topic that of the topic beside it.
+    /// DDS name; for a CPU buffer topic, that of its base topic.
     pub dds_name: DdsName,
     /// ROS name, or the DDS name.
     pub name: TopicName,
-    /// What it is.
+    /// Role of the topic in ROS.
     pub kind: TopicKind,
     /// Hidden by ROS convention.
     pub hidden: bool,
-    /// The endpoint serves the topic from beside it, and is not one of its publishers.
+    /// Whether the endpoint belongs to a buffer topic and is not a publisher of the base topic.
     pub is_buffer: bool,
-    /// Its samples are messages.
+    /// Whether its samples count as messages.
     pub counts: bool,
 }
 
 impl Naming {
-    /// Of a DDS topic.
+    /// Returns the names of a DDS topic.
     #[must_use]
     pub fn of(topic: &DdsTopic) -> Self {
         let demangled = topic.demangle();
@@ -66,9 +66,9 @@ impl Naming {
         }
     }
 
-    /// Watchlist entries that cover it. Entries are about topics: services are covered only by
-    /// their DDS names. A hidden topic is covered when an entry names a hidden token itself, so
-    /// `/**` is every topic that `ros2 topic list` shows.
+    /// Returns the watchlist entries that cover the topic. Entries name ROS topics; services are
+    /// covered only by their DDS names. A hidden topic is covered if an entry names a hidden token
+    /// itself, so `/**` covers the topics of `ros2 topic list`.
     pub(super) fn covered_by(&self, domain_id: DomainId, watchlist: &Watchlist) -> Vec<usize> {
         let mut covering = watchlist.matching(domain_id, self.watched_as());
         if self.hidden && !self.kind.is_service() {
@@ -83,12 +83,12 @@ impl Naming {
         covering
     }
 
-    /// Whether it is watched by its exact name, in this domain or, with `None`, in any.
+    /// Returns whether the topic is watched by exact name, in this domain or, with `None`, in any.
     pub(super) fn is_named_by(&self, domain_id: Option<DomainId>, watchlist: &Watchlist) -> bool {
         watchlist.names(domain_id, self.watched_as())
     }
 
-    /// The name that watches are about.
+    /// Returns the name that watches refer to.
     fn watched_as(&self) -> &str {
         if self.kind.is_service() {
             &self.dds_name

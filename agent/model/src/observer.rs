@@ -1,7 +1,8 @@
-//! The core's entry: datagrams and records in, interest and snapshots out.
+//! Entry point of the core: datagrams and records in, interest and snapshots out.
 //!
-//! Everything happens in the source's time, which the caller passes in: the same input gives the
-//! same facts, live or replayed at any speed. It reads no clock, sends nothing and keeps no packet.
+//! All processing uses the source's time, which the caller passes in: the same input yields the
+//! same facts, live or replayed at any speed. The observer reads no clock, sends nothing and keeps
+//! no packets.
 
 mod announcements;
 mod calendar;
@@ -46,27 +47,27 @@ use crate::watch::Watchlist;
 use lists::traits;
 pub use settings::Settings;
 
-/// How often leases, windows and gaps are looked at.
+/// Interval at which leases, windows and gaps are checked.
 const TICK: u64 = SECOND / 10;
-/// A clock that jumps further than this is set, not followed tick by tick.
+/// A larger step of the clock means that the clock was set; it is not processed tick by tick.
 const JUMP: u64 = 3600 * SECOND;
-/// Names matched against globs in one go: a few milliseconds.
+/// Largest number of names matched against globs at once, which takes a few milliseconds.
 const MATCHES_AT_ONCE: usize = 20_000;
 
-/// What is wanted of messages in shared memory.
+/// What the model needs from shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Wanted {
-    /// Nothing that is measured can pass there, and every name is known.
+    /// No measured sample can use shared memory, and every name is known.
     Nothing,
-    /// A name is lacking that may be said there.
+    /// A name is unknown that shared memory may contain.
     Names,
-    /// Samples of a measured writer may pass there.
+    /// Samples of a measured writer may use shared memory.
     Samples,
-    /// Those of a writer whose samples are to be given one by one.
+    /// A subscription requests the samples of a writer that may use shared memory.
     EverySample,
 }
 
-/// What deliveries are seen against. Borrows these fields alone, which a method could not.
+/// Context of deliveries. A macro borrows only these fields, which a method cannot.
 macro_rules! graph {
     ($observer:expr) => {
         $crate::receivers::GraphView {
@@ -86,7 +87,7 @@ pub struct Observer {
     pub(super) watchlist: Arc<Watchlist>,
     pub(super) discovery: Discovery,
     pub(super) topics: Topics,
-    /// Topics about which the lists are still to be asked, the next one last.
+    /// Topics to which the lists are still to be applied, the next one last.
     pending_topics: Vec<TopicId>,
     pub(super) interest: Interest,
     pub(super) profiler: Profiler,
@@ -100,13 +101,13 @@ pub struct Observer {
     pub(super) datagrams: u64,
     pub(super) records: u64,
     journal: Journal,
-    /// Time up to which everything is settled.
+    /// Time up to which all decisions are made.
     clock: Timestamp,
     wall_clock: WallClock,
 }
 
 impl Observer {
-    /// Nothing seen, nothing watched.
+    /// Creates an observer without state or watches.
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         let caps = Caps {
@@ -141,7 +142,7 @@ impl Observer {
         }
     }
 
-    /// Takes in one input.
+    /// Processes one input.
     pub fn input(&mut self, input: Input<'_>) {
         match input {
             Input::Time(now) => self.advance(now),
@@ -188,7 +189,7 @@ impl Observer {
         }
     }
 
-    /// Takes out what has come up since the last call.
+    /// Removes and returns all output since the last call.
     pub fn drain(&mut self) -> Output {
         let mut output = Output {
             interest: self.interest.changes(),
@@ -202,22 +203,22 @@ impl Observer {
         output
     }
 
-    /// Whether somebody wants samples whole.
+    /// Returns whether a subscription requests payloads.
     #[must_use]
     pub const fn wants_payloads(&self) -> bool {
         self.payloads.wants_any_bytes()
     }
 
-    /// So much waits to be given that it should be taken before more comes.
+    /// Returns whether so much output waits that it should be drained before further input.
     #[must_use]
     pub const fn has_much_output(&self) -> bool {
         self.payloads.is_full() || self.journal.events.are_many()
     }
 
-    /// Entries, or bytes, and cap of every table of the model, by name.
+    /// Returns the size and cap of each table of the model, in entries or bytes.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new component does not compile before it has a place here.
+        // The destructuring makes a new component fail to compile until it is listed here.
         let Self {
             settings,
             watchlist,
@@ -262,13 +263,13 @@ impl Observer {
         sizes.extend(tracer.sizes());
         sizes.extend(examiner.sizes(settings.endpoints));
         sizes.extend(journal.sizes());
-        // Of each stage every reason.
+        // Each stage has every reason at most once.
         let reasons = Size::new("observer.decode_errors", decode_errors.len(), 64);
         sizes.push(reasons);
         sizes
     }
 
-    /// What is wanted of shared memory at the moment.
+    /// Returns what the model needs from shared memory at present.
     #[must_use]
     pub fn wanted_of_shared_memory(&self) -> Wanted {
         let may_share = |guid: &Guid| may_share_memory(&self.discovery, *guid);
@@ -283,8 +284,8 @@ impl Observer {
         }
     }
 
-    /// Takes in a datagram of which a capture kept only the beginning: what it says about its
-    /// submessages counts, its payloads are not read.
+    /// Processes a truncated datagram of a capture file: submessage headers count, payloads are not
+    /// read.
     fn cut_datagram(&mut self, envelope: &Envelope, payload: &[u8], length: u32) {
         self.datagrams += 1;
         self.decode_error("frame", Reason::Truncated);
@@ -294,7 +295,7 @@ impl Observer {
         walk::datagram(&padded, envelope, None, |found| self.count(&found.record));
     }
 
-    /// Takes over what was known before the start, until one lease from `now` on at most.
+    /// Restores saved state, valid for at most one lease from `now` on.
     fn restore(&mut self, memory: &Memory, now: Timestamp) {
         let now = self.wall_clock.model_time(now);
         self.discovery.restore(memory, now);
@@ -306,25 +307,25 @@ impl Observer {
         self.follow_up(now);
     }
 
-    /// What is known of who is there, to be kept for the next start.
+    /// Returns the discovery state to save for the next start.
     #[must_use]
     pub fn memory(&self) -> Memory {
         self.discovery.memory()
     }
 
-    /// Rises with every change of what [`Self::memory`] says.
+    /// Returns a number that increases with every change of [`Self::memory`].
     #[must_use]
     pub const fn memory_revision(&self) -> u64 {
         self.discovery.revision()
     }
 
-    /// The latest discovery events and losses.
+    /// Returns the latest discovery events and losses.
     #[must_use]
     pub const fn journal(&self) -> &Journal {
         &self.journal
     }
 
-    /// All facts at this moment.
+    /// Returns all facts at `now`.
     #[must_use]
     pub fn snapshot(&self, now: Timestamp) -> Snapshot {
         let mut snapshot = report::snapshot(self, self.wall_clock.model_time(now));
@@ -332,7 +333,7 @@ impl Observer {
         snapshot
     }
 
-    /// All that was counted by `now` of each topic that is measured: domain, DDS name and counts.
+    /// Returns the domain, DDS name and counts of each measured topic at `now`.
     pub fn measured(
         &self,
         now: Timestamp,
@@ -340,7 +341,7 @@ impl Observer {
         report::measured(self, self.wall_clock.model_time(now))
     }
 
-    /// Counts a parse failure, also of those outside who parse for the core.
+    /// Counts a parse failure, including those of callers that parse for the core.
     fn decode_error(&mut self, stage: &'static str, reason: Reason) {
         *self
             .decode_errors
@@ -454,7 +455,7 @@ impl Observer {
         }
     }
 
-    /// Lets topics, interest and measurement follow discovery.
+    /// Applies changes of discovery to topics, interest and measurement.
     fn follow_up(&mut self, now: Timestamp) {
         for change in self.discovery.changes() {
             self.receivers.changed();
@@ -479,7 +480,7 @@ impl Observer {
             return;
         };
         if naming.dds_name == endpoint.topic {
-            // One copy of the name for all who keep it.
+            // All owners of the name share one copy.
             naming.dds_name = endpoint.topic.clone();
         }
         let (role, message_type) = (endpoint.role, endpoint.message_type.clone());

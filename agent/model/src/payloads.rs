@@ -1,9 +1,8 @@
-//! Samples for those who want them one by one: each once for its writer and sequence number, as
-//! soon as the profiler counts it, those of a reliable writer in the order of their numbers
-//! ([`super::in_order`]).
+//! Samples for subscriptions: one per writer and sequence number, as soon as the profiler counts
+//! it. Samples of a reliable writer are in the order of their numbers ([`super::in_order`]).
 //!
-//! What waits to be taken is bounded; what finds no room is counted and told. It measures nothing:
-//! whether somebody wants samples changes no number.
+//! The output queue is bounded; samples without room are counted and reported. Requests for samples
+//! never change a measurement.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -19,25 +18,25 @@ use super::selection::RequestIds;
 use super::size::{Size, largest};
 use super::writer::Counted;
 
-/// Entries that wait to be taken: a round of the capture thread has far fewer.
+/// Largest number of entries in the output queue; one round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
-/// How long the kernel may take to be told that bytes are wanted, and the model to see what it was
-/// not told of.
+/// Longest time until the kernel captures payloads after a request, and the model has processed
+/// what was captured before.
 pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
 
-/// What somebody wants of one writer.
+/// Requests for the samples of one writer.
 #[derive(Debug)]
 struct WantedWriter {
     topic: Arc<Topic>,
-    /// Ids of the requests, and of those for bytes, and of the others.
+    /// Ids of all requests, of those for payloads, and of the others.
     to: Arc<[u64]>,
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
-    /// Each of those ids, and the first number that is for it.
+    /// Each request id, and the first number for that request.
     begins: Vec<(u64, u64)>,
-    /// Since when bytes are wanted.
+    /// Time since which payloads are requested.
     since: Timestamp,
-    /// Number of the first sample that was given with its bytes.
+    /// Number of the first sample that was dispatched with its payload.
     first_whole: Option<u64>,
     order: InOrder,
 }
@@ -46,32 +45,32 @@ struct WantedWriter {
 #[derive(Debug, Default)]
 struct UnannouncedSamples {
     numbers: BTreeSet<u64>,
-    /// Ids of the requests, and the first number that was counted while each was there.
+    /// Ids of the requests, and the first number that was counted during each.
     begins: Vec<(u64, u64)>,
-    /// Lower ones that are not remembered: the first, the last, and how many.
+    /// Lower numbers that are not remembered: the first, the last, and their count.
     before: Option<(u64, u64, u64)>,
 }
 
-/// The wanted writers and what waits to be taken.
+/// Requested writers and the output queue.
 #[derive(Debug)]
 pub struct Payloads {
     writers: HashMap<Guid, WantedWriter>,
     payload_delay: u64,
-    /// How many of them are wanted with bytes.
+    /// Number of writers whose payloads are requested.
     deep: usize,
     assembly: Assembly,
-    /// Of writers that nobody announced yet, what was counted while samples were requested.
+    /// Counted samples of writers without an announcement, while samples are requested.
     unknown_writers: HashMap<Guid, UnannouncedSamples>,
     dispatches: Vec<Dispatch>,
     dispatch_bytes: usize,
-    /// Bytes that wait for lower numbers.
+    /// Bytes of samples that wait for lower numbers.
     waiting_bytes: usize,
     refused: u64,
 }
 
 impl Payloads {
-    /// Nobody wants anything; later at most `limit` bytes at once, which come at the latest
-    /// `payload_delay` nanoseconds after they are wanted.
+    /// Creates the state without requests. At most `limit` bytes are held; payloads arrive at most
+    /// `payload_delay` nanoseconds after they are requested.
     #[must_use]
     pub fn new(limit: usize, payload_delay: u64) -> Self {
         Self {
@@ -87,8 +86,8 @@ impl Payloads {
         }
     }
 
-    /// Entries, or bytes, and cap of every table: so many writers may be requested, so many be
-    /// unknown writers, and there are so many sample requests.
+    /// Returns the size and cap of each table, in entries or bytes. The arguments are the caps of
+    /// requested writers, unknown writers and sample requests.
     #[must_use]
     pub fn sizes(
         &self,
@@ -96,7 +95,7 @@ impl Payloads {
         unknown_writers: usize,
         sample_requests: usize,
     ) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             writers,
             payload_delay: _,
@@ -158,7 +157,7 @@ impl Payloads {
         sizes
     }
 
-    /// Bytes held, their cap, and what found no room.
+    /// Returns the bytes held, their cap, and the number of samples without room.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         let (bytes, limit, evictions) = self.assembly.size();
@@ -166,25 +165,25 @@ impl Payloads {
         (bytes, limit, evictions + self.refused)
     }
 
-    /// Whether the bytes of anybody's samples are wanted.
+    /// Returns whether payloads of any writer are requested.
     #[must_use]
     pub const fn wants_any_bytes(&self) -> bool {
         self.deep > 0
     }
 
-    /// Whether the bytes of this writer's samples are wanted.
+    /// Returns whether payloads of this writer are requested.
     #[must_use]
     pub fn wants_bytes(&self, writer: Guid) -> bool {
         let is_deep = |interested: &WantedWriter| !interested.payloads.is_empty();
         self.deep > 0 && self.writers.get(&writer).is_some_and(is_deep)
     }
 
-    /// The writers whose samples are given.
+    /// Returns the writers whose samples are requested.
     pub fn wanted(&self) -> impl Iterator<Item = &Guid> {
         self.writers.keys()
     }
 
-    /// Gives the samples of this writer from `now` on; the next one has number `next`.
+    /// Dispatches the samples of this writer from `now` on; the next one has the number `next`.
     pub fn want(
         &mut self,
         writer: Guid,
@@ -230,7 +229,7 @@ impl Payloads {
         self.announced(writer, now);
     }
 
-    /// No longer, after what waits of it.
+    /// Stops dispatching samples of this writer, after those that wait.
     pub fn release(&mut self, writer: Guid, now: Timestamp) {
         self.unknown_writers.remove(&writer);
         self.give_all(writer, now);
@@ -241,26 +240,26 @@ impl Payloads {
         }
     }
 
-    /// Keeps what a DATA or DATA_FRAG brings of a sample that has not been counted yet.
+    /// Keeps the payload of a DATA or DATA_FRAG whose sample is not counted yet.
     pub fn keep(&mut self, sample: record::Sample<'_>, payload: &[u8]) {
         let other_bytes = self.dispatch_bytes + self.waiting_bytes;
         self.assembly.put(sample, payload, other_bytes);
     }
 
-    /// Whether samples of this writer are given.
+    /// Returns whether samples of this writer are requested.
     #[must_use]
     pub fn wants(&self, writer: Guid) -> bool {
         self.writers.contains_key(&writer)
     }
 
-    /// A sample of this writer was counted. Returns as [`Self::turn`] does.
+    /// Dispatches a counted sample. Returns the same as [`Self::turn`].
     pub fn counted(&mut self, writer: Guid, counted: &Counted, progress: &Progress) -> Option<u64> {
         let interested = self.writers.get_mut(&writer)?;
         let payload = match interested.payloads.is_empty() {
             true => None,
             false => self.assembly.take(writer, counted.number),
         };
-        // What was under way when bytes were first wanted has not come whole.
+        // A sample that began before the request is incomplete.
         let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.payload_delay)
             || interested
                 .first_whole
@@ -307,7 +306,8 @@ impl Payloads {
         self.turn(writer, progress, counted.at)
     }
 
-    /// A sample from before the announcement came again. Returns as [`Self::turn`] does.
+    /// Dispatches a retransmitted sample from before the announcement. Returns the same as
+    /// [`Self::turn`].
     pub fn came_again(
         &mut self,
         writer: Guid,
@@ -321,15 +321,15 @@ impl Payloads {
         self.counted(writer, counted, progress)
     }
 
-    /// Whether this sample was counted before its writer was announced, and is to be given if it
-    /// comes again.
+    /// Returns whether this sample was counted before its writer's announcement and is dispatched
+    /// if it is retransmitted.
     #[must_use]
     pub fn lacks(&self, writer: Guid, number: u64) -> bool {
         let interested = self.writers.get(&writer);
         interested.is_some_and(|interested| interested.order.lacks(number))
     }
 
-    /// A sample of a writer that nobody announced yet was counted, while there were these requests.
+    /// Records a counted sample of a writer without an announcement, with the current requests.
     pub fn counted_of_unknown_writer(
         &mut self,
         writer: Guid,
@@ -353,18 +353,18 @@ impl Payloads {
         }
     }
 
-    /// Unknown writers remembered.
+    /// Returns the number of unknown writers remembered.
     #[must_use]
     pub fn unknown_writers(&self) -> usize {
         self.unknown_writers.len()
     }
 
-    /// Forgets unannounced writers that are no more.
+    /// Removes unknown writers for which `is_there` returns false.
     pub fn retain_unknown_writers(&mut self, is_there: impl Fn(Guid) -> bool) {
         self.unknown_writers.retain(|writer, _| is_there(*writer));
     }
 
-    /// Writers of which something waits, or may come again, in the order of their GUIDs.
+    /// Returns the writers with waiting or possibly retransmitted samples, sorted by GUID.
     #[must_use]
     pub fn unsettled(&self) -> Vec<Guid> {
         let is_unsettled = |interested: &WantedWriter| !interested.order.is_idle();
@@ -377,15 +377,15 @@ impl Payloads {
         writers
     }
 
-    /// Whether something of this writer waits, or may come again.
+    /// Returns whether this writer has waiting or possibly retransmitted samples.
     #[must_use]
     pub fn is_unsettled(&self, writer: Guid) -> bool {
         let interested = self.writers.get(&writer);
         interested.is_some_and(|interested| !interested.order.is_idle())
     }
 
-    /// Gives the samples of this writer whose turn it is. Returns the number below which nothing is
-    /// waited for any more, if the order was given up.
+    /// Dispatches the samples of this writer whose turn has come. If the order was given up,
+    /// returns the number below which no sample is waited for.
     pub fn turn(&mut self, writer: Guid, progress: &Progress, now: Timestamp) -> Option<u64> {
         let (_, limit, _) = self.assembly.size();
         let room = (limit / 2).saturating_sub(self.waiting_bytes);
@@ -400,7 +400,8 @@ impl Payloads {
         skip
     }
 
-    /// Nothing more will come of this writer: gives what waits, and tells what never came again.
+    /// Dispatches all waiting samples of a writer that has ended, and reports those that never
+    /// arrived again.
     pub fn give_all(&mut self, writer: Guid, now: Timestamp) {
         let nothing_awaited = Progress::default();
         let Some(interested) = self.writers.get_mut(&writer) else {
@@ -413,7 +414,7 @@ impl Payloads {
         due.into_iter().for_each(|due| self.give_due(due));
     }
 
-    /// These samples will not come.
+    /// Reports samples that will not arrive.
     pub fn missing(&mut self, missing: &Missing) {
         let Missing {
             writer,
@@ -432,25 +433,25 @@ impl Payloads {
         }
     }
 
-    /// Forgets what will not be complete.
+    /// Drops samples that will not become complete.
     pub fn expire(&mut self, now: Timestamp) {
         self.assembly.expire(now);
     }
 
-    /// Takes what is to be given.
+    /// Removes and returns the output queue.
     pub fn take(&mut self) -> Vec<Dispatch> {
         self.dispatch_bytes = 0;
         std::mem::take(&mut self.dispatches)
     }
 
-    /// So much waits that whoever feeds the model should let it be taken first.
+    /// Returns whether the output queue should be taken before further input.
     #[must_use]
     pub const fn is_full(&self) -> bool {
         let (_, limit, _) = self.assembly.size();
         self.dispatches.len() >= WAITING / 2 || self.dispatch_bytes > limit / 4
     }
 
-    /// What was counted of this writer before it was announced is to be given if it comes again.
+    /// Prepares samples counted before the announcement for dispatch if they are retransmitted.
     fn announced(&mut self, writer: Guid, now: Timestamp) {
         let Some(earlier) = self.unknown_writers.remove(&writer) else {
             return;
@@ -471,7 +472,7 @@ impl Payloads {
         }
     }
 
-    /// These will not come again.
+    /// Reports samples that will not be retransmitted.
     fn unannounced(&mut self, writer: Guid, numbers: &[u64]) {
         let Some(interested) = self.writers.get(&writer) else {
             return;
@@ -520,7 +521,7 @@ impl Payloads {
 }
 
 impl WantedWriter {
-    /// That these samples will not come, to each subscription those that are for it.
+    /// Reports missing samples to each subscription, limited to the numbers that concern it.
     fn missed(
         &self,
         writer: Guid,
@@ -550,7 +551,7 @@ impl WantedWriter {
         missed.into_iter().map(dispatches).collect()
     }
 
-    /// That a counted sample is missed by the subscriptions that want its bytes.
+    /// Returns the report that a counted sample is missing for requests of its payload.
     fn not_captured(&self, writer: Guid, number: u64) -> Dispatch {
         Dispatch {
             to: Arc::clone(&self.payloads),

@@ -1,8 +1,7 @@
-//! The measured writers: those of watched topics, and unknown writers, which send without a known
-//! announcement.
+//! Measured writers: those of watched topics, and unknown writers, whose announcement was missed.
 //!
-//! Unknown writers are few: beyond the cap a new one is refused until one has been silent for a
-//! while. What was there before a flood of invented GUIDs keeps its place.
+//! The number of unknown writers is capped: a new one is refused until a known one is silent for a
+//! while. Writers from before a flood of forged GUIDs stay.
 
 mod unknown_writers;
 
@@ -26,46 +25,47 @@ use super::wall_clock::WallClock;
 use super::writer::{Counted, MeasurementContext, Traits, Writer};
 pub use unknown_writers::UnknownWriters;
 
-/// An unknown writer is shown and metered after this long: announcements come within a second or
-/// so.
+/// An unknown writer is shown and metered after this time; announcements usually arrive within a
+/// second.
 const UNKNOWN_AFTER: u64 = 3 * SECOND;
-/// An unknown writer that is silent this long is forgotten; one that sent little makes room sooner.
+/// An unknown writer is dropped after this silence, or earlier if it sent little.
 const FORGET: u64 = 30 * SECOND;
 const EVICTABLE_AFTER: u64 = 3 * SECOND;
-/// Messages after which an unknown writer is not evicted.
+/// Number of messages from which on an unknown writer is not evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
-/// How long the kernel may take to be told of a writer: a round of the capture thread on a busy
-/// machine. Until then it hands over as much as of an unknown writer, which a point cloud exceeds.
+/// Longest time until the kernel knows a writer: a round of the capture thread on a busy machine.
+/// Until then the kernel limits captures as for an unknown writer, and a point cloud exceeds that
+/// limit.
 const KERNEL_UPDATE_TIME: u64 = SECOND / 5;
-/// Unknown writers may use this part of the memory for fragmented samples.
+/// Unknown writers may use one part in this many of the memory for fragmented samples.
 const UNKNOWN_WRITERS_SHARE: usize = 4;
-/// Deliveries that make room for new ones: silent for so long, so many at once.
+/// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
 const SILENT: u64 = 10 * SECOND;
 const GIVEN_UP: usize = 64;
-/// Records of what did not arrive: nothing that was sent.
+/// Flags of records that report undelivered datagrams; they are no transmissions.
 pub(super) const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
 
-/// One measured writer.
+/// A measured writer.
 #[derive(Debug)]
 pub struct Measured {
-    /// What is measured.
+    /// Its measurement.
     pub writer: Box<Writer>,
-    /// Who gets its samples; only of a writer of a topic.
+    /// Its receivers; only for a writer of a known topic.
     pub subscribers: Option<Box<Subscribers>>,
     /// Its topic; `None` for an unknown writer.
     pub topic: Option<TopicId>,
-    /// First record or announcement.
+    /// Time of the first record or announcement.
     pub first_seen: Timestamp,
-    /// Last record.
+    /// Time of the last record.
     pub last_seen: Timestamp,
-    /// An unknown writer that has been one for long enough.
+    /// Whether an unknown writer has existed long enough to be metered.
     pub metered: bool,
-    /// Of an unknown writer, the cookie of the socket it sends by; 0 = unknown.
+    /// Cookie of the socket by which an unknown writer sends; 0 if not known.
     pub sent_from: u64,
     opened: Timestamp,
-    /// A hole was waited for, and no ACKNACK came.
+    /// Whether a gap was waited for and no ACKNACK arrived.
     unacknowledged: bool,
-    /// From here on the kernel hands over all of its fragments.
+    /// Time from which the kernel captures all of its fragments.
     sure_from: Timestamp,
 }
 
@@ -80,7 +80,7 @@ pub struct Profiler {
     search_after: Timestamp,
 }
 
-/// What all writers draw on.
+/// Budgets that all writers share.
 #[derive(Debug)]
 struct SharedBudgets {
     budget: Budget,
@@ -89,7 +89,7 @@ struct SharedBudgets {
     quota: DeliveryQuota,
 }
 
-/// Whose samples something is about.
+/// The writer that a record belongs to.
 #[derive(Clone, Copy)]
 struct WriterRef {
     writer: Guid,
@@ -97,23 +97,23 @@ struct WriterRef {
     topic: Option<TopicId>,
 }
 
-/// What had been counted of a writer that is measured no more.
+/// Counts of a writer that is no longer measured.
 #[derive(Debug)]
 pub struct Retired {
     /// Its topic.
     pub topic: TopicId,
-    /// What was measured of it.
+    /// Its measurement.
     pub measurement: Measurement,
-    /// What became of its samples.
+    /// Sums over its deliveries.
     pub totals: Option<Totals>,
 }
 
-/// What a record was to the profiler.
+/// The result of a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RecordOutcome {
-    /// Of a writer that is not measured.
+    /// Its writer is not measured.
     Unmeasured,
-    /// Of one that is.
+    /// Its writer is measured.
     Measured,
     /// It completed a message, which was counted.
     Counted(Counted),
@@ -121,7 +121,7 @@ pub enum RecordOutcome {
 
 impl Measured {
     fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             writer,
             subscribers,
@@ -140,7 +140,7 @@ impl Measured {
 }
 
 impl Profiler {
-    /// Nothing measured.
+    /// Creates a profiler without writers.
     #[must_use]
     pub fn new(unknown_writer_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
@@ -163,10 +163,11 @@ impl Profiler {
         }
     }
 
-    /// Entries, or bytes, and cap of every table; of what writers have each, of the largest.
+    /// Returns the size and cap of each table, in entries or bytes; for tables of writers, the
+    /// largest.
     #[must_use]
     pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             writers,
             unknown_writers,
@@ -206,18 +207,18 @@ impl Profiler {
         sizes
     }
 
-    /// One of them.
+    /// Returns a measured writer.
     #[must_use]
     pub fn get(&self, guid: Guid) -> Option<&Measured> {
         self.writers.get(&guid)
     }
 
-    /// All of them.
+    /// Returns all measured writers.
     pub fn iter(&self) -> impl Iterator<Item = (&Guid, &Measured)> {
         self.writers.iter()
     }
 
-    /// How far the samples of this writer are decided.
+    /// Returns how far the samples of this writer are decided.
     pub fn progress(
         &mut self,
         guid: Guid,
@@ -230,7 +231,7 @@ impl Profiler {
         Some(measured.writer.progress(acknowledged, now))
     }
 
-    /// Nothing below `number` of this writer is waited for any more.
+    /// Stops waiting for samples of this writer below `number`.
     pub fn skip(&mut self, guid: Guid, number: u64) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.unacknowledged = !measured.is_acknowledged();
@@ -238,7 +239,8 @@ impl Profiler {
         }
     }
 
-    /// Writers of topics, unknown writers, their cap, and those refused or forgotten for it.
+    /// Returns the number of writers with a topic, of unknown writers, the cap of unknown writers,
+    /// and those refused or dropped because of it.
     #[must_use]
     pub fn size(&self) -> (usize, usize, usize, u64) {
         let known = self.writers.len() - self.unknown_writers.len();
@@ -250,7 +252,8 @@ impl Profiler {
         )
     }
 
-    /// Memory for fragmented samples: of writers of topics, of unknown writers, and of deliveries.
+    /// Returns the memory budgets for fragmented samples: for writers with a topic, unknown
+    /// writers, and deliveries.
     #[must_use]
     pub const fn budgets(&self) -> [&Budget; 3] {
         [
@@ -260,13 +263,13 @@ impl Profiler {
         ]
     }
 
-    /// Room for deliveries.
+    /// Returns the quota of deliveries.
     #[must_use]
     pub const fn quota(&self) -> &DeliveryQuota {
         &self.shared.quota
     }
 
-    /// Takes in a record, if it is of a measured writer.
+    /// Processes a record if its writer is measured.
     pub fn record(
         &mut self,
         guid: Guid,
@@ -280,8 +283,7 @@ impl Profiler {
         let now = Timestamp(record.time);
         measured.last_seen = measured.last_seen.max(now);
         if measured.topic.is_none() && !measured.metered {
-            // The kernel filter's budget for unknown writers may leave samples out: no gap is a
-            // loss.
+            // The kernel filter's budget for unknown writers may omit samples, so a gap is no loss.
             measured.opened = now;
         }
         const LEFT: u16 = flag::HOST | flag::OUTGOING;
@@ -295,7 +297,7 @@ impl Profiler {
         }
         let writer_ref = measured.writer_ref(guid);
         let mut novelty = RecordNovelty::New;
-        // What is announced in shared memory is read by whom it concerns or not: nobody sees that.
+        // HEARTBEATs in shared memory do not show which readers receive the samples.
         if measured.topic.is_some() && record.flags & flag::SHM == 0 {
             let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
@@ -330,22 +332,21 @@ impl Profiler {
         counted.map_or(RecordOutcome::Measured, RecordOutcome::Counted)
     }
 
-    /// The tap on shared memory cannot tell what passed before `now`.
+    /// Records that samples in shared memory before `now` may have been missed.
     pub fn uncertain(&mut self, now: Timestamp) {
         for measured in self.writers.values_mut() {
             measured.writer.uncertain(now);
         }
     }
 
-    /// Writers are no longer seen in the processes that they belong to.
+    /// Records that uprobes no longer observe writers.
     pub fn end_exact_view(&mut self) {
         for measured in self.writers.values_mut() {
             measured.writer.end_exact_view();
         }
     }
 
-    /// Measures this writer of a topic from now on; what was measured before its announcement comes
-    /// along.
+    /// Begins to measure a writer with a topic, keeping what was measured before its announcement.
     pub fn measure(
         &mut self,
         guid: Guid,
@@ -359,7 +360,7 @@ impl Profiler {
             known.opened = opened;
             if known.topic.is_none() {
                 known.opened = opened.max(now);
-                // Its unfinished samples are paid for by the other budget from now on.
+                // The other budget accounts for its unfinished samples from now on.
                 known.writer.transfer(
                     &mut self.shared.unknown_writers_budget,
                     &mut self.shared.budget,
@@ -376,21 +377,21 @@ impl Profiler {
         self.writers.insert(guid, measured);
     }
 
-    /// Discovery says more of this writer.
+    /// Updates the properties of a writer from discovery.
     pub fn learn(&mut self, guid: Guid, traits: Traits) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.writer.learn(traits);
         }
     }
 
-    /// A new reader makes the samples of this writer come where they can be seen.
+    /// Records that a new reader makes samples of this writer visible.
     pub fn open(&mut self, guid: Guid, at: Timestamp) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.opened = at;
         }
     }
 
-    /// Measures this writer no more; what it had counted, if it belonged to a topic.
+    /// Stops measuring a writer; returns its counts if it belonged to a topic.
     pub fn stop(
         &mut self,
         guid: Guid,
@@ -418,7 +419,7 @@ impl Profiler {
         })
     }
 
-    /// Settles what has waited long enough.
+    /// Settles samples whose waiting time is over.
     pub fn advance(
         &mut self,
         now: Timestamp,
@@ -463,7 +464,7 @@ impl Profiler {
         unknown_writers
     }
 
-    /// Settles everything: nothing more will come.
+    /// Settles all samples at the end of the input.
     pub fn settle(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
         let mut guids: Vec<_> = self.writers.keys().copied().collect();
         guids.sort_unstable();
@@ -482,12 +483,12 @@ impl Profiler {
                 subscribers
                     .settle(&mut self.shared.writer_context(writer_ref, now, journal, graph));
             }
-            // Who sent twice and was not announced until the end is an unknown writer.
+            // A writer that sent more than once and was never announced is an unknown writer.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
         }
     }
 
-    /// Gives up the deliveries that have been silent longest: somebody found no room.
+    /// Drops the deliveries that have been silent longest, since a new one was refused.
     fn give_up_silent(&mut self, now: Timestamp, journal: &mut Journal, graph: GraphView<'_>) {
         let mut silent: Vec<_> = self
             .writers
@@ -564,7 +565,7 @@ impl Measured {
         subscribers.is_some_and(|subscribers| subscribers.acknowledged_below().is_some())
     }
 
-    /// Whether a reader of its topic asks for repairs, as far as discovery knows.
+    /// Returns whether discovery knows a reliable reader of its topic.
     fn has_reliable_reader(&self, graph: GraphView<'_>) -> bool {
         let topic = self.topic.and_then(|topic| graph.topics.get(topic));
         let readers = topic.into_iter().flat_map(|topic| &topic.readers);
@@ -587,7 +588,7 @@ impl Measured {
         }
     }
 
-    /// It is metered once the kernel has been told.
+    /// Marks the writer as metered once the kernel knows it.
     const fn allow_incomplete(&mut self, now: Timestamp) {
         self.sure_from = Timestamp(now.0.saturating_add(KERNEL_UPDATE_TIME));
         self.writer.allow_incomplete(self.sure_from);

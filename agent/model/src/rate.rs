@@ -1,7 +1,7 @@
-//! Counts of the last seconds, for gauges that people read and for expectations.
+//! Counts of the last seconds, for displayed rates and for expectations.
 //!
-//! Only whole seconds enter a rate, so a periodic topic neither flickers nor reads high at its
-//! start. Counters for rules are elsewhere and exact; this forgets after [`SECONDS`].
+//! Only whole seconds contribute to a rate, so a periodic topic neither flickers nor reads high at
+//! its start. Exact counters are elsewhere; this module forgets after [`SECONDS`].
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
@@ -15,12 +15,12 @@ const SLOTS: usize = SECONDS as usize + 1;
 pub struct Window {
     /// The second that is being counted.
     second: u64,
-    /// Where counting began.
+    /// The second in which counting began.
     began: u64,
     slots: [Slot; SLOTS],
 }
 
-/// What happened in one second, or in several.
+/// Counts of one or several seconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Slot {
     /// Messages.
@@ -31,7 +31,7 @@ pub struct Slot {
     pub lost: u64,
     /// Samples with a source latency.
     pub delayed: u64,
-    /// Sum of their latencies, seconds.
+    /// Sum of their latencies in seconds.
     pub delay: f64,
 }
 
@@ -47,24 +47,24 @@ impl Slot {
 }
 
 impl Window {
-    /// The counts of the second in which `now` lies.
+    /// Returns the counts of the second that contains `now`.
     pub fn current(&mut self, now: Timestamp) -> &mut Slot {
         self.turn(now);
         let slot = usize::try_from(self.second % SLOTS as u64).unwrap_or(0);
-        // The modulus keeps it inside; the first slot stands in for the compiler's sake.
+        // The modulus keeps the index in range; the alternative only satisfies the compiler.
         let slot = if slot < SLOTS { slot } else { 0 };
         #[expect(clippy::indexing_slicing, reason = "slot < SLOTS was just established")]
         &mut self.slots[slot]
     }
 
-    /// Sum over the last `seconds` whole seconds, and how many of those there are: fewer when
+    /// Returns the sum over the last `seconds` whole seconds, and their number, which is lower if
     /// counting began later.
     #[must_use]
     pub fn sum(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
         let current = now.0 / SECOND;
         let end = current.max(self.second);
         let start = end.saturating_sub(seconds.min(SECONDS));
-        // The second in which counting began is not whole.
+        // The second in which counting began is incomplete.
         let start = if self.began == 0 {
             end
         } else {
@@ -72,7 +72,7 @@ impl Window {
         };
         let mut sum = Slot::default();
         for second in start..end {
-            // Slots keep the seconds `self.second - SECONDS ..= self.second`.
+            // The slots contain the seconds `self.second - SECONDS ..= self.second`.
             if second <= self.second && second + SECONDS >= self.second {
                 let slot = usize::try_from(second % SLOTS as u64).unwrap_or(0);
                 if let Some(slot) = self.slots.get(slot) {
@@ -83,7 +83,7 @@ impl Window {
         (sum, end - start)
     }
 
-    /// Empties the slots of seconds that have passed without anything.
+    /// Clears the slots of seconds without counts.
     fn turn(&mut self, now: Timestamp) {
         let second = now.0 / SECOND;
         if self.began == 0 {

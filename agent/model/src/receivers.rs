@@ -1,13 +1,13 @@
-//! Which participant receives at which socket and address.
+//! Maps sockets and addresses to the participants that receive there.
 //!
-//! A socket belongs to the participant that sends by it, or whose process holds it, or for which
-//! something directed (INFO_DST) came to it. Which processes participants live in is learned from
-//! the sockets they send by, for announced process ids are those of a container, if any. What is
-//! directed tells least: RustDDS announces loopback addresses to other hosts, so what their
-//! participants send there for one of this host they send to themselves. An address
-//! belongs to the participant that announces it, unless several do. A multicast group belongs to
-//! nobody: what is directed at one member reaches all. Where nothing tells, or two participants
-//! share a socket, the answer is "unknown", never a guess.
+//! A socket belongs to the participant that sends by it, whose process owns it, or to which a
+//! directed message (INFO_DST) arrived at it. Processes of participants are learned from the
+//! sockets by which they send, since announced process ids may be those of a container. INFO_DST is
+//! the weakest evidence: RustDDS announces loopback addresses to other hosts, so their participants
+//! send messages for this host to themselves. An address belongs to the participant that announces
+//! it, unless several do. A multicast group belongs to no participant, because directed messages
+//! reach all members. Without evidence, or if two participants share a socket, the result is
+//! "unknown".
 
 mod addresses;
 
@@ -26,20 +26,21 @@ use super::sockets::Sockets;
 use super::topic::{Topic, Topics};
 use super::wall_clock::WallClock;
 
-/// Participants remembered of one socket or process.
+/// Largest number of participants remembered per socket or process.
 const MAX_CANDIDATES: usize = 8;
-/// Closed sockets remembered, for those who still hold something of them.
+/// Largest number of closed sockets remembered, for deliveries that still refer to them.
 const CLOSED: usize = 1024;
-/// Addresses kept of one participant.
+/// Largest number of addresses kept per participant.
 const MAX_ADDRESSES: usize = 16;
 
-/// All that is known of receivers.
+/// All evidence about receivers.
 #[derive(Debug)]
 pub struct Receivers {
     sockets: Sockets,
     users: HashMap<u64, SocketUsers>,
     processes: HashMap<u32, Candidates>,
-    /// Participants for which a socket of this host sends, since the last [`Self::tidy`] at most.
+    /// Participants for which a socket of this host sends; at most as old as the last
+    /// [`Self::tidy`].
     local: HashSet<GuidPrefix>,
     addresses: AnnouncedAddresses,
     closed: HashSet<u64>,
@@ -48,38 +49,38 @@ pub struct Receivers {
     generation: u64,
 }
 
-/// What the samples of a writer are seen in front of.
+/// Context in which a writer's samples are processed.
 #[derive(Clone, Copy, Debug)]
 pub struct GraphView<'a> {
-    /// Who receives where.
+    /// Sockets and addresses of receivers.
     pub receivers: &'a Receivers,
-    /// Who is there.
+    /// Participants and endpoints.
     pub discovery: &'a Discovery,
-    /// Who reads what.
+    /// Readers and writers of each topic.
     pub topics: &'a Topics,
-    /// What the clocks of writers are held against.
+    /// Difference between model time and calendar time, for timestamps of writers.
     pub wall_clock: WallClock,
 }
 
 /// Whether a receiver has a reader of the topic.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Matched {
-    /// It has.
+    /// The receiver has a reader.
     Yes,
-    /// Its announcements were seen from the first on, and there is none.
+    /// The receiver has no reader: all of its announcements were captured.
     No,
-    /// Not all of its announcements were seen, or the receiver is not known.
+    /// Some announcements were missed, or the receiver is not known.
     Unknown,
 }
 
-/// To whom a socket may belong.
+/// Participants that a socket may belong to.
 #[derive(Debug, Default)]
 struct SocketUsers {
-    /// They send by it.
+    /// Participants that send by it.
     senders: Candidates,
-    /// Something directed to them came to it.
+    /// Participants for which a directed message arrived at it.
     addressed: Candidates,
-    /// It sent for more participants than are remembered: who forges does that.
+    /// More participants send by it than are remembered, which indicates forgery.
     is_crowded: bool,
 }
 
@@ -87,7 +88,8 @@ struct SocketUsers {
 struct Candidates(Vec<GuidPrefix>);
 
 impl Receivers {
-    /// Nothing known; at most `limit` sockets, and the addresses of so many participants.
+    /// Creates an empty state for at most `limit` sockets and the addresses of `participants`
+    /// participants.
     #[must_use]
     pub fn new(limit: usize, participants: usize) -> Self {
         Self {
@@ -106,24 +108,24 @@ impl Receivers {
         }
     }
 
-    /// Rises with every change; who compares need not ask again.
+    /// Returns a number that increases with every change, so that callers can cache results.
     #[must_use]
     pub const fn generation(&self) -> u64 {
         self.generation
     }
 
-    /// Something else changed that answers depend on.
+    /// Records an external change that affects results.
     pub const fn changed(&mut self) {
         self.generation += 1;
     }
 
-    /// The sockets as they were told.
+    /// Returns the known sockets.
     #[must_use]
     pub const fn sockets(&self) -> &Sockets {
         &self.sockets
     }
 
-    /// Who holds the socket by which each participant sends, as far as that is known.
+    /// Returns the owner of the socket by which each participant sends, if known.
     #[must_use]
     pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
         let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
@@ -132,7 +134,7 @@ impl Receivers {
                 continue;
             };
             for sender in &users.senders.0 {
-                // Of several sockets always the same one.
+                // The choice among several sockets is deterministic.
                 let holder = holders.entry(*sender).or_insert(facts);
                 let better = |facts: &SocketFacts| (facts.process_id.is_none(), facts.cookie);
                 if better(facts) < better(holder) {
@@ -143,13 +145,13 @@ impl Receivers {
         holders
     }
 
-    /// Whether this socket was closed a while ago.
+    /// Returns whether this socket was closed recently.
     #[must_use]
     pub fn is_closed(&self, socket: u64) -> bool {
         self.closed.contains(&socket)
     }
 
-    /// Takes in what is known of a socket.
+    /// Records facts about a socket.
     pub fn socket(&mut self, facts: SocketFacts) {
         let (cookie, process) = (facts.cookie, facts.process_id);
         let before = self.sockets.get(cookie).and_then(|known| known.process_id);
@@ -168,13 +170,13 @@ impl Receivers {
         self.generation += 1;
     }
 
-    /// This socket may be open, but the kernel remembers others in its place.
+    /// Records that the kernel's table dropped this socket, which may still be open.
     pub fn socket_forgotten(&mut self, cookie: u64) {
         self.sockets.forget(cookie);
         self.socket_closed(cookie);
     }
 
-    /// This socket is no more.
+    /// Records that this socket was closed.
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);
         self.users.remove(&cookie);
@@ -188,19 +190,19 @@ impl Receivers {
         self.generation += 1;
     }
 
-    /// Whether a socket of this host sends for this participant.
+    /// Returns whether a socket of this host sends for this participant.
     #[must_use]
     pub fn is_local(&self, prefix: &GuidPrefix) -> bool {
         self.local.contains(prefix)
     }
 
-    /// Learns from a record whose socket it is. Returns whether a socket of this host sent it that
-    /// sends for few participants.
+    /// Learns the owner of a socket from a record. Returns whether a socket of this host sent it,
+    /// unless that socket sends for too many participants.
     pub fn learn(&mut self, record: &Record) -> bool {
         if record.flags & flag::HOST == 0 || record.socket == 0 {
             return false;
         }
-        // Who told that it was closed may have lost sight of it only.
+        // A socket that was reported as closed may still be open if the kernel's table dropped it.
         if !self.closed.is_empty() {
             self.closed.remove(&record.socket);
         }
@@ -246,23 +248,23 @@ impl Receivers {
         is_local
     }
 
-    /// A participant announces where it is reached by unicast.
+    /// Records the announced unicast addresses of a participant.
     pub fn announce(&mut self, prefix: GuidPrefix, addresses: impl Iterator<Item = Destination>) {
         for destination in addresses.take(MAX_ADDRESSES) {
             self.generation += u64::from(self.addresses.put(prefix, destination));
         }
     }
 
-    /// Addresses, their cap, and those given up because of it.
+    /// Returns the number of addresses, their cap, and those dropped because of it.
     #[must_use]
     pub fn addresses(&self) -> (usize, usize, u64) {
         self.addresses.size()
     }
 
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             sockets,
             users,
@@ -299,7 +301,7 @@ impl Receivers {
         sizes
     }
 
-    /// Forgets what participants said that are no more and do not wait for room.
+    /// Removes the evidence of participants that are gone and do not wait for an entry.
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
         self.addresses.retain(is_there);
@@ -320,7 +322,7 @@ impl Receivers {
             .collect();
     }
 
-    /// The participant that receives what comes this way.
+    /// Returns the participant that receives on this route.
     #[must_use]
     pub fn owner(&self, route: &Route, discovery: &Discovery) -> Option<GuidPrefix> {
         if route.socket != 0 {
@@ -332,7 +334,7 @@ impl Receivers {
                 process.and_then(|process| self.processes.get(&process)),
                 users.map(|users| &users.addressed),
             ];
-            // Each list is asked only about those that the ones before leave open.
+            // Each list is only checked for participants that the previous ones leave open.
             let mut open: Vec<GuidPrefix> = Vec::new();
             for candidates in lists.into_iter().flatten() {
                 let alive = |owner: &&GuidPrefix| discovery.participants().contains_key(*owner);
@@ -361,7 +363,7 @@ impl Receivers {
 }
 
 impl GraphView<'_> {
-    /// Whether this participant reads the topic.
+    /// Returns whether this participant reads the topic.
     #[must_use]
     pub fn matched(&self, topic: Option<&Topic>, prefix: GuidPrefix) -> Matched {
         let Some(topic) = topic else {
@@ -377,7 +379,7 @@ impl GraphView<'_> {
     }
 }
 
-/// This participant's readers of the topic, sorted but for those beside it.
+/// Returns this participant's readers of the topic, sorted, without those of buffer topics.
 pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
     [&topic.readers, &topic.buffer_endpoints]
         .into_iter()
@@ -389,8 +391,8 @@ pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> 
         })
 }
 
-/// The only participant that announces to live in this process, by its own number. Fast DDS says no
-/// more than the low 16 bits.
+/// Returns the only participant that announces this process id, or `None`. Fast DDS announces only
+/// the low 16 bits.
 fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
     let mut announced = discovery.participants().iter().filter(|(_, participant)| {
         participant

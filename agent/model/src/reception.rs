@@ -1,8 +1,8 @@
-//! Which samples of one writer came whole at one place: on this host at all, or at one receiver.
+//! Samples of one writer that arrived whole at one point: this host, or one receiver.
 //!
-//! Puts sequence numbers and fragments together: a sample in fragments is there when all of them
-//! are, a late fragment does not reopen it, and what stays away is decided once. It counts nothing;
-//! what it finds is for the caller to count.
+//! Combines sequence numbers and fragments: a fragmented sample is complete with its last fragment,
+//! a late fragment does not reopen it, and each missing sample is decided once. The caller counts
+//! the results.
 
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
 use ros2probe_wire::{RtpsTime, Timestamp};
@@ -11,97 +11,98 @@ use super::samples::{Budget, Facts, Progress, Samples};
 use super::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
 use super::size::Size;
 
-/// A fragment that completes its sample this late after the sample's last one was retransmitted.
+/// A fragment that completes its sample this long after the sample's last fragment was
+/// retransmitted.
 const REPAIR: i64 = 5_000_000;
-/// Numbers below the newest whose fragments a sampled view still waits for.
+/// Numbers below the newest for whose fragments a sampled view still waits.
 const UNDER_WAY: u64 = 8;
 
-/// State of one writer's samples at one place.
+/// State of one writer's samples at one point.
 #[derive(Debug, Default)]
 pub struct Reception {
     sequence: Sequence,
     samples: Samples,
 }
 
-/// A sample that is complete.
+/// A complete sample.
 #[derive(Clone, Copy, Debug)]
 pub struct Whole {
     /// Its sequence number.
     pub number: u64,
-    /// Payload bytes, encapsulation included.
+    /// Payload bytes, including encapsulation.
     pub bytes: u64,
-    /// Not a disposal: those take a sequence number and are no message.
+    /// False for a disposal, which has a sequence number but is no message.
     pub is_message: bool,
-    /// It was retransmitted.
+    /// Whether it was retransmitted.
     pub recovered: bool,
-    /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
+    /// Whether it is the newest so far; otherwise its delay includes a retransmission.
     pub newest: bool,
-    /// Its number is not believed to be the writer's.
+    /// Whether its number is not confirmed as the writer's.
     pub unconfirmed: bool,
-    /// INFO_TS.
+    /// INFO_TS of the sample.
     pub source: RtpsTime,
-    /// What lies where a header's stamp would.
+    /// The bytes at the position of a header's stamp.
     pub stamp: Option<(i32, u32)>,
-    /// Its first datagram.
+    /// Time of its first datagram.
     pub began: Timestamp,
-    /// Its last missing fragment came this long after its last fragment number, nanoseconds.
+    /// Nanoseconds from its last fragment number to its last missing fragment.
     pub repaired_after: i64,
 }
 
-/// What a record did.
+/// Result of a record.
 #[derive(Clone, Copy, Debug)]
 pub enum Outcome {
-    /// It completed a sample.
+    /// The record completed a sample.
     Whole(Whole),
-    /// It brought nothing that had not come before.
+    /// The record is a duplicate.
     Duplicate,
-    /// Something is missing still, or it was of no use.
+    /// The sample is still incomplete, or the record was not usable.
     Open,
 }
 
-/// What became of samples that stayed away.
+/// A decision about missing samples.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Decision {
-    /// They never came.
+    /// The samples never arrived.
     Lost {
-        /// The first.
+        /// First sequence number.
         first: u64,
-        /// The last.
+        /// Last sequence number.
         last: u64,
-        /// Fragments of it came; then it is one sample.
+        /// Whether fragments of it arrived; it is then a single sample.
         incomplete: bool,
     },
-    /// The writer will not send it.
+    /// The writer will not send the sample.
     Irrelevant(u64),
 }
 
 impl Reception {
-    /// Entries, or bytes, and cap of every list.
+    /// Returns the size and cap of each list, in entries or bytes.
     pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self { sequence, samples } = self;
         sequence.sizes().into_iter().chain(samples.sizes())
     }
 
-    /// The numbers.
+    /// Returns the sequence numbers.
     #[must_use]
     pub const fn sequence(&self) -> &Sequence {
         &self.sequence
     }
 
-    /// The numbers.
+    /// Returns the sequence numbers.
     pub const fn sequence_mut(&mut self) -> &mut Sequence {
         &mut self.sequence
     }
 
-    /// Whether fragments of this sample came and others are missing.
+    /// Returns whether this sample has some but not all of its fragments.
     #[must_use]
     pub fn is_partial(&self, number: u64) -> bool {
         self.samples.is_partial(number)
     }
 
-    /// Takes in a DATA_FRAG of a view in which samples may be missing: whether it completes its
-    /// sample. Samples far below it are waited for no longer, unless it is `unconfirmed`.
+    /// Adds a DATA_FRAG of a sampled view. Returns whether it completes its sample. Samples far
+    /// below it are no longer waited for, unless it is `unconfirmed`.
     pub fn assemble(
         &mut self,
         fragments: DataFrag<'_>,
@@ -117,18 +118,18 @@ impl Reception {
         matches!(progress, Progress::Complete(_))
     }
 
-    /// Moves what the unfinished samples take from one budget to another.
+    /// Moves the memory of unfinished samples from one budget to another.
     pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
         self.samples.transfer(from, to);
     }
 
-    /// Samples in fragments that begin before this are no loss when they stay incomplete: the
-    /// kernel did not know the writer yet, and what it hands over of unknown writers is limited.
+    /// Allows fragmented samples that begin before this to be incomplete without a loss: the kernel
+    /// did not know the writer yet and limits captures of unknown writers.
     pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.samples.allow_incomplete(until);
     }
 
-    /// Takes in a DATA or DATA_FRAG of a writer that retransmits, or does not.
+    /// Processes a DATA or DATA_FRAG of a writer that is `reliable` or not.
     pub fn sample(
         &mut self,
         sample: record::Sample<'_>,
@@ -147,7 +148,7 @@ impl Reception {
         }
     }
 
-    /// Whether the number of this DATA or DATA_FRAG is believed to be the writer's.
+    /// Returns whether the number of this DATA or DATA_FRAG is confirmed as the writer's.
     pub fn recognise(
         &mut self,
         sample: record::Sample<'_>,
@@ -170,7 +171,7 @@ impl Reception {
         }
     }
 
-    /// Takes in a HEARTBEAT.
+    /// Processes a HEARTBEAT.
     pub fn heartbeat(
         &mut self,
         heartbeat: Heartbeat<'_>,
@@ -185,7 +186,7 @@ impl Reception {
         });
     }
 
-    /// Takes in a GAP.
+    /// Processes a GAP.
     pub fn gap(&mut self, gap: Gap<'_>, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
         let (start, list) = (gap.start(), gap.list());
         let now = Timestamp(gap.record().time);
@@ -195,7 +196,7 @@ impl Reception {
         });
     }
 
-    /// This sample exists, whether it came or not.
+    /// Records that this sample exists, whether it arrived or not.
     pub fn exists(
         &mut self,
         number: u64,
@@ -209,7 +210,7 @@ impl Reception {
         });
     }
 
-    /// Takes over what `other` received; `other`'s unfinished samples are given up.
+    /// Merges what `other` received; its unfinished samples are dropped.
     pub fn absorb(
         &mut self,
         mut other: Self,
@@ -224,7 +225,8 @@ impl Reception {
         });
     }
 
-    /// Another view takes over: samples of which a part came are its, and no losses. Their numbers.
+    /// Hands over to another view: returns the numbers of unfinished samples, which are no losses
+    /// here.
     pub fn abandon(&mut self) -> Vec<u64> {
         let mut partial = Vec::new();
         for number in self.sequence.settled()..self.sequence.next() {
@@ -236,7 +238,7 @@ impl Reception {
         partial
     }
 
-    /// Nobody is there any more for what has not come since the last sample that came.
+    /// Excuses all samples after the last one that arrived, because the receiver is gone.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
         for number in (sequence.settled()..sequence.next()).rev() {
@@ -248,8 +250,8 @@ impl Reception {
         }
     }
 
-    /// Decides what has been open for `window` nanoseconds, and what the writer withdrew `grace`
-    /// nanoseconds ago.
+    /// Decides samples that have been open for `window` nanoseconds, and those that the writer
+    /// withdrew `grace` nanoseconds ago.
     pub fn advance(
         &mut self,
         now: Timestamp,
@@ -265,7 +267,7 @@ impl Reception {
         samples.expire(now, 2 * window, budget);
     }
 
-    /// Decides everything: nothing more will come.
+    /// Decides all samples at the end of the input.
     pub fn settle(&mut self, budget: &mut Budget, decide: &mut impl FnMut(Decision)) {
         let Self { sequence, samples } = self;
         sequence.settle_all(&mut |settled| decide(decision(settled, samples, budget)));
@@ -301,7 +303,7 @@ impl Reception {
         })
     }
 
-    /// Takes in a DATA or DATA_FRAG whose number is not believed.
+    /// Processes a DATA or DATA_FRAG whose number is not confirmed.
     fn unconfirmed(&mut self, sample: record::Sample<'_>, budget: &mut Budget) -> Outcome {
         let number = sample.sequence_number();
         let now = Timestamp(sample.record().time);
@@ -335,7 +337,7 @@ impl Reception {
     ) -> Outcome {
         let number = fragments.sequence_number();
         let now = Timestamp(fragments.record().time);
-        // Sequence numbers are signed (RTPS 2.5, 9.3.2): beyond is none.
+        // Sequence numbers are signed (RTPS 2.5, 9.3.2), so larger values are invalid.
         if self.sequence.has(number) || number > u64::MAX >> 1 {
             return Outcome::Duplicate;
         }
@@ -351,8 +353,8 @@ impl Reception {
             }
             Progress::Partial | Progress::Complete(_) => {}
         }
-        // A sample that is joined in the middle does not count as one that was sent; the writer's
-        // first one cannot be.
+        // The first captured sample does not count as sent if its first fragments were missed,
+        // except for number 1.
         let joined = u64::from(fragments.starting() != 1 && number > 1);
         self.sequence.begin(number.saturating_add(joined));
         self.exists(number, now, budget, decide);
@@ -413,7 +415,7 @@ fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Dec
         }
         Settled::Lost(number) => (number, number),
         Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
-        // A sample of which fragments came was sent: no excuse holds.
+        // A sample with fragments was sent, so no excuse applies.
         Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
         Settled::Irrelevant(number) => return Decision::Irrelevant(number),
     };

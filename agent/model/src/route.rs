@@ -1,21 +1,21 @@
-//! By which route a record came: leaving this host or arriving, at which socket, for which address.
+//! The route of a record: direction, receiving socket and destination address.
 
 use std::net::{IpAddr, Ipv6Addr, SocketAddr};
 
 use ros2probe_wire::Record;
 use ros2probe_wire::record::flag;
 
-/// Which side of the network a delivery was seen at.
+/// The direction of a delivery.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Direction {
-    /// On its way out of this host. Losses are not counted here: what did not leave is nobody's.
+    /// The samples left this host. Losses are not counted, because unsent samples have no receiver.
     Sent,
-    /// At a receiver.
+    /// The samples arrived at a receiver.
     Received,
 }
 
 impl Direction {
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -28,14 +28,14 @@ impl Direction {
 /// A UDP destination.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug, Default)]
 pub struct Destination {
-    /// IPv4-mapped for IPv4.
+    /// Address, IPv4-mapped for IPv4.
     pub address: [u8; 16],
     /// Port.
     pub port: u16,
 }
 
 impl Destination {
-    /// Where the record's datagram was sent to.
+    /// Returns the destination of the record's datagram.
     #[must_use]
     pub fn of(record: &Record) -> Self {
         let [a, b, c, d] = record.destination.map(u32::to_ne_bytes);
@@ -49,13 +49,13 @@ impl Destination {
         }
     }
 
-    /// Whether a datagram for it may reach several receivers.
+    /// Returns whether its datagrams may reach several receivers.
     #[must_use]
     pub fn is_multicast(&self) -> bool {
         self.socket_address().ip().is_multicast()
     }
 
-    /// As everybody writes it.
+    /// Returns the address in its usual form, with mapped IPv4 addresses converted.
     #[must_use]
     pub fn socket_address(&self) -> SocketAddr {
         let address = Ipv6Addr::from(self.address).to_canonical();
@@ -76,19 +76,19 @@ impl From<SocketAddr> for Destination {
     }
 }
 
-/// One route of a writer's samples.
+/// A route of a writer's samples.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Route {
-    /// Leaving or arriving.
+    /// Outgoing or incoming.
     pub direction: Direction,
-    /// Cookie of the receiving socket; 0 when leaving, and on a wire source.
+    /// Cookie of the receiving socket; 0 for outgoing samples and on a wire source.
     pub socket: u64,
-    /// Where to.
+    /// Destination of the samples.
     pub destination: Destination,
 }
 
 impl Route {
-    /// That of the record's datagram.
+    /// Returns the route of the record's datagram.
     #[must_use]
     pub fn of(record: &Record) -> Self {
         let destination = Destination::of(record);
@@ -112,13 +112,13 @@ impl Route {
 }
 
 impl Route {
-    /// On its way out.
+    /// Returns whether the route is outgoing.
     #[must_use]
     pub fn is_sent(&self) -> bool {
         self.direction == Direction::Sent
     }
 
-    /// A multicast that arrives: of itself it tells nothing about who receives it.
+    /// Returns whether it is an incoming multicast route, whose receiver is not evident.
     #[must_use]
     pub fn is_open(&self) -> bool {
         !self.is_sent() && self.destination.is_multicast()

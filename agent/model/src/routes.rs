@@ -1,7 +1,7 @@
-//! The routes of one writer's samples, and to whom each leads.
+//! The routes of one writer's samples, and the receiver of each.
 //!
-//! What was found out of a route is kept until something changes that it depends on. Bounded: the
-//! route that has been silent longest makes room.
+//! A resolved receiver is kept until the facts that it depends on change. The number of routes is
+//! bounded: the one with the longest silence is dropped for a new one.
 
 use std::collections::VecDeque;
 
@@ -14,51 +14,52 @@ use super::route::{Destination, Route};
 use super::size::Size;
 use super::topic::Topic;
 
-/// Routes of one writer.
+/// Largest number of routes per writer.
 const LIMIT: usize = 512;
-/// Moments at which it is known what had left, one a second.
+/// Number of times, one per second, at which the last departed number is remembered.
 const MOMENTS: usize = 24;
 
 /// All routes of one writer, sorted.
 #[derive(Debug, Default)]
 pub struct Routes {
     routes: Vec<KnownRoute>,
-    /// The one that was used last.
+    /// Index of the route used last.
     last: usize,
-    /// Routes given up because of the cap.
+    /// Routes dropped because of the cap.
     evictions: u64,
 }
 
-/// One route.
+/// A route and its receiver.
 #[derive(Debug)]
 pub struct KnownRoute {
-    /// Which.
+    /// The route.
     pub route: Route,
-    /// The participant at its end.
+    /// The participant that receives on it.
     pub owner: Option<GuidPrefix>,
-    /// What was directed to it there, where nothing else tells.
+    /// The participant of directed messages on it, the only evidence of a receiver.
     directed_to: Option<GuidPrefix>,
-    /// Whether that participant reads the topic; of a multicast that leaves, whether anybody does.
+    /// Whether that participant reads the topic; for an outgoing multicast, whether any participant
+    /// does.
     pub matched: Matched,
-    /// Where its delivery stands, if that was looked up.
+    /// Index of its delivery, if resolved.
     pub delivery: Option<usize>,
-    /// Last record.
+    /// Time of the last record.
     pub last_seen: Timestamp,
-    /// New samples that came by this route.
+    /// Number of new samples that arrived on it.
     pub brought: u64,
-    /// It is seen at a socket, not on a wire.
+    /// Whether it is observed at a socket rather than on a wire.
     pub at_socket: bool,
-    /// Samples have come by this route.
+    /// Whether samples, rather than only control messages, have used it.
     pub has_data: bool,
-    /// What had left by when.
+    /// Highest number that had left, at each remembered time.
     left: VecDeque<(Timestamp, u64)>,
 }
 
 impl Routes {
-    /// Entries and cap of every list.
+    /// Returns the length and cap of each list.
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             routes,
             last: _,
@@ -86,34 +87,34 @@ impl Routes {
         ]
     }
 
-    /// All of them.
+    /// Returns all routes.
     pub fn iter(&self) -> impl Iterator<Item = &KnownRoute> {
         self.routes.iter()
     }
 
-    /// All of them.
+    /// Returns all routes.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut KnownRoute> {
         self.routes.iter_mut()
     }
 
-    /// One of them.
+    /// Returns the route at this index.
     #[must_use]
     pub fn get(&self, index: usize) -> Option<&KnownRoute> {
         self.routes.get(index)
     }
 
-    /// One of them.
+    /// Returns the route at this index.
     pub fn get_mut(&mut self, index: usize) -> Option<&mut KnownRoute> {
         self.routes.get_mut(index)
     }
 
-    /// Routes given up because of the cap.
+    /// Returns the number of routes dropped because of the cap.
     #[must_use]
     pub const fn evictions(&self) -> u64 {
         self.evictions
     }
 
-    /// Where this route stands.
+    /// Returns the index of this route.
     #[must_use]
     pub fn find(&self, route: &Route) -> Option<usize> {
         if self
@@ -128,7 +129,7 @@ impl Routes {
             .ok()
     }
 
-    /// Where this route stands, known from now on.
+    /// Returns the index of this route, adding it if it is new.
     pub fn find_or_insert(
         &mut self,
         route: Route,
@@ -167,19 +168,19 @@ impl Routes {
         index
     }
 
-    /// Whether what is sent to this place is seen at sockets.
+    /// Returns whether datagrams for this destination are observed at sockets.
     #[must_use]
     pub fn is_at_socket(&self, destination: Destination) -> bool {
         let mut routes = self.routes.iter();
         routes.any(|known| known.at_socket && known.route.destination == destination)
     }
 
-    /// Forgets routes.
+    /// Keeps the routes for which `keep` returns true.
     pub fn retain(&mut self, keep: impl FnMut(&KnownRoute) -> bool) {
         self.routes.retain(keep);
     }
 
-    /// The highest number that has left for this place, and what had left by a moment.
+    /// Returns the outgoing route to this destination.
     #[must_use]
     pub fn leaving(&self, destination: Destination) -> Option<&KnownRoute> {
         self.find(&Route {
@@ -192,7 +193,7 @@ impl Routes {
 }
 
 impl KnownRoute {
-    /// Finds out who is at its end.
+    /// Resolves the receiver of each route that is out of date.
     pub fn resolve(&mut self, graph: &GraphView<'_>, topic: Option<&Topic>) {
         let is_there = |prefix: &GuidPrefix| graph.discovery.participants().contains_key(prefix);
         self.owner = graph
@@ -212,7 +213,7 @@ impl KnownRoute {
         };
     }
 
-    /// Something was directed to this participant here.
+    /// Records a message directed to this participant on a route.
     pub fn note_directed(
         &mut self,
         prefix: GuidPrefix,
@@ -226,7 +227,7 @@ impl KnownRoute {
         }
     }
 
-    /// Up to this number everything has left by now.
+    /// Records that all samples up to this number have left by `now`.
     pub fn mark(&mut self, number: u64, now: Timestamp) {
         let is_due = self
             .left
@@ -240,7 +241,7 @@ impl KnownRoute {
         }
     }
 
-    /// Up to which number everything had left then.
+    /// Returns the highest number that had left by this time.
     #[must_use]
     pub fn left_by(&self, at: Timestamp) -> Option<u64> {
         let mut left = self.left.iter().rev();

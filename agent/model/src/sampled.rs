@@ -1,9 +1,10 @@
-//! What a sampled view tells of one writer: how many samples there were, and how many of them were
-//! seen.
+//! Counts of one writer in a sampled view: how many samples were written, and how many of them were
+//! read.
 //!
-//! Shared memory is looked at now and then; what was overwritten meanwhile is not seen. The
-//! sequence numbers still tell how many samples there were, so messages are counted by their span,
-//! and no number that was not seen is a loss. While a writer is seen this way, what comes of it by
+//! Shared memory is polled, so samples that are overwritten between two polls are not seen.
+//! Sequence numbers still show how many were written: messages are counted by the span of their
+//! numbers, and unseen numbers are no losses. While a writer is sampled, its network samples are
+//! counted here too.
 //! the network counts here too: it adds to what was seen.
 
 use ros2probe_wire::Timestamp;
@@ -13,73 +14,74 @@ use super::measurement::SampledFacts;
 use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
 
-/// A writer that was not seen in shared memory for so long is not sampled any more.
+/// A writer that was not seen in shared memory for this long is no longer sampled.
 const HOLD: u64 = 10 * SECOND;
-/// How long a sample that was not seen may still come by another way before it is left out.
+/// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const PATIENCE: u64 = 200 * MILLISECOND;
-/// Numbers below the next one of which it is known one by one whether they were seen.
+/// Numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
 /// State of one writer's sampled view.
 #[derive(Debug)]
 pub struct Sampled {
-    /// Last record from shared memory.
+    /// Time of the last record from shared memory.
     last: Timestamp,
-    /// Something came by the network since shared memory fell silent.
+    /// Whether a network record arrived after shared memory fell silent.
     left: bool,
     span: u64,
     seen: u64,
     uncertain: u64,
-    /// Messages that a HEARTBEAT or an ACKNACK told of, and whose size nothing has told yet.
+    /// Messages known from HEARTBEATs and ACKNACKs whose size is not known yet.
     unmeasured: u64,
-    /// Bit `i`: the number `i + 1` below the next one was seen, or needs not be.
+    /// Bit `i`: the number `i + 1` below the next one was seen or need not be.
     sighted: u128,
-    /// Likewise: all of it was seen, or its last fragment while others were not.
+    /// Bit `i`: of that number everything was seen, or its last fragment without some others.
     finished: u128,
-    /// The number to which these bits belong.
+    /// The number to which these bits are relative.
     next: u64,
-    /// Nothing below this is waited for.
+    /// No sample below this number is waited for.
     settled: u64,
-    /// When [`Self::tick`] last settled, and the next number at that time.
+    /// Time of the last [`Self::tick`] that settled, and the next number at that time.
     last_settled: (Timestamp, u64),
     /// Runs of numbers that were settled without being seen.
     unseen: Vec<(u64, u64)>,
-    /// The latest number that arrived whole as far as can be told, and when.
+    /// The latest number that arrived, presumably whole, and its time.
     arrived: Option<(u64, Timestamp)>,
-    /// Where its payload begins with a header: the stamp that came with the first fragment.
+    /// The stamp from the first fragment of a sample whose payload begins with a header.
     head: Option<(u64, (i32, u32))>,
 }
 
-/// What a record changed.
+/// Changes caused by a record.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct SampledUpdate {
-    /// Numbers that are now known to be used, the record's own included.
+    /// Number of samples that are now known to exist, including the record's own.
     pub samples: u64,
-    /// Samples that may be taken for as large as this one: those, and others that were told of.
+    /// Number of samples assumed to have the size of this one: `samples`, and earlier announced
+    /// ones.
     pub alike: u64,
-    /// Time since the number before it arrived, when that was seen.
+    /// Time since the previous number arrived, if that was seen.
     pub interval: Option<i64>,
-    /// It is the newest one and has arrived: its delay is a delivery delay.
+    /// Whether it is the newest sample and has arrived, so that its delay is meaningful.
     pub arrived: bool,
-    /// Nothing more of it is waited for, for the first time.
+    /// Whether nothing more of it is waited for, for the first time.
     pub finished: bool,
-    /// Its number is not believed to be the writer's.
+    /// Whether its number is not confirmed as the writer's.
     pub unconfirmed: bool,
 }
 
-/// What was seen of a sample, its latest record included.
+/// How much of a sample was seen, including its latest record.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Seen {
-    /// A part of it, of which more follows.
+    /// Some fragments, with more to follow.
     Part,
-    /// Its last fragment, while others are missing.
+    /// The last fragment, while others are missing.
     Tail,
-    /// All of it.
+    /// The whole sample.
     Whole,
 }
 
 impl Sampled {
-    /// From now on.
+    /// Creates a view that begins at `now`.
     #[must_use]
     pub const fn new(now: Timestamp) -> Self {
         Self {
@@ -100,10 +102,10 @@ impl Sampled {
         }
     }
 
-    /// Entries and cap; it is taken after each record.
+    /// Returns the length and cap of its list, which is taken after each record.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             last: _,
             left: _,
@@ -123,40 +125,39 @@ impl Sampled {
         [Size::new("sampled.unseen", unseen.len(), 0)]
     }
 
-    /// A record came from shared memory.
+    /// Records that the writer was seen in shared memory.
     pub fn touch(&mut self, now: Timestamp) {
         self.last = self.last.max(now);
         self.left = false;
     }
 
-    /// Whether it still is seen that way.
+    /// Returns whether the writer is still sampled.
     #[must_use]
     pub const fn is_current(&self, now: Timestamp) -> bool {
         self.last.0.saturating_add(HOLD) > now.0
     }
 
-    /// Whether a record at `now` still belongs here: while it is seen that way, and the first one
-    /// after that, for what is missing before it may have gone through shared memory.
+    /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
+    /// the first record after that, since samples missing before it may have used shared memory.
     pub const fn takes(&mut self, now: Timestamp) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
         takes
     }
 
-    /// It is seen otherwise from now on. Samples under way may still come, until [`Self::tick`]
-    /// settles them.
+    /// Ends the sampled view. Pending samples may still arrive until [`Self::tick`] settles them.
     pub const fn end(&mut self) {
         (self.last, self.left) = (Timestamp(0), true);
     }
 
-    /// Whether this sample is sent and still waited for.
+    /// Returns whether this sample was sent and is still waited for.
     #[must_use]
     pub fn awaits(&self, number: u64) -> bool {
         let bit = self.bit(number, self.next);
         number >= self.settled && bit.is_some_and(|bit| self.finished & bit == 0)
     }
 
-    /// Takes in a sample that [`Self::awaits`], or a fragment of one, after [`Self::end`].
+    /// Processes a sample that [`Self::awaits`] accepts, or a fragment of one, after [`Self::end`].
     pub fn catch_up(&mut self, number: u64, seen: Seen) -> SampledUpdate {
         SampledUpdate {
             finished: self.sight(number, seen),
@@ -164,8 +165,8 @@ impl Sampled {
         }
     }
 
-    /// Takes over these samples, counted already, of which another view saw a part. `next` is the
-    /// number after the newest.
+    /// Takes over counted samples that another view saw in part. `next` is the number after the
+    /// newest.
     pub fn take_over(&mut self, partial: &[u64], next: u64, now: Timestamp) {
         self.follow(next, now);
         for &number in partial {
@@ -179,7 +180,7 @@ impl Sampled {
         }
     }
 
-    /// Waits no longer for what was missing at the last look and is still.
+    /// Stops waiting for samples that were already missing at the previous tick.
     pub fn tick(&mut self, now: Timestamp) {
         let (then, next) = self.last_settled;
         if now.0.saturating_sub(then.0) >= PATIENCE {
@@ -188,18 +189,18 @@ impl Sampled {
         }
     }
 
-    /// Waits for nothing any longer.
+    /// Stops waiting for all samples.
     pub fn settle_all(&mut self) {
         self.settle(self.next);
     }
 
-    /// Since when a sample is waited for.
+    /// Returns the time since which a sample is waited for.
     #[must_use]
     pub fn unseen_since(&self) -> Option<Timestamp> {
         self.unseen().map(|_| self.last_settled.0)
     }
 
-    /// The lowest number of a sample that is waited for.
+    /// Returns the lowest number that is waited for.
     #[must_use]
     pub fn unseen(&self) -> Option<u64> {
         let open = self.next.saturating_sub(self.settled);
@@ -209,17 +210,17 @@ impl Sampled {
         self.next.checked_sub(u64::from(highest) + 1)
     }
 
-    /// Runs of numbers that were sent and not seen, first and last, each once.
+    /// Removes and returns the runs of unseen numbers, as first and last number.
     pub fn take_unseen(&mut self) -> Vec<(u64, u64)> {
         std::mem::take(&mut self.unseen)
     }
 
-    /// The tap cannot tell what passed before `now`.
+    /// Records a polling gap in which samples may have been missed.
     pub const fn uncertain(&mut self) {
         self.uncertain += 1;
     }
 
-    /// So far.
+    /// Returns the counts so far.
     #[must_use]
     pub const fn facts(&self) -> SampledFacts {
         SampledFacts {
@@ -229,7 +230,7 @@ impl Sampled {
         }
     }
 
-    /// Whether nothing more is waited for of this sample, where `next` is the number after the
+    /// Returns whether nothing more of this sample is waited for; `next` is the number after the
     /// newest.
     #[must_use]
     pub fn has(&self, number: u64, next: u64) -> bool {
@@ -239,8 +240,8 @@ impl Sampled {
                 .is_none_or(|bit| self.finished & bit != 0)
     }
 
-    /// Takes in a sample or a fragment of one: its number, how much of it, its source time. Up to
-    /// `reach` numbers before it may have been missed.
+    /// Processes a sample or fragment: its number, completeness and source time. Up to `reach`
+    /// numbers before it may have been missed.
     pub fn sample(
         &mut self,
         (number, seen, source): (u64, Seen, Option<Timestamp>),
@@ -257,7 +258,7 @@ impl Sampled {
             .bit(number, before)
             .is_some_and(|bit| self.sighted & bit == 0);
         let belief = match source {
-            // It is late and not of a writer that begins anew.
+            // The sample is late, and its writer has not restarted.
             Some(source) if is_told_only => {
                 sequence.sourced(number, source);
                 RunMembership::Live
@@ -273,7 +274,7 @@ impl Sampled {
         };
         sequence.begin(number);
         if sequence.next() != before {
-            // It begins, perhaps anew.
+            // The writer starts or restarts.
             self.settle_all();
             self.begin(sequence.next(), now);
             self.arrived = None;
@@ -303,8 +304,8 @@ impl Sampled {
         update
     }
 
-    /// Samples up to `last` exist, as a HEARTBEAT or an ACKNACK says. How many that was not known
-    /// of.
+    /// Records that samples up to `last` exist, from a HEARTBEAT or ACKNACK. Returns how many of
+    /// them are new.
     pub fn exist(&mut self, last: u64, reach: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let end = last.saturating_add(1);
         if !sequence.started() {
@@ -328,8 +329,8 @@ impl Sampled {
         samples
     }
 
-    /// The numbers `start..end` were never sent, as a GAP says. How many before them were that was
-    /// not known of.
+    /// Records that the numbers `start..end` were never sent, from a GAP. Returns how many numbers
+    /// before them are new.
     pub fn skip(
         &mut self,
         (start, end): (u64, u64),
@@ -352,7 +353,7 @@ impl Sampled {
         samples
     }
 
-    /// Keeps the stamp of a sample that began, or gives that of one that did.
+    /// Keeps the stamp of a sample's first fragment, or returns the stamp that was kept.
     pub fn stamp(&mut self, number: u64, stamp: Option<(i32, u32)>) -> Option<(i32, u32)> {
         if let Some(stamp) = stamp {
             self.head = Some((number, stamp));
@@ -362,7 +363,7 @@ impl Sampled {
             .map(|(_, stamp)| stamp)
     }
 
-    /// Takes in a sample whose number is not believed.
+    /// Processes a sample whose number is not confirmed.
     fn unconfirmed(
         &mut self,
         (number, seen): (u64, Seen),
@@ -381,8 +382,8 @@ impl Sampled {
         }
     }
 
-    /// Marks the samples of a run that is believed as seen. Returns how many of `samples` new
-    /// numbers were not counted while it was unconfirmed.
+    /// Marks the samples of a confirmed run as seen. Returns how many of `samples` new numbers were
+    /// not counted while the run was unconfirmed.
     fn confirm(&mut self, run: &Run, samples: u64) -> u64 {
         for &(number, is_whole) in &run.numbers {
             let bit = self.bit(number, self.next).unwrap_or(0);
@@ -394,7 +395,8 @@ impl Sampled {
         samples.saturating_sub(run.numbers.len() as u64)
     }
 
-    /// Marks a sample as seen: whether nothing more of it is waited for, for the first time.
+    /// Marks a sample as seen. Returns whether nothing more of it is waited for, for the first
+    /// time.
     fn sight(&mut self, number: u64, seen: Seen) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
         if self.sighted & bit != bit {
@@ -408,14 +410,14 @@ impl Sampled {
         finished
     }
 
-    /// The bit of a number among those below `next`.
+    /// Returns the bit of a number relative to `next`.
     fn bit(&self, number: u64, next: u64) -> Option<u128> {
         let below = next.checked_sub(number)?.checked_sub(1)?;
         1_u128.checked_shl(u32::try_from(below).ok()?)
     }
 
-    /// Everything below `end` is used, and none of it is a loss. How many numbers that is more.
-    /// `sent` = samples have them.
+    /// Marks all numbers below `end` as used and not lost, and returns how many are new. `sent` is
+    /// false if no samples have these numbers.
     fn advance(&mut self, end: u64, sent: bool, now: Timestamp, sequence: &mut Sequence) -> u64 {
         let next = sequence.next();
         if end <= next {
@@ -441,7 +443,7 @@ impl Sampled {
         samples
     }
 
-    /// What was counted meanwhile was seen otherwise.
+    /// Takes over numbers that were counted elsewhere.
     fn follow(&mut self, next: u64, now: Timestamp) {
         if self.next != next {
             self.settle_all();
@@ -449,13 +451,13 @@ impl Sampled {
         }
     }
 
-    /// All below `next` was seen, or needs not be.
+    /// Marks all numbers below `next` as seen or not needed.
     const fn begin(&mut self, next: u64, now: Timestamp) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));
     }
 
-    /// Nothing below `end` is waited for any longer: what was not seen of it is left out.
+    /// Stops waiting for numbers below `end`; unseen ones are skipped.
     fn settle(&mut self, end: u64) {
         let known = self.next.saturating_sub(WINDOW).max(self.settled);
         for number in known..end.min(self.next) {

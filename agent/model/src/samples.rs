@@ -1,37 +1,37 @@
-//! Samples that come in DATA_FRAGs: complete when every fragment number was seen.
+//! Fragmented samples: complete once every fragment number was seen.
 //!
-//! Writers repeat fragments, so bytes prove nothing; a bitmap per sample does. It holds no payload,
-//! and it believes no size: the bitmap grows with the fragments that came, within a budget shared
-//! by all writers. Whether a finished sample's number was seen before is the business of
-//! [`super::sequence`]; the caller asks there first.
+//! Writers repeat fragments, so counting bytes is not enough; each sample has a bitmap. Payloads
+//! are not kept, and announced sizes are not trusted: the bitmap grows with the fragments that
+//! arrived, within a budget shared by all writers. [`super::sequence`] knows whether a finished
+//! sample was seen before; the caller checks there first.
 
 use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{RtpsTime, Timestamp};
 
 use super::size::Size;
 
-/// Most fragments of one sample: 88 MB of Cyclone DDS fragments, 4 GB of Fast DDS ones.
+/// Largest number of fragments per sample: 88 MB of Cyclone DDS, 4 GB of Fast DDS.
 pub const MAX_FRAGMENTS: u32 = 65_536;
-/// Samples of one writer under way at once.
+/// Largest number of unfinished samples per writer.
 const MAX_PER_WRITER: usize = 16;
 
-/// What all writers' bitmaps may take together, and what was given up for it.
+/// Memory budget for the bitmaps of all writers, and its evictions.
 #[derive(Clone, Copy, Debug)]
 pub struct Budget {
     /// Bytes in use.
     pub bytes: usize,
-    /// Samples under way.
+    /// Number of unfinished samples.
     pub samples: usize,
     /// Cap on the bytes.
     pub limit: usize,
-    /// Samples given up.
+    /// Number of samples dropped because of the cap.
     pub evictions: u64,
-    /// Fragments whose numbers contradict themselves, or of samples with too many.
+    /// Number of fragments with contradictory numbers, or of samples with too many fragments.
     pub rejected: u64,
 }
 
 impl Budget {
-    /// Empty.
+    /// Creates an empty budget.
     #[must_use]
     pub const fn new(limit: usize) -> Self {
         Self {
@@ -48,13 +48,13 @@ impl Budget {
 #[derive(Debug, Default)]
 pub struct Samples {
     partial: Vec<Partial>,
-    /// Of samples that begin earlier, fragments may have been left out.
+    /// Time from which samples have all fragments captured; earlier ones may lack some.
     sure_from: Timestamp,
-    /// The last one that did.
+    /// The last sample that began before that time.
     last_uncertain: u64,
 }
 
-/// One unfinished sample.
+/// An unfinished sample.
 #[derive(Debug)]
 struct Partial {
     number: u64,
@@ -62,47 +62,48 @@ struct Partial {
     fragment_size: u32,
     seen: u32,
     bitmap: Vec<u64>,
-    /// When the last fragment number was first seen.
+    /// Time at which the last fragment number was first seen.
     tail: Option<Timestamp>,
     latest: Timestamp,
     facts: Facts,
 }
 
-/// What the fragments told of their sample.
+/// Facts about a complete sample.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub struct Facts {
-    /// INFO_TS; Cyclone DDS sends it with the first fragment only.
+    /// INFO_TS; Cyclone DDS sends it only with the first fragment.
     pub source: RtpsTime,
     /// Stamp in the payload of the first fragment.
     pub stamp: Option<(i32, u32)>,
     /// Size in bytes.
     pub size: u32,
-    /// The first datagram of the record that came first.
+    /// Time of the first datagram of the first record.
     pub began: Timestamp,
-    /// Its last missing fragment came this long after its last fragment number, nanoseconds.
+    /// Nanoseconds from its last fragment number to its last missing fragment.
     pub repaired_after: i64,
 }
 
-/// What a fragment did.
+/// Result of a fragment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Progress {
-    /// New, but some are still missing.
+    /// The fragment is new, but others are missing.
     Partial,
-    /// That was the last missing one.
+    /// The fragment completed the sample.
     Complete(Facts),
     /// All of it was seen before.
     Duplicate,
-    /// Impossible numbers, or no room.
+    /// Its numbers are invalid, or the budget is exhausted.
     Rejected,
-    /// More fragments than are kept track of: nothing can be said of this sample.
+    /// The sample has more fragments than are tracked, so its completeness is unknown.
     TooMany,
 }
 
 impl Samples {
-    /// Entries and cap; bytes of the largest bitmap. All of them together are in the [`Budget`].
+    /// Returns the number of samples and the bytes of the largest bitmap, with their caps. The sum
+    /// over all writers is in the [`Budget`].
     #[must_use]
     pub fn sizes(&self) -> [Size; 2] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             partial,
             sure_from: _,
@@ -132,7 +133,7 @@ impl Samples {
         ]
     }
 
-    /// Takes in one DATA_FRAG.
+    /// Processes a DATA_FRAG.
     pub fn fragment(
         &mut self,
         fragments: DataFrag<'_>,
@@ -191,25 +192,25 @@ impl Samples {
         Progress::Partial
     }
 
-    /// Whether fragments of this sample came and others are missing.
+    /// Returns whether this sample has some but not all of its fragments.
     #[must_use]
     pub fn is_partial(&self, number: u64) -> bool {
         self.place(number).is_some()
     }
 
-    /// Of samples that begin before this, the kernel may have left fragments out.
+    /// Allows samples that begin before this to lack fragments that the kernel did not capture.
     pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.sure_from = until;
     }
 
-    /// Whether this one is under way and may lack fragments that nobody lost.
+    /// Returns whether this sample is unfinished and may lack fragments without a loss.
     #[must_use]
     pub fn is_doubtful(&self, number: u64) -> bool {
         number <= self.last_uncertain && self.is_partial(number)
     }
 
-    /// The oldest sample from `first` on that still gets fragments: it and what follows is not
-    /// decided yet.
+    /// Returns the oldest sample, from `first` on, that still receives fragments. It and later ones
+    /// are not decided yet.
     #[must_use]
     pub fn growing(&self, now: Timestamp, window: u64, first: u64) -> Option<u64> {
         let growing = self
@@ -219,7 +220,7 @@ impl Samples {
         growing.map(|each| each.number).min()
     }
 
-    /// Forgets this one; true if it was under way.
+    /// Drops this sample; returns whether it was unfinished.
     pub fn forget(&mut self, number: u64, budget: &mut Budget) -> bool {
         let index = self.place(number);
         if let Some(index) = index {
@@ -228,14 +229,14 @@ impl Samples {
         index.is_some()
     }
 
-    /// Forgets those with a lower number than this.
+    /// Drops all samples below this number.
     pub fn forget_below(&mut self, number: u64, budget: &mut Budget) {
         while let Some(index) = self.partial.iter().position(|each| each.number < number) {
             self.close(index, budget);
         }
     }
 
-    /// Forgets what got no fragment for `window` nanoseconds; how many that were.
+    /// Drops samples without a fragment for `window` nanoseconds; returns their number.
     pub fn expire(&mut self, now: Timestamp, window: u64, budget: &mut Budget) -> u64 {
         let mut expired = 0;
         while let Some(index) = self
@@ -249,7 +250,7 @@ impl Samples {
         expired
     }
 
-    /// Moves what the unfinished samples take from one budget to another.
+    /// Moves the memory of unfinished samples from one budget to another.
     pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
         let bytes: usize = self.partial.iter().map(|each| each.bitmap.len() * 8).sum();
         from.bytes = from.bytes.saturating_sub(bytes);
@@ -258,7 +259,7 @@ impl Samples {
         to.samples += self.partial.len();
     }
 
-    /// Forgets all, returning their share to the budget.
+    /// Drops all samples and returns their memory to the budget.
     pub fn clear(&mut self, budget: &mut Budget) {
         while !self.partial.is_empty() {
             self.close(0, budget);
@@ -297,7 +298,7 @@ impl Samples {
         self.partial.len() - 1
     }
 
-    /// Gives up the one that has waited longest, the newcomer only when it is alone.
+    /// Drops the sample with the longest wait; the newcomer goes only if it is alone.
     fn evict(&mut self, newcomer: u64, budget: &mut Budget) {
         let candidates = self.partial.iter().enumerate();
         let oldest = candidates.min_by_key(|(_, each)| (each.number == newcomer, each.latest));
@@ -315,7 +316,7 @@ impl Samples {
 }
 
 impl Partial {
-    /// Sets the bits `start..end`; how many of them were new.
+    /// Sets the bits `start..end` and returns how many of them were new.
     fn mark(&mut self, start: u32, end: u32) -> u32 {
         let words = end.div_ceil(64) as usize;
         if self.bitmap.len() < words {
@@ -380,7 +381,7 @@ mod tests {
         }
     }
 
-    /// [`Samples::fragment`] of the DATA_FRAG that a record reports.
+    /// Passes the DATA_FRAG of a record to [`Samples::fragment`].
     fn put(samples: &mut Samples, record: &Record, at: u64, budget: &mut Budget) -> Progress {
         let Some(Sample::DataFrag(fragments)) = record.sample() else {
             panic!("{record:?}")

@@ -1,7 +1,7 @@
-//! Which topics somebody wants the samples of, and how much of them.
+//! Topics whose samples a subscription requests, and in what depth.
 //!
-//! A subscription's choice, matched against topics as they appear. It decides nothing about
-//! measuring beyond that: the watchlist has its own patterns.
+//! A selection is matched against topics as they appear. It affects measurement only in that
+//! requested topics are measured; the watchlist has its own patterns.
 
 use std::sync::Arc;
 
@@ -13,91 +13,90 @@ use super::naming::Naming;
 use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
-/// Largest compiled form of one regular expression, in bytes, and as much again while it is
-/// matched.
+/// Largest compiled size of a regular expression in bytes. Matching may use the same amount again.
 const REGEX_BYTES: usize = 256 << 10;
 
-/// How much of each sample.
+/// How much of each sample a subscription receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Depth {
-    /// That it came, and what is known of it.
+    /// Arrival and metadata.
     Arrivals,
-    /// With its bytes.
+    /// Arrival, metadata and payload.
     Payloads,
 }
 
-/// One way to name topics.
+/// A way to select topics.
 #[derive(Clone, Debug)]
 pub enum Choice {
     /// Every topic that `ros2 topic list` shows.
     All,
-    /// One topic by its ROS name, hidden or not, or by its DDS name.
+    /// One topic by its ROS name, even if hidden, or by its DDS name.
     Name(String),
-    /// `*` within one token, `**` across tokens; hidden topics where it names a hidden token.
+    /// `*` within a token, `**` across tokens; covers hidden topics if it names a hidden token.
     Glob(String),
-    /// Every topic in whose name it is found.
+    /// Every topic with a match in its name.
     Regex(Regex),
 }
 
-/// Why nothing can be chosen that way.
+/// Why a choice is invalid.
 #[derive(Debug, thiserror::Error)]
 pub enum ChoiceError {
-    /// No name and no glob.
+    /// The text is neither a name nor a glob.
     #[error("`{pattern}` {reason}")]
     Pattern {
-        /// As given.
+        /// The text.
         pattern: String,
-        /// What is wrong with it.
+        /// The broken rule.
         reason: PatternError,
     },
-    /// No regular expression, or one that is too large.
+    /// The text is not a regular expression, or its compiled form is too large.
     #[error("`{pattern}` is not a supported regular expression")]
     Regex {
-        /// As given.
+        /// The text.
         pattern: String,
-        /// Why not.
+        /// The error of the compiler.
         source: Box<regex::Error>,
     },
 }
 
-/// Topics by what is wanted and what is not.
+/// A set of topics, as included and excluded choices.
 #[derive(Clone, Debug, Default)]
 pub struct Selection {
-    /// A topic is wanted that one of these names.
+    /// Choices of which at least one must match.
     pub include: Vec<Choice>,
-    /// Unless one of these names it.
+    /// Choices of which none may match.
     pub exclude: Vec<Choice>,
-    /// [`Choice::All`], globs and regular expressions find hidden topics, too.
+    /// Whether [`Choice::All`], globs and regular expressions include hidden topics.
     pub hidden: bool,
 }
 
-/// A subscription as the model sees it.
+/// A subscription of samples.
 #[derive(Clone, Debug)]
 pub struct SampleRequest {
-    /// Names the subscription.
+    /// Id of the subscription.
     pub id: u64,
-    /// Which topics.
+    /// The selected topics.
     pub selection: Arc<Selection>,
-    /// Only of this domain; `None` = every domain.
+    /// The selected domain; `None` for every domain.
     pub domain_id: Option<DomainId>,
-    /// How much of them.
+    /// How much of each sample it receives.
     pub depth: Depth,
 }
 
-/// Requests for the samples of one topic.
+/// The requests for one topic's samples.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RequestIds {
-    /// Whose.
+    /// Ids of all requests.
     pub ids: Arc<[u64]>,
-    /// Those of them that want the bytes.
+    /// Ids of the requests that include payloads.
     pub payloads: Arc<[u64]>,
 }
 
 impl Choice {
-    /// A name, or a glob where it has a star.
+    /// Parses a name, or a glob if the text contains a star.
     ///
     /// # Errors
-    /// It can be neither.
+    /// Fails if the text is neither.
     pub fn parse(pattern: &str) -> Result<Self, ChoiceError> {
         let is_dds = !pattern.is_empty() && !pattern.starts_with('/') && pattern.len() <= 255;
         if is_dds && !pattern.contains('*') {
@@ -113,10 +112,10 @@ impl Choice {
         Ok(Self::Glob(pattern.to_owned()))
     }
 
-    /// A regular expression, found anywhere in a name.
+    /// Parses a regular expression, which may match any part of a name.
     ///
     /// # Errors
-    /// It is none, or too large.
+    /// Fails if the text is not a regular expression, or is too large.
     pub fn regex(pattern: &str) -> Result<Self, ChoiceError> {
         let regex = expression(pattern).map_err(|source| ChoiceError::Regex {
             pattern: pattern.to_owned(),
@@ -136,11 +135,11 @@ impl Choice {
     }
 }
 
-/// Compiles a regular expression over topic names, whose characters are ASCII: the classes `\w`,
-/// `\d` and `\s` are.
+/// Compiles a regular expression over topic names. Names are ASCII, and so are the classes `\w`,
+/// `\d` and `\s`.
 ///
 /// # Errors
-/// It is none, or too large.
+/// Fails if the text is not a regular expression, or is too large.
 pub fn expression(pattern: &str) -> Result<Regex, regex::Error> {
     RegexBuilder::new(pattern)
         .unicode(false)
@@ -150,10 +149,10 @@ pub fn expression(pattern: &str) -> Result<Regex, regex::Error> {
 }
 
 impl Selection {
-    /// These names and globs.
+    /// Parses names and globs.
     ///
     /// # Errors
-    /// The first that is neither.
+    /// Returns the first that is neither.
     pub fn named<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<Self, ChoiceError> {
         let include: Result<_, _> = patterns.into_iter().map(Choice::parse).collect();
         Ok(Self {
@@ -162,7 +161,7 @@ impl Selection {
         })
     }
 
-    /// Everything that `ros2 topic list` shows.
+    /// Selects every topic that `ros2 topic list` shows.
     #[must_use]
     pub fn all() -> Self {
         Self {
@@ -171,7 +170,7 @@ impl Selection {
         }
     }
 
-    /// Its globs.
+    /// Returns the globs.
     pub fn globs(&self) -> impl Iterator<Item = &str> {
         let choices = self.include.iter().chain(&self.exclude);
         choices.filter_map(|choice| match choice {
@@ -180,7 +179,7 @@ impl Selection {
         })
     }
 
-    /// How many regular expressions it has.
+    /// Returns the number of regular expressions.
     #[must_use]
     pub fn regexes(&self) -> usize {
         let choices = self.include.iter().chain(&self.exclude);
@@ -189,12 +188,12 @@ impl Selection {
             .count()
     }
 
-    /// Whether this topic is wanted. Requests and replies of services, and what follows no ROS
-    /// convention, go by their exact names alone.
+    /// Returns whether the topic is selected. Service requests and replies, and topics without a
+    /// ROS name, are selected only by their exact names.
     #[must_use]
     pub fn covers(&self, kind: TopicKind, name: &str, dds_name: &str, hidden: bool) -> bool {
         let is_ros = kind.is_ros_topic();
-        // The ROS name of a request is the service's, which may be a topic's as well.
+        // The ROS name of a request topic is the service's, which a topic may have as well.
         let name = if is_ros { name } else { dds_name };
         let shown = self.hidden || !hidden;
         let covers = |choice: &Choice| choice.covers(name, dds_name, is_ros, shown);
@@ -204,7 +203,7 @@ impl Selection {
 }
 
 impl SampleRequest {
-    /// Whether it is for this topic.
+    /// Returns whether the request covers this topic.
     #[must_use]
     pub fn covers(&self, domain_id: DomainId, naming: &Naming) -> bool {
         self.domain_id.is_none_or(|wanted| wanted == domain_id)
@@ -215,7 +214,7 @@ impl SampleRequest {
 }
 
 impl RequestIds {
-    /// Which requests cover this topic; `None` = no request does.
+    /// Returns the requests that cover this topic, or `None` if no request does.
     pub(super) fn of(
         domain_id: DomainId,
         naming: &Naming,

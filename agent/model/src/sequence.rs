@@ -1,11 +1,11 @@
-//! Which sequence numbers of one writer came, and which never will.
+//! Sequence numbers of one writer: which samples arrived, and which never will.
 //!
-//! A gap is not a loss yet: it stays open for the settle window, so that reordering and
-//! retransmission can fill it. What GAP, an ACKNACK or the moment of first sight excuses is never a
-//! loss. HEARTBEAT's firstSN excuses nothing: a sample that never came and that the writer no
+//! A gap is not a loss at once: it stays open for the settle window, so that reordering and
+//! retransmission can fill it. Numbers excused by a GAP, an ACKNACK or the start of observation are
+//! never lost. The firstSN of a HEARTBEAT excuses nothing: a missing sample that the writer no
 //! longer has is lost (RTPS 2.5, 8.4.10.4, `lost_changes_update`). Memory is two bitmaps that grow
-//! with the number of undecided sequence numbers, up to [`MAX_WINDOW`]. It knows no payloads and no
-//! time but the one it is given.
+//! with the undecided numbers, up to [`MAX_WINDOW`]. The module sees no payloads and only the times
+//! that callers pass in.
 
 mod bitmap;
 mod runs;
@@ -22,30 +22,31 @@ use bitmap::Bitmap;
 pub use unconfirmed::Run;
 use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
 
-/// Undecided and recently decided sequence numbers remembered at the start.
+/// Initial number of undecided and recently decided numbers that are remembered.
 const MIN_WINDOW: u64 = 512;
-/// And at most: 8 KiB of bitmaps; about 3000 messages a second over the reliable settle window.
+/// Largest such number: 8 KiB of bitmaps, or about 3000 messages per second over the reliable
+/// settle window.
 pub const MAX_WINDOW: u64 = 32_768;
-/// A jump beyond this is a new incarnation or a forgery, not a million losses.
+/// A larger jump is a new incarnation or a forgery, not a million losses.
 const MAX_JUMP: u64 = 1 << 20;
-/// HEARTBEAT and GAP may run ahead of the data by at most this, also when two agree.
+/// HEARTBEAT and GAP may exceed the received numbers by at most this, even if two agree.
 pub const FAR: u64 = 4096;
-/// A number that is further ahead is unconfirmed, and so is what a single HEARTBEAT or GAP says of
-/// it.
+/// A number further ahead is unconfirmed, as is a claim about it in a single HEARTBEAT or GAP.
 pub const REACH: u64 = 64;
-/// A gap that fills this soon, unasked, was reordering. Retransmissions that no ACKNACK was seen
-/// for take longer: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before they answer a
-/// HEARTBEAT.
+/// A gap that fills within this time without a request was reordering. Retransmissions take longer
+/// even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before
+/// they answer a HEARTBEAT.
 const REORDERING: i64 = 5_000_000;
-/// Gaps remembered for telling reordering from retransmission.
+/// Number of gaps remembered, to distinguish reordering from retransmission.
 const GAPS: usize = 32;
-/// A lower sequence number with a source time newer by this is a new incarnation of the writer.
+/// A lower number with a source time later by this much begins a new incarnation of the writer.
 const INCARNATION: u64 = 100 * MILLISECOND;
-/// So many consecutive samples below the window are one too, whatever their source time says.
+/// This many consecutive samples below the window also begin a new incarnation, whatever their
+/// source times.
 const STALE: u32 = 1024;
-/// Settling advances in this many steps per window.
+/// Number of steps per window in which settling advances.
 const STEPS: u64 = 16;
-/// So many checkpoints at most: two windows of different lengths, and one that is held.
+/// Largest number of checkpoints: two windows of different lengths, and one that is held.
 const CHECKPOINTS: usize = 3 * STEPS as usize;
 /// Words of a bitmap.
 const WORDS: usize = MAX_WINDOW as usize / 64;
@@ -53,57 +54,57 @@ const WORDS: usize = MAX_WINDOW as usize / 64;
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
 pub struct Sequence {
-    /// The first one seen; what lies before does not count. 0 = none seen yet.
+    /// The first number seen; earlier ones do not count. 0 before the first.
     first: u64,
-    /// All below are decided.
+    /// All numbers below are decided.
     settled: u64,
-    /// All that are known to exist are below this.
+    /// One more than the highest number known to exist.
     next: u64,
-    /// The writer has none below this any more: the highest firstSN of its HEARTBEATs.
+    /// The lowest number that the writer still has: the highest firstSN of its HEARTBEATs.
     available: u64,
-    /// A value that `available` had, and since when.
+    /// An earlier value of `available`, and its time.
     withdrawn: Option<(Timestamp, u64)>,
-    /// All readers that acknowledge have all below this, or will not get them.
+    /// All readers that acknowledge have every number below, or will not get it.
     acknowledged: u64,
-    /// All below came, or no reader waits for them; as far as was looked.
+    /// Every number below, as far as checked, has arrived or is not waited for.
     complete: u64,
-    /// How often it began.
+    /// Number of restarts.
     incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
-    /// `next` at some moments, oldest first.
+    /// `next` at some times, oldest first.
     checkpoints: VecDeque<(Timestamp, u64)>,
     gaps: VecDeque<Gap>,
     newest_source: Timestamp,
-    /// The sample of that time.
+    /// The number with the newest source time.
     newest: u64,
-    /// Consecutive samples after it that are older.
+    /// Consecutive samples after it with an older source time.
     older: u8,
     stale: u32,
-    /// When the last one that moved `next` came.
+    /// Time of the last increase of `next`.
     last_advance: Timestamp,
-    /// Samples that continued this incarnation, up to a handful.
+    /// Samples that continued this incarnation, counted up to a small number.
     followed: u8,
     unconfirmed: Option<Box<UnconfirmedRun>>,
-    /// Runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
+    /// Number of runs, HEARTBEATs, GAPs and ACKNACKs that were unconfirmed.
     jumps: u64,
 }
 
-/// Whether a sample's number is its writer's.
+/// Whether a sample's number belongs to the writer's run.
 #[derive(Debug)]
 pub enum RunMembership {
-    /// It belongs to the live run.
+    /// The number belongs to the live run.
     Live,
-    /// It counts as a message and moves no other number.
+    /// The sample counts as a message but affects no other number.
     Unconfirmed {
-        /// Nothing of this sample was seen before.
+        /// Whether no part of this sample was seen before.
         new: bool,
     },
-    /// It continues a run that is believed from here on, with the samples that came before it.
+    /// The number confirms a run, which is live from here on, with its earlier samples.
     Confirmed(Run),
 }
 
-/// One run of missing numbers, for telling reordering from retransmission.
+/// A run of missing numbers, to distinguish reordering from retransmission.
 #[derive(Clone, Copy, Debug)]
 struct Gap {
     start: u64,
@@ -112,47 +113,47 @@ struct Gap {
     requested: bool,
 }
 
-/// How a sample's number relates to those before.
+/// Relation of a sample's number to earlier ones.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Arrival {
     /// Not seen before.
     New {
-        /// It filled a gap by retransmission.
+        /// Whether it filled a gap by retransmission.
         recovered: bool,
-        /// It is the newest so far, so its delay is a delivery delay and not a repetition's.
+        /// Whether it is the newest so far; otherwise its delay includes a retransmission.
         newest: bool,
     },
-    /// Seen before, or too old to tell.
+    /// Seen before, or too old to decide.
     Duplicate,
 }
 
-/// How a sample was delivered, for telling a retransmission.
+/// Whether a late sample may be a retransmission.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum RepairMode {
     /// The writer never retransmits.
     BestEffort,
-    /// The writer retransmits what a reader misses.
+    /// The writer retransmits samples that a reader misses.
     Reliable,
-    /// It does, but the sample came in fragments: that it is late need not mean that it was lost.
+    /// The writer retransmits, but a fragmented sample may be late without a loss.
     ReliableFragments,
 }
 
-/// One or several numbers that were decided.
+/// A decision about one or several numbers.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Settled {
-    /// Never came.
+    /// The number never arrived.
     Lost(u64),
-    /// Excused by the writer.
+    /// The writer excused the number.
     Irrelevant(u64),
-    /// So many in one go, beyond what the window holds.
+    /// Lost numbers from the first to the last, beyond the capacity of the window.
     LostRun(u64, u64),
 }
 
 impl Sequence {
-    /// Entries, or bytes, and cap of every list.
+    /// Returns the size and cap of each list, in entries or bytes.
     #[must_use]
     pub fn sizes(&self) -> [Size; 5] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             first: _,
             settled: _,
@@ -188,31 +189,31 @@ impl Sequence {
         ]
     }
 
-    /// Whether any sample was seen.
+    /// Returns whether any sample was seen.
     #[must_use]
     pub const fn started(&self) -> bool {
         self.first != 0
     }
 
-    /// One past the highest number known to exist.
+    /// Returns the highest number known to exist, plus one.
     #[must_use]
     pub const fn next(&self) -> u64 {
         self.next
     }
 
-    /// When the highest number last rose.
+    /// Returns the time at which the highest number last increased.
     #[must_use]
     pub const fn last_advance(&self) -> Timestamp {
         self.last_advance
     }
 
-    /// Whether this sample was received whole before.
+    /// Returns whether this sample was received whole before.
     #[must_use]
     pub fn has(&self, number: u64) -> bool {
         self.started() && (number < self.floor() || number < self.next && self.received.get(number))
     }
 
-    /// Takes in one whole sample, after [`Self::recognise`].
+    /// Processes a whole sample, after [`Self::recognise`].
     pub fn receive(
         &mut self,
         number: u64,
@@ -251,25 +252,26 @@ impl Sequence {
         }
     }
 
-    /// How often something was unconfirmed.
+    /// Returns how often a number was unconfirmed.
     #[must_use]
     pub const fn jumps(&self) -> u64 {
         self.jumps
     }
 
-    /// Takes in a sample's source time.
+    /// Records the source time of a sample.
     pub fn sourced(&mut self, number: u64, source: Timestamp) {
         if number <= self.newest {
             return;
         }
         self.older += 1;
-        // Many that are older: the newest was forged, or the writer's clock was set back.
+        // After many older source times, the newest one was forged or the writer's clock was set
+        // back.
         if source >= self.newest_source || self.older >= CONFIRMATIONS {
             (self.newest_source, self.newest, self.older) = (source, number, 0);
         }
     }
 
-    /// A sample of this number exists, for some of its fragments came.
+    /// Records that a sample exists, because some of its fragments arrived.
     pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
         let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
         if self.started() && is_ahead && is_number(number) {
@@ -277,20 +279,20 @@ impl Sequence {
         }
     }
 
-    /// Numbers count from here on; does nothing once begun.
+    /// Begins to count at this number; does nothing after the beginning.
     pub fn begin(&mut self, number: u64) {
         if !self.started() && number > 0 && number < u64::MAX >> 1 {
             self.restart(number);
         }
     }
 
-    /// All below are decided.
+    /// Returns the number below which everything is decided.
     #[must_use]
     pub const fn settled(&self) -> u64 {
         self.settled
     }
 
-    /// When it was noticed that this one was missing, as far as that is remembered.
+    /// Returns the time at which this number was detected as missing, if remembered.
     #[must_use]
     pub fn missed_since(&self, number: u64) -> Option<Timestamp> {
         let mut gaps = self.gaps.iter().rev();
@@ -298,15 +300,15 @@ impl Sequence {
         gap.map(|gap| gap.noticed)
     }
 
-    /// This one came another way: it is no loss here, and no sample either.
+    /// Records that this number arrived elsewhere: here it is neither a loss nor a sample.
     pub fn know(&mut self, number: u64) {
         if self.started() && number >= self.floor() && number < self.next {
             self.received.set(number);
         }
     }
 
-    /// Takes over what `other` received of the same writer's numbers; where both go, this one's
-    /// beginning counts.
+    /// Merges the numbers of the same writer that `other` received. The beginning of this one
+    /// applies.
     pub fn absorb(&mut self, other: &Self, now: Timestamp, settled: &mut impl FnMut(Settled)) {
         if !self.started() || !other.started() {
             return;
@@ -321,14 +323,14 @@ impl Sequence {
         }
     }
 
-    /// Lowest number that counts.
+    /// Returns the lowest number that counts.
     #[must_use]
     pub const fn first(&self) -> u64 {
         self.first
     }
 
-    /// All below came, or no reader waits for them: the writer left them out or has them no longer,
-    /// readers acknowledged them, or they are settled.
+    /// Returns the number below which every sample has arrived or is not waited for: the writer
+    /// skipped or dropped it, readers acknowledged it, or it is settled.
     pub fn complete(&mut self) -> u64 {
         let decided = self.settled.max(self.available).max(self.floor());
         self.complete = self.complete.max(decided);
@@ -340,25 +342,25 @@ impl Sequence {
         self.complete
     }
 
-    /// Nothing below `number` is waited for any more.
+    /// Stops waiting for numbers below this one.
     pub fn skip(&mut self, number: u64) {
         self.complete = self.complete.max(number.min(self.next));
     }
 
-    /// The writer will send none below this again.
+    /// Returns the number below which the writer sends no sample again.
     #[must_use]
     pub fn awaited(&self) -> u64 {
         self.available.max(self.acknowledged)
     }
 
-    /// How often the numbers began anew.
+    /// Returns the number of restarts.
     #[must_use]
     pub const fn incarnation(&self) -> u32 {
         self.incarnation
     }
 
-    /// Decides what has been open for `window`, and what the writer withdrew `grace` ago, but
-    /// nothing from `hold` on.
+    /// Decides numbers that have been open for `window`, and those that the writer withdrew `grace`
+    /// ago. Numbers from `hold` on stay open.
     pub fn advance(
         &mut self,
         now: Timestamp,
@@ -399,13 +401,13 @@ impl Sequence {
         }
     }
 
-    /// Decides everything that is open.
+    /// Decides all open numbers.
     pub fn settle_all(&mut self, settled: &mut impl FnMut(Settled)) {
         self.settle(self.next, settled);
         self.checkpoints.clear();
     }
 
-    /// Numbers below this are not remembered.
+    /// Returns the lowest number that is remembered.
     fn floor(&self) -> u64 {
         self.next.saturating_sub(self.received.len())
     }
@@ -426,7 +428,7 @@ impl Sequence {
         };
     }
 
-    /// Raises `next` to `end`; `start..end` came, what lies before it is a gap.
+    /// Raises `next` to `end`: `start..end` arrived, and the numbers before are a gap.
     fn extend(&mut self, start: u64, end: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
         if start > self.next {
             self.note_gap(self.next, start, now);
@@ -439,7 +441,7 @@ impl Sequence {
         }
         let keep = end.saturating_sub(self.received.len());
         if keep > self.settled {
-            // Too many to keep open: decided now.
+            // The window cannot keep so many numbers open, so they are decided now.
             self.settle(keep.min(self.next), settled);
             if keep > self.settled {
                 settled(Settled::LostRun(self.settled, keep));
@@ -473,7 +475,7 @@ impl Sequence {
         let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
         match repair_mode {
             RepairMode::BestEffort => false,
-            // A gap that was forgotten is an old one.
+            // A gap that is no longer remembered is an old one.
             RepairMode::Reliable => gap.is_none_or(late),
             RepairMode::ReliableFragments => gap.is_some_and(late),
         }
@@ -494,7 +496,7 @@ impl Sequence {
     }
 }
 
-/// Whether it can be a sequence number: those are signed (RTPS 2.5, 9.3.2).
+/// Returns whether it is a valid sequence number, which is signed (RTPS 2.5, 9.3.2).
 const fn is_number(number: u64) -> bool {
     number > 0 && number <= u64::MAX >> 1
 }

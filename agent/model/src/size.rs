@@ -1,19 +1,19 @@
-//! How large a table of the model is and may become.
+//! Current size and cap of the model's tables.
 
 use std::collections::BTreeMap;
 
-/// One table.
+/// Size and cap of one table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Size {
-    /// Its name: component and field.
+    /// Name: component and field.
     pub table: &'static str,
-    /// Entries, or bytes where its cap is one of bytes.
+    /// Number of entries, or bytes if the cap is in bytes.
     pub entries: usize,
-    /// How many there may be.
+    /// Largest number of entries or bytes.
     pub cap: usize,
 }
 
-/// The largest size of each table that many have one of.
+/// Returns the largest size of each table, among many instances.
 #[must_use]
 pub fn largest(sizes: impl IntoIterator<Item = Size>) -> Vec<Size> {
     let mut largest: BTreeMap<&'static str, Size> = BTreeMap::new();
@@ -25,7 +25,7 @@ pub fn largest(sizes: impl IntoIterator<Item = Size>) -> Vec<Size> {
 }
 
 impl Size {
-    /// So large and no larger than this.
+    /// Creates the size of a table.
     #[must_use]
     pub const fn new(table: &'static str, entries: usize, cap: usize) -> Self {
         Self {

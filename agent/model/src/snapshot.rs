@@ -1,7 +1,7 @@
-//! What the agent knows at one moment, for whoever asks: immutable, sorted, complete.
+//! The agent's state at one moment: immutable, sorted, complete.
 //!
-//! The model builds one about once a second; surfaces read it without ever blocking the model.
-//! Nothing here computes: every number was settled when the snapshot was taken.
+//! The model builds about one snapshot per second, and readers never block the model. All values
+//! were settled when the snapshot was taken.
 
 mod delivery;
 
@@ -24,40 +24,40 @@ use super::topic_kind::TopicKind;
 use super::watch::Watch;
 pub use delivery::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 
-/// All facts at `at`. Lists are sorted by their identity.
+/// All facts at the time `at`. Lists are sorted by identity.
 #[derive(Clone, Debug, Default)]
 pub struct Snapshot {
-    /// When it was taken, in the source's clock (capture time on replays).
+    /// Time of the snapshot, by the source's clock (capture time in a replay).
     pub at: Timestamp,
-    /// Participants that are alive.
+    /// Live participants.
     pub participants: Vec<ParticipantFacts>,
     /// ROS nodes of live participants.
     pub nodes: Vec<NodeFacts>,
     /// DDS topics with at least one endpoint, and those that had one within the grace period.
     pub topics: Vec<TopicFacts>,
-    /// Writers seen sending whose announcement was not seen.
+    /// Active writers whose announcement was missed.
     pub unknown_writers: Vec<UnknownWriterFacts>,
-    /// Sockets by which measured samples come or leave, as far as they are known, by cookie.
+    /// Known sockets of measured samples, sorted by cookie.
     pub sockets: Vec<SocketFacts>,
     /// Watchlist entries, in configuration order.
     pub watches: Vec<WatchFacts>,
-    /// What is wrong with the graph; the same value as long as nothing changes.
+    /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
-    /// When each of them was found, in their order.
+    /// Time at which each problem appeared, in the same order.
     pub diagnosed: Arc<Vec<Timestamp>>,
-    /// Discovery churn since the start.
+    /// Counters of discovery events since the start.
     pub churn: Vec<ChurnCount>,
     /// Parse failures since the start.
     pub decode_errors: Vec<DecodeErrorCount>,
     /// Sizes, limits and evictions of the model's tables.
     pub tables: Vec<TableFacts>,
-    /// Datagrams looked at in user space.
+    /// Datagrams processed in user space.
     pub datagrams: u64,
-    /// Records taken in, from the kernel or from user-space walks.
+    /// Records processed, from the kernel or from parsing in user space.
     pub records: u64,
-    /// Topics that are measured, vanished ones included.
+    /// Measured topics, including vanished ones.
     pub topics_measured: u64,
-    /// Topics that the watchlist matched but the cap kept out.
+    /// Topics that match the watchlist but exceed the cap.
     pub topics_rejected: u64,
 }
 
@@ -66,39 +66,39 @@ pub struct Snapshot {
 pub struct ParticipantFacts {
     /// Its GUID (entity 000001c1).
     pub guid: Guid,
-    /// Domain, when announced or derivable from the discovery port.
+    /// Domain, as announced or derived from the discovery port.
     pub domain_id: DomainId,
     /// Its implementation.
     pub vendor: VendorId,
-    /// ROS enclave; `None` means it is no ROS participant.
+    /// ROS enclave; `None` if the participant does not use ROS.
     pub enclave: Option<Arc<str>>,
-    /// Where it lives.
+    /// Host and process of the participant.
     pub process: ProcessFacts,
-    /// When its first announcement was seen.
+    /// Time of its first announcement.
     pub first_seen: Timestamp,
-    /// When anything of it was last seen.
+    /// Time of its last packet.
     pub last_seen: Timestamp,
-    /// How long it is believed alive without a sign of life.
+    /// Time after which a silent participant is removed.
     pub lease: Duration,
-    /// Announces security: its user data may be encrypted.
+    /// Whether it announces security: its user data may be encrypted.
     pub secured: bool,
-    /// Known from before the agent's start and not heard since.
+    /// Whether it is restored from saved state without a packet so far.
     pub restored: bool,
-    /// Where its discovery endpoints and its other ones are reached over UDP.
+    /// UDP addresses of its discovery endpoints and of its other endpoints.
     pub addresses: Addresses,
 }
 
-/// Where something lives, as far as it is announced or its socket's holder is known.
+/// Host and process, as announced or known from the owner of the socket.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ProcessFacts {
-    /// Host name when announced.
+    /// Host name, if announced.
     pub host: Option<Arc<str>>,
-    /// Process id: of the socket's holder, else as announced, perhaps in a container's count, or
-    /// its low 16 bits where the GUID holds those.
+    /// Process id of the socket's owner, otherwise as announced. An announced id may be from a
+    /// container's namespace, or only the low 16 bits if it comes from the GUID.
     pub id: Option<u32>,
-    /// Process name: as announced, else that of the socket's holder.
+    /// Process name as announced, otherwise that of the socket's owner.
     pub name: Option<Arc<str>>,
-    /// Control group of the socket, as a path below the root: which container.
+    /// Control group of the socket, as a path below the root; it identifies the container.
     pub cgroup: Option<Arc<str>>,
 }
 
@@ -122,72 +122,71 @@ pub struct NodeFacts {
 pub struct TopicFacts {
     /// Domain.
     pub domain_id: DomainId,
-    /// ROS name for topics, the DDS name where it follows no ROS convention.
+    /// ROS name, or the DDS name if the topic follows no ROS convention.
     pub name: TopicName,
     /// DDS name.
     pub dds_name: DdsName,
-    /// What kind of ROS channel.
+    /// Role of the topic in ROS.
     pub kind: TopicKind,
     /// Hidden by ROS convention (a token begins with `_`).
     pub hidden: bool,
-    /// Message types announced on it, ROS form, sorted; more than one is a fault.
+    /// Announced message types in ROS form, sorted; more than one is a fault.
     pub message_types: Vec<TypeName>,
-    /// RIHS01 type hashes announced, sorted.
+    /// Announced RIHS01 type hashes, sorted.
     pub type_hashes: Vec<TypeHash>,
     /// Live writers.
     pub publishers: Vec<EndpointFacts>,
     /// Live readers.
     pub subscriptions: Vec<EndpointFacts>,
-    /// Present when somebody is or was interested in the topic: the sum over its writers, also
-    /// those that have gone.
+    /// Sum over its writers, including vanished ones; present if the topic is or was watched or
+    /// requested.
     pub measurement: Option<Box<Measurement>>,
-    /// Sum over all receivers and writers, also those that have gone; present once a sample of the
-    /// topic was seen arriving while it was measured.
+    /// Sum over all receivers and writers, including vanished ones; present once a measured sample
+    /// arrived.
     pub received: Option<Box<Delivered>>,
-    /// Likewise over all destinations to which samples were seen leaving this host.
+    /// Sum over all destinations to which samples left this host; present once one left.
     pub sent: Option<Box<Delivered>>,
-    /// Where its samples spent their time, as far as this host sees it.
+    /// Time that its samples spent in each stage on this host.
     pub breakdown: Option<Box<Breakdown>>,
     /// Every receiver and destination of live writers, sorted by writer, direction, destination and
     /// subscriber.
     pub deliveries: Vec<DeliveryFacts>,
     /// Every reliable reader that acknowledges, sorted by writer and reader.
     pub acknowledgements: Vec<AcknowledgementFacts>,
-    /// The last endpoint has gone; kept for the grace period.
+    /// Whether the last endpoint is gone; the topic is kept for the grace period.
     pub vanished: bool,
-    /// Pairs of its live writers and readers by how messages pass between them; those that there
-    /// are.
+    /// Number of pairs of live writers and readers for each transport in use.
     pub transports: Vec<TransportCount>,
-    /// Its samples are given one by one.
+    /// Whether a subscription requests its samples.
     pub is_read: bool,
 }
 
-/// How messages pass between a writer and a reader, as both announce it.
+/// Transport between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Transport {
-    /// By the network, where all of them can be seen.
+    /// The network, where all messages can be captured.
     Network,
-    /// Through Fast DDS's shared memory, which is looked at now and then.
+    /// Fast DDS's shared memory, which is sampled.
     SharedMemory,
-    /// The reader reads the writer's history in memory: not seen.
+    /// The reader accesses the writer's history in shared memory, which cannot be observed.
     DataSharing,
-    /// Within one process: not seen.
+    /// The same process, which cannot be observed.
     SameProcess,
-    /// Through Cyclone DDS's iceoryx: not seen.
+    /// Cyclone DDS's iceoryx, which cannot be observed.
     Iceoryx,
 }
 
-/// Pairs of writer and reader.
+/// Number of pairs with one transport.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TransportCount {
-    /// How messages pass between them.
+    /// The transport.
     pub transport: Transport,
-    /// How many pairs.
+    /// Number of pairs.
     pub pairs: usize,
 }
 
 impl Transport {
-    /// All of them.
+    /// All transports.
     pub const ALL: [Self; 5] = [
         Self::Network,
         Self::SharedMemory,
@@ -196,13 +195,13 @@ impl Transport {
         Self::Iceoryx,
     ];
 
-    /// Its place in a set of ways.
+    /// Returns the bit of the transport in a set.
     #[must_use]
     pub const fn bit(self) -> u8 {
         1 << self as u8
     }
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -220,7 +219,7 @@ impl Transport {
 pub struct EndpointFacts {
     /// GUID.
     pub guid: Guid,
-    /// Node name when `ros_discovery_info` told.
+    /// Node name, if `ros_discovery_info` announces it.
     pub node: Option<NodeName>,
     /// Quality of service.
     pub qos: Arc<Qos>,
@@ -228,17 +227,16 @@ pub struct EndpointFacts {
     pub message_type: TypeName,
     /// RIHS01 hash.
     pub type_hash: Option<TypeHash>,
-    /// When it was announced.
+    /// Time of its first announcement.
     pub first_seen: Timestamp,
-    /// What was measured of this writer while its topic was watched.
+    /// Counts and times of this writer while its topic was watched.
     pub measurement: Option<Box<Measurement>>,
-    /// How messages pass between it and its counterparts: [`Transport::bit`] of each way.
+    /// Set of the transports to its counterparts, as [`Transport::bit`].
     pub transports: u8,
 }
 
 impl EndpointFacts {
-    /// Its history in words: `KEEP_LAST (10)`, `KEEP_ALL` or, as it is often not announced,
-    /// `UNKNOWN`.
+    /// Returns the history as text: `KEEP_LAST (10)`, `KEEP_ALL` or, if not announced, `UNKNOWN`.
     #[must_use]
     pub fn history(&self) -> String {
         let history = self.qos.history;
@@ -246,66 +244,66 @@ impl EndpointFacts {
     }
 }
 
-/// A writer that sends without a known announcement.
+/// An active writer whose announcement was missed.
 #[derive(Clone, Debug)]
 pub struct UnknownWriterFacts {
     /// GUID.
     pub guid: Guid,
-    /// Vendor: its participant's, else the one whose mark its GUID bears.
+    /// Vendor of its participant, otherwise the one that its GUID indicates.
     pub vendor: Option<VendorId>,
-    /// Where it lives.
+    /// Host and process of the writer.
     pub process: ProcessFacts,
-    /// First record.
+    /// Time of the first record.
     pub first_seen: Timestamp,
-    /// Measured like any writer.
+    /// Counts and times, as for any writer.
     pub measurement: Measurement,
 }
 
-/// One watchlist entry and the topics it covers now.
+/// A watchlist entry and the topics that it covers now.
 #[derive(Clone, Debug)]
 pub struct WatchFacts {
     /// The entry as configured.
     pub watch: Arc<Watch>,
-    /// Covered topics with their state; a literal name that does not exist yet is listed with
+    /// Covered topics with their states. An exact name without a topic is listed with
     /// [`WatchState::NotPublished`].
     pub topics: Vec<WatchedTopicFacts>,
 }
 
-/// One watched topic under one entry.
+/// State of a watched topic under one entry.
 #[derive(Clone, Debug)]
 pub struct WatchedTopicFacts {
     /// Domain.
     pub domain_id: DomainId,
     /// ROS name.
     pub topic: TopicName,
-    /// Where it stands.
+    /// State of the topic.
     pub state: WatchState,
-    /// Which expectations are broken: `min_rate_hz`, `max_loss_ratio`, ...
+    /// Violated expectations: `min_rate_hz`, `max_loss_ratio`, ...
     pub violations: Vec<&'static str>,
 }
 
-/// Parse failures of one kind.
+/// Number of parse failures of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DecodeErrorCount {
-    /// What was being read: `frame`, `rtps`, `spdp`, `sedp`, `entities`.
+    /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`.
     pub stage: &'static str,
-    /// [`ros2probe_wire::Reason::label`].
+    /// Reason, from [`ros2probe_wire::Reason::label`].
     pub reason: &'static str,
-    /// How often.
+    /// Number of failures.
     pub count: u64,
 }
 
-/// One bounded table.
+/// Size and cap of a bounded table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
     /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `payloads`,
     /// `history`.
     pub table: &'static str,
-    /// Entries (bytes for `reassembly` and `payloads`).
+    /// Number of entries (bytes for `reassembly` and `payloads`).
     pub size: u64,
     /// Cap.
     pub limit: u64,
-    /// Entries given up because of the cap.
+    /// Entries dropped because of the cap.
     pub evictions: u64,
 }

@@ -1,29 +1,29 @@
-//! What is known of this host's sockets from outside the packets: who holds them, and what died
-//! there without a name.
+//! Facts about this host's sockets from outside the packets: their owners, and drops of
+//! unidentified datagrams.
 //!
-//! Told by whoever reads the kernel's tables; nothing here looks anywhere. Bounded: when full, a
-//! new socket is refused and counted, for the ones at hand have been told apart already.
+//! The capture side reads these facts from the kernel. The table is bounded: when it is full, a new
+//! socket is refused and counted, because existing ones already identify receivers.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::size::Size;
 
-/// What is known of one socket from outside the packets.
+/// Facts about one socket from outside the packets.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct SocketFacts {
     /// `SO_COOKIE`.
     pub cookie: u64,
-    /// Process that holds it.
+    /// Process that owns it.
     pub process_id: Option<u32>,
-    /// The same process as it knows itself: in a container another number, which is the one that
-    /// participants announce.
+    /// Id of the same process in its own namespace. It differs in a container, and it is the id
+    /// that participants announce.
     pub own_process_id: Option<u32>,
-    /// Its name.
+    /// Name of the process.
     pub process: Option<Arc<str>>,
     /// Control group, as a path below the root.
     pub cgroup: Option<Arc<str>>,
-    /// Datagrams that the socket had no room for and of which it is not known what they held.
+    /// Datagrams dropped because the buffer was full, with unknown content.
     pub unidentified_drops: u64,
 }
 
@@ -36,7 +36,7 @@ pub struct Sockets {
 }
 
 impl Sockets {
-    /// None known, at most `limit`.
+    /// Creates an empty table for at most `limit` sockets.
     #[must_use]
     pub const fn new(limit: usize) -> Self {
         Self {
@@ -46,10 +46,10 @@ impl Sockets {
         }
     }
 
-    /// Entries and cap.
+    /// Returns the number of sockets and its cap.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             sockets,
             limit,
@@ -58,7 +58,7 @@ impl Sockets {
         [Size::new("receivers.sockets", sockets.len(), *limit)]
     }
 
-    /// Takes in what is known of one; whether that is new.
+    /// Records facts about a socket. Returns whether they are new.
     pub fn put(&mut self, facts: SocketFacts) -> bool {
         let known = self.sockets.get(&facts.cookie);
         if known == Some(&facts) {
@@ -72,24 +72,24 @@ impl Sockets {
         true
     }
 
-    /// One was closed; whether it was known.
+    /// Removes a closed socket. Returns whether it was known.
     pub fn remove(&mut self, cookie: u64) -> bool {
         self.sockets.remove(&cookie).is_some()
     }
 
-    /// One that is open was forgotten where sockets are told from: others took its place.
+    /// Removes a socket that may be open, because the kernel's table dropped it.
     pub fn forget(&mut self, cookie: u64) {
         self.evictions += 1;
         self.remove(cookie);
     }
 
-    /// One of them.
+    /// Returns the facts about a socket.
     #[must_use]
     pub fn get(&self, cookie: u64) -> Option<&SocketFacts> {
         self.sockets.get(&cookie)
     }
 
-    /// Entries, cap, and sockets refused or forgotten because of one.
+    /// Returns the number of sockets, its cap, and those refused or dropped because of a cap.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {
         (self.sockets.len(), self.limit, self.evictions)

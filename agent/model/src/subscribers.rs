@@ -1,17 +1,17 @@
-//! Who gets one writer's samples, and by which routes.
+//! Receivers of one writer's samples, and the routes to them.
 //!
-//! **A delivery is a participant's.** A multicast sample and its repair by unicast come to two
-//! sockets of one participant, so losses can only be told where both are put together: all routes
-//! that are known to lead to a participant feed one delivery. A route that leads to nobody known is
-//! a delivery of its own, until more is known.
+//! **A delivery belongs to a participant.** A multicast sample and its unicast retransmission
+//! arrive at two sockets of one participant, so losses only show when both are combined. All routes
+//! that lead to a participant feed one delivery. A route to an unknown receiver has its own
+//! delivery until the receiver is known.
 //!
-//! Of such routes a multicast one may belong to any receiver (on a wire it belongs to all). There
-//! the rule is not to invent losses: what comes by unicast fills its gaps, what it brought is not
-//! missing at a unicast delivery, and what it knows already opens no delivery when it comes again
-//! by unicast.
+//! A multicast route to an unknown receiver may lead to any receiver (on a wire, to all). The rule
+//! there is not to invent losses. Unicast samples fill its gaps, and its samples are not missing at
+//! unicast deliveries. A sample that it already has opens no delivery when it arrives again by
+//! unicast.
 //!
-//! What is directed (INFO_DST) at a participant is for nobody else at the same socket. Where the
-//! participant is known and reads nothing of the topic, samples are unmatched and nothing is kept.
+//! A sample directed (INFO_DST) at a participant concerns no other participant at the same socket.
+//! If that participant is known to have no reader of the topic, the sample counts as unmatched.
 
 mod lifecycle;
 mod submessages;
@@ -36,10 +36,9 @@ use super::snapshot::AcknowledgementFacts;
 use super::topic::{Topic, TopicId};
 use lifecycle::is_best_effort;
 
-/// Numbers looked up in a sibling at once.
+/// Largest number of samples compared with a sibling at once.
 const LOOK_BACK: u64 = 4096;
-/// Largest UDP payload that fits one Ethernet frame over IPv4: a larger datagram may die in IP
-/// reassembly.
+/// Largest UDP payload that fits one Ethernet frame over IPv4; larger datagrams need IP reassembly.
 const ONE_FRAME: u16 = 1472;
 
 /// All receivers and destinations of one writer.
@@ -47,72 +46,71 @@ const ONE_FRAME: u16 = 1472;
 pub struct Subscribers {
     routes: Routes,
     deliveries: Vec<Delivery>,
-    /// Deliveries of multicast routes that lead to nobody known.
+    /// Number of deliveries of multicast routes to unknown receivers.
     open: usize,
     totals: Totals,
     departures: Departures,
     acknowledgements: Acknowledgements,
-    /// Its datagrams may need IP reassembly on this host.
+    /// Whether its datagrams may need IP reassembly on this host.
     reassembled: bool,
-    /// Some routes are seen at sockets.
+    /// Whether some routes are observed at sockets.
     at_socket: bool,
-    /// Of the answers in `routes`.
+    /// Generation of the results in `routes`.
     generation: u64,
     /// See [`Delivery::allow_incomplete`].
     sure_from: Timestamp,
 }
 
-/// What a record was to the deliveries.
+/// Result of a record for the deliveries.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum RecordNovelty {
-    /// It may have brought something.
+    /// The record may contain something new.
     New,
-    /// It brought nothing that had not come to the same receiver before, or left for the same
-    /// destination.
+    /// The same receiver already had all of it, or all of it had left for the same destination.
     Duplicate,
-    /// On a wire, of what is seen at sockets anyway.
+    /// The record is from a wire, but the route is observed at sockets.
     SeenAtSocket,
 }
 
-/// Room for the deliveries of all writers.
+/// The quota for deliveries of all writers.
 #[derive(Clone, Copy, Debug)]
 pub struct DeliveryQuota {
-    /// Deliveries.
+    /// Number of deliveries.
     pub used: usize,
     /// Cap.
     pub limit: usize,
-    /// Deliveries refused or given up because of it.
+    /// Deliveries refused or dropped because of the cap.
     pub evictions: u64,
-    /// Somebody was refused.
+    /// Whether a delivery was refused.
     pub wanted: bool,
 }
 
-/// What a record changes besides the deliveries of its writer, and what it is seen against.
+/// State outside the deliveries that a record changes, and its context.
 #[derive(Debug)]
 pub struct WriterContext<'a> {
-    /// The time of the record, or of the look at the clock.
+    /// Time of the record, or of the tick.
     pub now: Timestamp,
     /// The writer.
     pub writer: Guid,
-    /// It retransmits.
+    /// Whether the writer retransmits.
     pub reliable: bool,
     /// Its topic.
     pub topic: Option<TopicId>,
-    /// Memory for fragmented samples.
+    /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
-    /// Where losses are told.
+    /// Journal that receives the losses.
     pub journal: &'a mut Journal,
-    /// Room for deliveries.
+    /// Quota for deliveries.
     pub quota: &'a mut DeliveryQuota,
-    /// Who is there.
+    /// Participants, topics and receivers.
     pub graph: GraphView<'a>,
 }
 
 impl Subscribers {
-    /// Entries, or bytes, and cap of every list; of what deliveries have each, one after the other.
-    /// How many deliveries there may be is in [`DeliveryQuota`].
+    /// Returns the size and cap of each list, in entries or bytes, for one delivery after the
+    /// other. The number of deliveries is in [`DeliveryQuota`].
     pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             routes,
             deliveries,
@@ -130,7 +128,7 @@ impl Subscribers {
         own.chain(deliveries.iter().flat_map(Delivery::sizes))
     }
 
-    /// None yet, of a writer that the kernel meters from `sure_from` on.
+    /// Creates an empty state for a writer that the kernel meters from `sure_from` on.
     #[must_use]
     pub fn new(sure_from: Timestamp) -> Self {
         Self {
@@ -139,7 +137,7 @@ impl Subscribers {
         }
     }
 
-    /// Every delivery with the routes that lead to it.
+    /// Returns each delivery with its routes.
     pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&KnownRoute>)> {
         self.deliveries.iter().map(|delivery| {
             let leads_there = |known: &&KnownRoute| match delivery.receiver() {
@@ -152,19 +150,19 @@ impl Subscribers {
         })
     }
 
-    /// Sums over all deliveries, also those that are no more.
+    /// Returns the sums over all deliveries, including former ones.
     #[must_use]
     pub const fn totals(&self) -> &Totals {
         &self.totals
     }
 
-    /// Routes and readers for which there was no room.
+    /// Returns the number of routes and readers that were refused.
     #[must_use]
     pub const fn refused(&self) -> u64 {
         self.routes.evictions() + self.acknowledgements.refused
     }
 
-    /// What the readers acknowledged of `writer`, whose next sample will be `next`.
+    /// Returns the readers' acknowledgements of `writer`, whose next sample has the number `next`.
     pub fn acknowledgements(
         &self,
         writer: Guid,
@@ -174,7 +172,7 @@ impl Subscribers {
         self.acknowledgements.facts(writer, next, now)
     }
 
-    /// Takes in a record of the writer, or an ACKNACK for it.
+    /// Processes a record of the writer, or an ACKNACK for it.
     pub fn record(&mut self, record: &Record, context: &mut WriterContext<'_>) -> RecordNovelty {
         self.refresh(context);
         let body = record.body();
@@ -227,18 +225,19 @@ impl Subscribers {
         }
     }
 
-    /// All readers that acknowledge have all samples below this number; `None` if none does.
+    /// Returns the number below which all acknowledging readers have everything; `None` without
+    /// any.
     #[must_use]
     pub fn acknowledged_below(&self) -> Option<u64> {
         self.acknowledgements.floor(|_| true)
     }
 
-    /// The writer's newest sample is this one.
+    /// Records the writer's newest sample and its time.
     pub fn wrote(&mut self, number: u64, at: Timestamp) {
         self.acknowledgements.wrote(number, at);
     }
 
-    /// A sample on its way out.
+    /// Processes an outgoing sample.
     fn leave(&mut self, index: usize, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
         let Some(route) = self.routes.get(index).map(|known| known.route) else {
             return false;
@@ -246,7 +245,8 @@ impl Subscribers {
         self.totals.seen[1] = true;
         let source = sample.source_timestamp().timestamp();
         let began = context.graph.wall_clock.wall_time(sample.record().began());
-        // One clock: what leaves before its timestamp, or hours after, is no matter of sending.
+        // Both times are from one clock. A sample that leaves before its timestamp, or hours after
+        // it, is no measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
             && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
             && delay <= PLAUSIBLE
@@ -311,7 +311,7 @@ impl Subscribers {
         false
     }
 
-    /// Who gets what came by this route, and whether it reads the topic.
+    /// Returns the receiver on this route, and whether it reads the topic.
     fn receiver(
         &mut self,
         index: usize,
@@ -324,7 +324,7 @@ impl Subscribers {
         let is_multicast = known.route.destination.is_multicast();
         if let Some(prefix) = directed.filter(|_| !is_multicast) {
             if known.route.socket != 0 && known.owner.is_some_and(|owner| owner != prefix) {
-                // Whoever lives here passes it over.
+                // The receiver ignores it.
                 return None;
             }
             known.note_directed(prefix, &graph, topic);
@@ -399,7 +399,7 @@ impl Subscribers {
         again
     }
 
-    /// A sample came whole this route.
+    /// Processes a sample that arrived whole on this route.
     fn came(&mut self, index: usize, place: usize, whole: &Whole, now: Timestamp) {
         self.transfer(whole, now);
         let Some(known) = self.routes.get_mut(index).filter(|_| !whole.recovered) else {
@@ -426,7 +426,8 @@ impl Subscribers {
         }
     }
 
-    /// Fills gaps of those that may be the receiver; whether any of them knows of the sample.
+    /// Fills the gaps of deliveries that may be the same receiver. Returns whether any of them
+    /// knows the sample.
     fn repair(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
         let number = sample.sequence_number();
         let mut is_known = false;
@@ -442,8 +443,8 @@ impl Subscribers {
         is_known
     }
 
-    /// On a wire, by unicast, to somebody of whom nothing else is known, of a sample that has come
-    /// to a socket of this host as multicast: a repair for another host that got the multicast too.
+    /// Returns whether a unicast record on a wire is a retransmission to another host: its receiver
+    /// is unknown, and a socket of this host received the sample by multicast.
     fn is_repair_elsewhere(&self, route: Route, receiver: Receiver, sample: Sample<'_>) -> bool {
         let is_at_socket = |route: Route| route.is_open() && route.socket != 0;
         route.socket == 0
@@ -455,7 +456,7 @@ impl Subscribers {
             })
     }
 
-    /// Lets deliveries that may be the same receiver's know of each other's samples.
+    /// Shares the samples of deliveries that may be the same receiver.
     fn share(&mut self, place: usize, next: u64, whole: Option<u64>) {
         let Some(delivery) = self.deliveries.get(place) else {
             return;
@@ -495,7 +496,7 @@ impl Subscribers {
             .position(|delivery| delivery.receiver() == receiver)
     }
 
-    /// The delivery of this receiver, begun if there is none and there is room.
+    /// Returns the delivery of this receiver, creating it if the quota allows.
     fn delivery(
         &mut self,
         index: usize,

@@ -1,8 +1,8 @@
-//! Topics: what endpoints meet on, who watches, and what its writers that have gone had counted.
+//! Topics with their endpoints, watches, and the counts of vanished writers.
 //!
-//! A topic is a DDS name in one domain; the CPU buffer topics of `rmw_fastrtps` belong to the ROS
-//! topic they stand beside. A topic whose last endpoint has gone is kept for a grace period with
-//! its counters, so that its silence is seen rather than its series missed.
+//! A topic is a DDS name in one domain; CPU buffer topics of `rmw_fastrtps` belong to their base
+//! topic. A topic without endpoints is kept with its counters for a grace period, so that its
+//! series show silence instead of disappearing.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -25,15 +25,15 @@ pub struct TopicId(u64);
 /// Whether a topic is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Watched {
-    /// Nobody asked.
+    /// The topic is neither watched nor requested.
     No,
-    /// Measured.
+    /// The topic is measured.
     Yes,
-    /// Asked for, but the cap is reached.
+    /// The topic is watched or requested, but the cap is reached.
     Rejected,
 }
 
-/// One topic.
+/// A topic.
 #[derive(Debug)]
 pub struct Topic {
     /// Domain.
@@ -44,81 +44,81 @@ pub struct Topic {
     pub writers: Vec<Guid>,
     /// Live readers.
     pub readers: Vec<Guid>,
-    /// Writers and readers beside it.
+    /// Writers and readers of its buffer topic.
     pub buffer_endpoints: Vec<Guid>,
-    /// Type of the endpoint that came last, for when none is left.
+    /// Type of the endpoint that was announced last; kept when all endpoints are gone.
     pub last_type: Option<TypeName>,
     /// Whether it is measured.
     pub watched: Watched,
-    /// Watchlist entries that cover it, and how it stands with them.
+    /// Watchlist entries that cover it, with the state under each.
     pub judgements: Vec<(usize, Judgement)>,
-    /// Who wants its samples; `None` = nobody.
+    /// Requests for its samples; `None` without any.
     pub requested: Option<RequestIds>,
-    /// What writers had counted that are measured no more.
+    /// Counts of writers that are no longer measured.
     pub retired: Option<Box<Measurement>>,
-    /// What had become of their samples.
+    /// Sums over the deliveries of these writers.
     pub retired_totals: Option<Box<Totals>>,
-    /// When a reader appeared last.
+    /// Time at which a reader last appeared.
     pub reader_appeared: Timestamp,
-    /// Since when it has been both published and watched.
+    /// Time since which it is both published and watched.
     pub published: Timestamp,
-    /// When its last endpoint went.
+    /// Time at which its last endpoint vanished.
     pub vanished: Option<Timestamp>,
 }
 
 /// All topics of all domains.
 ///
-/// Boxed: a table in which much comes and goes has up to four places for each entry.
+/// Values are boxed: a hash table under churn allocates up to four slots per entry.
 #[derive(Debug, Default)]
 pub struct Topics {
     topics: HashMap<TopicId, Box<Topic>>,
     index: BTreeMap<(DomainId, DdsName), TopicId>,
-    /// Those without endpoints, by the time when the last one went.
+    /// Topics without endpoints, by the time at which the last one vanished.
     vanished: BTreeSet<(Timestamp, TopicId)>,
-    /// Those of them that hold a measuring place.
+    /// Topics among `vanished` that hold a measuring slot.
     vanished_watched: BTreeSet<(Timestamp, TopicId)>,
-    /// Those that are measured and not watched by their exact names.
+    /// Measured topics that are not watched by exact name.
     yielding: BTreeSet<TopicId>,
     created: u64,
     watched: usize,
-    /// How often the cap kept out a topic that somebody wanted.
+    /// How often a watched or requested topic exceeded the cap.
     pub rejected: u64,
-    /// Vanished topics given up before their grace period ended.
+    /// Vanished topics dropped before their grace period ended.
     pub evictions: u64,
 }
 
 impl Topic {
-    /// Whether any endpoint is left.
+    /// Returns whether no endpoint is left.
     #[must_use]
     pub const fn is_vanished(&self) -> bool {
         self.vanished.is_some()
     }
 
-    /// Takes over what a writer had counted.
+    /// Adds the counts of a writer that is no longer measured.
     pub fn retire(&mut self, measurement: &Measurement, totals: Option<&Totals>) {
         if let Some(totals) = totals {
             self.retired_totals.get_or_insert_default().add(totals);
         }
         let retired = self.retired.get_or_insert_default();
         retired.add(measurement);
-        // What is gone sends no more.
+        // A vanished writer sends nothing, so it has no rate.
         (retired.rate_hz, retired.bandwidth) = (0.0, 0.0);
     }
 }
 
 impl Topics {
-    /// One topic.
+    /// Returns a topic.
     #[must_use]
     pub fn get(&self, id: TopicId) -> Option<&Topic> {
         self.topics.get(&id).map(Box::as_ref)
     }
 
-    /// One topic.
+    /// Returns a topic.
     pub fn get_mut(&mut self, id: TopicId) -> Option<&mut Topic> {
         self.topics.get_mut(&id).map(Box::as_mut)
     }
 
-    /// The topic of this DDS name, or of the topic it stands beside.
+    /// Returns the topic with this DDS name; for a buffer topic, its base topic.
     #[must_use]
     pub fn find(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicId> {
         self.index
@@ -126,23 +126,23 @@ impl Topics {
             .copied()
     }
 
-    /// All, by domain and DDS name.
+    /// Returns all topics, sorted by domain and DDS name.
     pub fn iter(&self) -> impl Iterator<Item = (TopicId, &Topic)> {
         self.index
             .values()
             .filter_map(|id| Some((*id, &**self.topics.get(id)?)))
     }
 
-    /// All handles, by domain and DDS name.
+    /// Returns all handles, sorted by domain and DDS name.
     #[must_use]
     pub fn ids(&self) -> Vec<TopicId> {
         self.index.values().copied().collect()
     }
 
-    /// Entries and cap of every table; there may be as many topics as endpoints.
+    /// Returns the size and cap of each table; there are at most as many topics as endpoints.
     #[must_use]
     pub fn sizes(&self, endpoints: usize, measured: usize, watches: usize) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             topics,
             index,
@@ -189,25 +189,25 @@ impl Topics {
         ]
     }
 
-    /// How many.
+    /// Returns the number of topics.
     #[must_use]
     pub fn len(&self) -> usize {
         self.topics.len()
     }
 
-    /// Whether there is none.
+    /// Returns whether there are no topics.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.topics.is_empty()
     }
 
-    /// How many are measured.
+    /// Returns the number of measured topics.
     #[must_use]
     pub const fn watched(&self) -> usize {
         self.watched
     }
 
-    /// Adds an endpoint; gives its topic and whether the topic is new.
+    /// Adds an endpoint. Returns its topic and whether the topic is new.
     pub fn join(
         &mut self,
         domain_id: DomainId,
@@ -242,7 +242,7 @@ impl Topics {
         (id, is_new)
     }
 
-    /// Takes an endpoint away.
+    /// Removes an endpoint.
     pub fn leave(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
         let Some(topic) = self.topics.get_mut(&id) else {
             return;
@@ -266,7 +266,7 @@ impl Topics {
         }
     }
 
-    /// Watchlist entries stand elsewhere from now on: `moved` has the new place for each old one.
+    /// Renumbers the watchlist entries: `moved` has the new index for each old one.
     pub fn renumber(&mut self, moved: &[Option<usize>]) {
         for topic in self.topics.values_mut() {
             topic.judgements.retain_mut(|(watch, _)| {
@@ -277,8 +277,8 @@ impl Topics {
         }
     }
 
-    /// Asks the watchlist and the sample requests about one topic, within the cap. One that is
-    /// watched by its exact name takes the place of the latest of the others, which is returned.
+    /// Applies the watchlist and the sample requests to one topic, within the cap. A topic that is
+    /// watched by exact name displaces the latest other one, which is returned.
     pub fn apply_lists(
         &mut self,
         id: TopicId,
@@ -339,21 +339,22 @@ impl Topics {
         displaced
     }
 
-    /// Forgets what was measured of a topic that is measured no more: numbers that stand still
-    /// would look like silence.
+    /// Drops the measurement of a topic that is no longer measured: constant counters would look
+    /// like silence.
     pub fn forget_measurement(&mut self, id: TopicId) {
         if let Some(topic) = self.topics.get_mut(&id) {
             (topic.retired, topic.retired_totals) = (None, None);
         }
     }
 
-    /// Whether one more topic can be measured: a place is free, or a vanished topic has it.
+    /// Returns whether one more topic can be measured: a slot is free, or a vanished topic holds
+    /// one.
     #[must_use]
     pub fn has_place(&self, cap: usize) -> bool {
         self.watched < cap || !self.vanished_watched.is_empty()
     }
 
-    /// Forgets topics that vanished longer than `grace` ago.
+    /// Removes topics that vanished more than `grace` ago.
     pub fn expire(&mut self, now: Timestamp, grace: u64) {
         while let Some((at, id)) = self.vanished.first().copied()
             && at.0.saturating_add(grace) <= now.0
@@ -362,7 +363,7 @@ impl Topics {
         }
     }
 
-    /// Forgets the topics that vanished first until at most `cap` are left, as far as that goes.
+    /// Removes the topics that vanished first until at most `cap` topics are left.
     pub fn shrink(&mut self, cap: usize) {
         while self.topics.len() > cap {
             let Some((_, id)) = self.vanished.first().copied() else {
@@ -403,8 +404,8 @@ impl Topics {
         id
     }
 
-    /// Frees the measuring place of the topic that vanished first; one that is watched by its exact
-    /// name keeps it, unless the newcomer is, too.
+    /// Frees the slot of the topic that vanished first. A topic watched by exact name keeps its
+    /// slot unless the newcomer is watched so, too.
     fn give_up_vanished(&mut self, keep: TopicId, is_named: bool) -> bool {
         let places = || self.vanished_watched.iter().map(|(_, id)| *id);
         let unnamed = places().find(|id| *id != keep && self.yielding.contains(id));
@@ -417,8 +418,8 @@ impl Topics {
         true
     }
 
-    /// Takes its measuring place from the latest topic that is not watched by its exact name: what
-    /// was there before a flood stays.
+    /// Frees the slot of the latest topic that is not watched by exact name, so that topics from
+    /// before a flood stay.
     fn displace(&mut self) -> Option<TopicId> {
         let id = self.yielding.pop_last()?;
         let topic = self.topics.get_mut(&id)?;

@@ -1,15 +1,15 @@
-//! What kind of ROS channel a DDS topic is.
+//! Roles of DDS topics in ROS.
 
 use ros2probe_wire::names::{ActionPart, DdsTopic, Demangled, RosName};
 
-/// What kind of ROS channel a DDS topic is. Ordered by label.
+/// Role of a DDS topic in ROS. Ordered by label.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum TopicKind {
     /// Feedback of an action.
     ActionFeedback,
     /// Goal states of an action.
     ActionStatus,
-    /// Follows no ROS naming convention.
+    /// A topic that follows no ROS naming convention.
     Dds,
     /// `ros_discovery_info`.
     Discovery,
@@ -36,7 +36,7 @@ impl TopicKind {
         Self::Topic,
     ];
 
-    /// Of a DDS topic; a buffer topic is of the kind of its base.
+    /// Returns the kind of a DDS topic; a buffer topic has the kind of its base topic.
     #[must_use]
     pub fn of(topic: &DdsTopic) -> Self {
         Self::of_demangled(&topic.demangle())
@@ -69,7 +69,7 @@ impl TopicKind {
         Self::ALL.into_iter().find(|kind| kind.label() == label)
     }
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -84,14 +84,15 @@ impl TopicKind {
         }
     }
 
-    /// Whether it is one half of a service, whose ROS name may be a topic's as well.
+    /// Returns whether it is a request or reply topic of a service, whose ROS name a topic may have
+    /// as well.
     #[must_use]
     pub const fn is_service(self) -> bool {
         matches!(self, Self::ServiceRequest | Self::ServiceReply)
     }
 
-    /// Whether `ros2 topic` knows it by its ROS name: a topic, or one of an action or of a
-    /// service's introspection.
+    /// Returns whether `ros2 topic` lists it by its ROS name: topics, and topics of actions and of
+    /// service introspection.
     #[must_use]
     pub const fn is_ros_topic(self) -> bool {
         matches!(

@@ -1,10 +1,9 @@
-//! Spans of sampled messages: when each was on the wire, and when its reliable readers acknowledged
-//! it.
+//! Spans of traced messages: when each was on the network, and when its reliable readers
+//! acknowledged it.
 //!
-//! Only what was seen is told: nothing here guesses when a message was published or processed.
-//! Which messages are sampled follows from their identity, so that every agent that sees a message
-//! decides alike, without a word between them. What is under way or waits for acknowledgements is
-//! bounded; what is given up for that is counted.
+//! Spans contain only what was observed, not when a message was published or processed. Whether a
+//! message is traced follows from its identity, so all agents that see it decide alike without
+//! communication. The number of open messages is bounded, and dropped ones are counted.
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
@@ -20,77 +19,78 @@ use super::route::Destination;
 use super::samples::{Budget, Progress, Samples};
 use super::size::{Size, largest};
 
-/// Writers whose messages may be sampled.
+/// Largest number of writers whose messages may be traced.
 const MAX_WRITERS: usize = 4096;
-/// Messages under way or waiting, of all writers and of one.
+/// Largest number of open messages, of all writers and of one.
 const MAX_OPEN: usize = 4096;
 const MAX_OPEN_OF_WRITER: usize = 256;
-/// Fragmented messages of one writer under way.
+/// Largest number of unfinished fragmented messages per writer.
 const MAX_UNDER_WAY: usize = 16;
-/// Readers of one message that are told of.
+/// Largest number of readers with a span per message.
 const MAX_READERS: usize = 32;
-/// Last messages of a writer, which may come again.
+/// Number of recent messages per writer that are remembered, to ignore duplicates.
 const REMEMBERED: usize = 128;
-/// Spans kept until they are taken.
+/// Largest number of spans kept until they are taken.
 const MAX_FINISHED: usize = 2048;
-/// For bitmaps of fragments.
+/// Memory for bitmaps of fragments in bytes.
 const BITMAP_BYTES: usize = 1 << 18;
-/// Acknowledgements that come later are of no interest.
+/// Acknowledgements after this time have no span.
 const PATIENCE: u64 = 10 * SECOND;
-/// What arrives may turn out to be a copy of what is sent from here.
+/// An arriving message is not a copy of one sent from here if no record shows that within this
+/// time.
 const LOCAL_COPY_DELAY: u64 = 500 * MILLISECOND;
-/// The loopback interface, in every network namespace.
+/// Index of the loopback interface in every network namespace.
 const LOOPBACK: u32 = 1;
-/// The part of a trace's identity that decides, as in OpenTelemetry's samplers.
+/// The bits of a trace id that decide about sampling, as in OpenTelemetry's samplers.
 const RANDOM: u64 = (1 << 56) - 1;
 
-/// What a span tells.
+/// The stage that a span covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SpanStage {
-    /// Leaving this host, or on the wire where that is not told apart: first to last fragment. A
-    /// gateway that looks at its wire sees what it forwards leaving, too.
+    /// The message leaves this host, or is on the wire if the direction is unknown: from the first
+    /// to the last fragment. On a gateway with a wire source, forwarded messages leave, too.
     Send,
-    /// Reaching this host from another: first to last fragment.
+    /// The message arrives from another host: from the first to the last fragment.
     Receive,
-    /// From its last fragment to the first ACKNACK of this reader that covers it.
+    /// From the message's last fragment to the first ACKNACK of this reader that covers it.
     Settle(Guid),
 }
 
-/// One span.
+/// A span.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Span {
-    /// What it tells.
+    /// The stage.
     pub stage: SpanStage,
-    /// Of which message.
+    /// The message.
     pub message: Message,
-    /// Begin.
+    /// Begin of the span.
     pub begin: Timestamp,
-    /// End.
+    /// End of the span.
     pub end: Timestamp,
 }
 
-/// One sampled message.
+/// A traced message.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Message {
-    /// Who wrote it.
+    /// GUID of its writer.
     pub writer: Guid,
-    /// Its number.
+    /// Its sequence number.
     pub sequence_number: u64,
-    /// Out of both.
+    /// Trace id, derived from both.
     pub trace_id: u128,
-    /// On which topic.
+    /// Its topic and type.
     pub description: Arc<WriterDescription>,
-    /// The writer's own time.
+    /// Source timestamp, by the writer's clock.
     pub source: RtpsTime,
     /// Size of the payload in bytes.
     pub size: u32,
-    /// In so many fragments; 1 for a whole one.
+    /// Number of fragments; 1 for an unfragmented message.
     pub fragments: u32,
-    /// Where its first datagram went.
+    /// Destination of its first datagram.
     pub destination: Destination,
 }
 
-/// What all messages of a writer have in common.
+/// Properties shared by all messages of a writer.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WriterDescription {
     /// Domain.
@@ -99,30 +99,30 @@ pub struct WriterDescription {
     pub topic: TopicName,
     /// Type.
     pub message_type: TypeName,
-    /// Its readers may acknowledge.
+    /// Whether its readers may acknowledge.
     pub reliable: bool,
 }
 
-/// What was finished since the last call.
+/// Spans completed since the last call.
 #[derive(Debug, Default)]
 pub struct Spans {
-    /// In the order in which they ended.
+    /// Spans in the order in which they ended.
     pub spans: Vec<Span>,
-    /// For which there was no room.
+    /// Number of spans dropped because the list was full.
     pub lost: u64,
 }
 
-/// All of it.
+/// State of all traced writers.
 #[derive(Debug)]
 pub struct Tracer {
     wanted: bool,
     directed: bool,
-    /// `None` = none of its messages is wanted.
+    /// Traced writers; `None` for a writer that is not traced.
     writers: HashMap<Guid, Option<Box<WriterTrace>>>,
     shared: Shared,
 }
 
-/// What all writers draw on.
+/// Budgets that all writers share.
 #[derive(Debug)]
 struct Shared {
     budget: Budget,
@@ -131,25 +131,25 @@ struct Shared {
     finished: Spans,
 }
 
-/// One writer some of whose messages are wanted.
+/// A writer that is traced.
 #[derive(Debug)]
 struct WriterTrace {
     description: Arc<WriterDescription>,
-    /// Of its messages, before their numbers.
+    /// Identity of its messages, before the sequence number is added.
     identity: Identity,
     threshold: u64,
     samples: Samples,
-    /// It sends from here. The kernel shows a multicast's local copies before its sending, so this
-    /// is learned when the first message has arrived already.
+    /// Whether it sends from this host. The kernel shows a multicast's local copies before its
+    /// departure, so the first message arrives before this is known.
     is_local: bool,
     under_way: VecDeque<Message>,
-    /// Spans of messages that arrived, until it is sure that they were not sent from here.
+    /// Spans of arrivals, until it is certain that they were not sent from this host.
     arrived: VecDeque<Span>,
     waiting: VecDeque<Unacknowledged>,
     done: VecDeque<u64>,
 }
 
-/// A message that was sent and not acknowledged by everybody.
+/// A message that was sent and that some readers have not acknowledged.
 #[derive(Debug)]
 struct Unacknowledged {
     message: Message,
@@ -158,8 +158,8 @@ struct Unacknowledged {
 }
 
 impl Tracer {
-    /// Nothing is wanted yet. A capture file does not say who sent: `directed` is false, and all of
-    /// it is taken for sent.
+    /// Creates a tracer without writers. In a capture file the direction is unknown: `directed` is
+    /// then false, and all messages count as sent.
     #[must_use]
     pub fn new(directed: bool) -> Self {
         Self {
@@ -175,13 +175,13 @@ impl Tracer {
         }
     }
 
-    /// Whether anything is wanted at all.
+    /// Returns whether any topic is traced.
     #[must_use]
     pub const fn is_wanted(&self) -> bool {
         self.wanted
     }
 
-    /// What is wanted has changed.
+    /// Restarts after a change of the traced topics.
     pub fn restart(&mut self, wanted: bool) {
         self.wanted = wanted;
         self.writers = HashMap::new();
@@ -189,15 +189,15 @@ impl Tracer {
         self.shared.open = 0;
     }
 
-    /// A writer has gone.
+    /// Removes a writer.
     pub fn forget(&mut self, writer: Guid) {
         if let Some(Some(traced)) = self.writers.remove(&writer) {
             traced.close(&mut self.shared);
         }
     }
 
-    /// Takes in a record. `about` says of a writer that was not heard before what it writes and
-    /// which part of it is wanted; `None` = not known yet.
+    /// Processes a record. `about` returns the description and traced share of a new writer, or
+    /// `None` if they are not known yet.
     pub fn record(
         &mut self,
         record: &Record,
@@ -230,7 +230,7 @@ impl Tracer {
         }
     }
 
-    /// Waits for no acknowledgement that is long overdue.
+    /// Drops messages whose acknowledgements are overdue.
     pub fn advance(&mut self, now: Timestamp) {
         for traced in self.writers.values_mut().flatten() {
             traced.release(now, &mut self.shared);
@@ -243,15 +243,15 @@ impl Tracer {
         }
     }
 
-    /// What was finished since the last call.
+    /// Removes and returns the spans completed since the last call.
     pub fn take(&mut self) -> Spans {
         std::mem::take(&mut self.shared.finished)
     }
 
-    /// Entries, or bytes, and cap of every table.
+    /// Returns the size and cap of each table, in entries or bytes.
     #[must_use]
     pub fn sizes(&self) -> Vec<Size> {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             wanted: _,
             directed: _,
@@ -275,7 +275,7 @@ impl Tracer {
         sizes
     }
 
-    /// Messages under way or waiting, their cap, and those given up for it.
+    /// Returns the number of open messages, its cap, and those dropped because of it.
     #[must_use]
     pub const fn size(&self) -> (usize, usize, u64) {
         (self.shared.open, MAX_OPEN, self.shared.evictions)
@@ -283,7 +283,7 @@ impl Tracer {
 }
 
 impl Message {
-    /// The identity of a message for every agent that sees it.
+    /// Returns the identity of a message, equal for every agent that sees it.
     #[must_use]
     pub fn identity(writer: Guid, sequence_number: u64) -> u128 {
         numbered(of_writer(writer), sequence_number)
@@ -303,7 +303,7 @@ fn numbered(mut identity: Identity, sequence_number: u64) -> u128 {
 
 impl WriterTrace {
     fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             description: _,
             identity: _,
@@ -337,7 +337,7 @@ impl WriterTrace {
         own.into_iter().chain(samples.sizes())
     }
 
-    /// `None`: nothing of it is wanted.
+    /// Returns `None` if no message of the writer is traced.
     fn new(writer: Guid, description: WriterDescription, ratio: f64) -> Option<Self> {
         if ratio.is_nan() || ratio <= 0.0 {
             return None;
@@ -375,7 +375,7 @@ impl WriterTrace {
         if leaves && !self.is_local {
             self.forget_arrivals(shared);
         }
-        // Copies that arrive are no part of how it left.
+        // Copies that arrive do not belong to the departure.
         if leaves != self.is_local || self.done.contains(&number) {
             return;
         }
@@ -413,7 +413,7 @@ impl WriterTrace {
         self.whole(message, begin, at, shared);
     }
 
-    /// A message has been seen whole.
+    /// Processes a message that was seen whole.
     fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, shared: &mut Shared) {
         if self.waiting.len() + self.arrived.len() >= MAX_OPEN_OF_WRITER {
             self.arrived
@@ -445,7 +445,7 @@ impl WriterTrace {
         });
     }
 
-    /// Tells of what arrived so long ago that it was not sent from here.
+    /// Completes the spans of arrivals that are old enough to be from another host.
     fn release(&mut self, now: Timestamp, shared: &mut Shared) {
         while let Some(first) = self.arrived.front()
             && now.0.saturating_sub(first.end.0) > LOCAL_COPY_DELAY
@@ -456,7 +456,7 @@ impl WriterTrace {
         }
     }
 
-    /// It turns out to send from here.
+    /// Drops the spans of arrivals, because the writer sends from this host.
     fn forget_arrivals(&mut self, shared: &mut Shared) {
         self.is_local = true;
         let open = self.under_way.len() + self.arrived.len();
@@ -467,7 +467,7 @@ impl WriterTrace {
         self.samples.clear(&mut shared.budget);
     }
 
-    /// Makes room for a message and gives its place.
+    /// Adds a message, dropping another if necessary, and returns its index.
     fn begin(&mut self, message: Message, shared: &mut Shared) -> Option<usize> {
         if self.under_way.len() >= MAX_UNDER_WAY {
             self.under_way.pop_front();

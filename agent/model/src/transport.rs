@@ -1,7 +1,7 @@
-//! How messages pass between a writer and a reader, as far as both announce it: by the network, or
-//! by a way of their host that a network does not show.
+//! Transports between a writer and a reader, as far as both announce them: the network, or a
+//! transport within their host that the network does not show.
 //!
-//! It says what they would use, not what they did: whether their QoS fits is theirs to find out.
+//! The result is the transport that they would use; whether they match is decided elsewhere.
 
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
@@ -10,14 +10,15 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 use super::discovery::{Discovery, Endpoint};
 use super::snapshot::{EndpointFacts, Transport, TransportCount};
 
-/// Pairs of one topic that are looked at; the rest is taken to be as those are.
+/// Largest number of pairs examined per topic; the others are assumed to be alike.
 const MAX_PAIRS: usize = 1024;
-/// After so long a participant that told no nodes is none of ROS, and an endpoint is nobody's.
+/// A participant without announced nodes for this long does not use ROS, and its endpoints have no
+/// node.
 const NODES_WITHIN: u64 = 30 * SECOND;
 const NODE_WITHIN: u64 = 10 * SECOND;
 
-/// Pairs of these writers and readers by how messages pass between them; each endpoint gets the
-/// ways it has a part in.
+/// Counts the pairs of these writers and readers by transport, and passes each endpoint its
+/// transports.
 pub(super) fn transports(
     discovery: &Discovery,
     writers: &mut [EndpointFacts],
@@ -54,8 +55,8 @@ pub(super) fn transports(
     counts.into_iter().filter(|count| count.pairs > 0).collect()
 }
 
-/// Whether somebody on this writer's host may get its samples through Fast DDS's shared memory, who
-/// need not be known to read it.
+/// Returns whether a participant on this writer's host may receive its samples through Fast DDS's
+/// shared memory. The participant need not be a known reader.
 pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
     let participants = discovery.participants();
     let own = participants.get(&writer.prefix);
@@ -70,8 +71,8 @@ pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
         })
 }
 
-/// Whether names are lacking that may be said in shared memory just now: those of a participant's
-/// nodes, or those of the node that an endpoint belongs to.
+/// Returns whether names are missing that shared memory may contain at present: nodes of a
+/// participant, or the node of an endpoint.
 pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
     let is_new =
         |first_seen: Timestamp, patience: u64| first_seen.0.saturating_add(patience) > now.0;
@@ -123,8 +124,9 @@ fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
     participant.map_or(VendorId([first, second]), |known| known.proxy.vendor)
 }
 
-/// One participant, or two of one process: Fast DDS has vendor, host and process in the first eight
-/// bytes, the process's number in the fifth and sixth and something random in the next two.
+/// Returns whether both are one participant or in one process. Fast DDS stores vendor, host and
+/// process in the first eight bytes: the process id in the fifth and sixth, random bits in the next
+/// two.
 fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> bool {
     one == other
         || vendor(discovery, one) == VendorId::EPROSIMA
@@ -132,8 +134,8 @@ fn is_one_process(discovery: &Discovery, one: GuidPrefix, other: GuidPrefix) -> 
             && one.0.first_chunk::<8>() == other.0.first_chunk::<8>()
 }
 
-/// Fast DDS has vendor and host in the first four bytes. Others do not tell: only who announces
-/// shared memory is asked about.
+/// Returns whether both are on one host. Fast DDS stores vendor and host in the first four bytes;
+/// only participants that announce shared memory are compared.
 fn is_one_host(vendor: VendorId, one: GuidPrefix, other: GuidPrefix) -> bool {
     vendor != VendorId::EPROSIMA || one.0.first_chunk::<4>() == other.0.first_chunk::<4>()
 }

@@ -1,10 +1,10 @@
-//! Arrivals that never reached the reader: the socket had no room for them.
+//! Arrivals that never reached the reader, because the socket's buffer was full.
 //!
-//! The host hook reports a datagram when it reaches a socket, and the kernel may say a moment later
-//! that the socket's receive buffer was full. That comes first here, and takes its part out of the
-//! arrival it names, once: a retransmission of the same fragments is another arrival. An arrival
-//! may speak for several datagrams; it lasts from its first to its last, and only what died in that
-//! time is taken out of it.
+//! The host hook reports a datagram when it reaches a socket, and shortly afterwards the kernel may
+//! report that the socket's buffer was full. The second report arrives here first and is
+//! subtracted, once, from the arrival that it names: a retransmission of the same fragments is
+//! another arrival. An arrival may cover several datagrams; only drops between its first and last
+//! are subtracted.
 
 use std::collections::VecDeque;
 
@@ -14,14 +14,14 @@ use ros2probe_wire::time::SECOND;
 
 use super::size::Size;
 
-/// What waits for its arrival at one receiver: more than the datagrams of a large sample.
+/// Largest number of drops that wait for their arrival, more than the datagrams of a large sample.
 const LIMIT: usize = 4096;
-/// Clock readings of the two reports may be converted this far apart, nanoseconds.
+/// Largest difference in nanoseconds between the clock conversions of the two reports.
 const SLACK: u64 = 100_000;
-/// Arrivals come within this, or their record was lost.
+/// Arrivals follow within this time, or their record was lost.
 const LIFETIME: u64 = 60 * SECOND;
 
-/// What waits for its arrival at one receiver.
+/// Drops that wait for their arrival at one receiver.
 #[derive(Debug, Default)]
 pub struct Undelivered {
     waiting: VecDeque<UndeliveredPart>,
@@ -31,7 +31,7 @@ pub struct Undelivered {
 struct UndeliveredPart {
     socket: u64,
     number: u64,
-    /// Fragments from `start` to before `end`; of a whole sample 0 and 1.
+    /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
     start: u32,
     end: u32,
     first: u64,
@@ -39,21 +39,21 @@ struct UndeliveredPart {
 }
 
 impl Undelivered {
-    /// Entries and cap.
+    /// Returns the number of entries and its cap.
     #[must_use]
     pub fn sizes(&self) -> [Size; 1] {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self { waiting } = self;
         [Size::new("undelivered.waiting", waiting.len(), LIMIT)]
     }
 
-    /// Whether nothing waits.
+    /// Returns whether no drop waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }
 
-    /// Takes in that this DATA or DATA_FRAG was not delivered; whether an older one had to go.
+    /// Records that this DATA or DATA_FRAG was dropped. Returns whether an older entry was evicted.
     pub fn note(&mut self, sample: Sample<'_>) -> bool {
         let record = sample.record();
         let (start, end) = range(sample);
@@ -82,7 +82,7 @@ impl Undelivered {
         is_full
     }
 
-    /// The parts of an arrival that were delivered, in order; counts older ones that had to go.
+    /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
     pub fn delivered(&mut self, sample: Sample<'_>, evictions: &mut u64) -> Vec<Record> {
         let record = sample.record();
         let mut parts = vec![range(sample)];
@@ -130,7 +130,7 @@ impl Undelivered {
         parts.into_iter().map(part).collect()
     }
 
-    /// Forgets what no arrival came for.
+    /// Removes entries whose arrival did not follow.
     pub fn expire(&mut self, now: u64) {
         while let Some(oldest) = self.waiting.front()
             && oldest.last.saturating_add(LIFETIME) <= now
@@ -143,7 +143,7 @@ impl Undelivered {
     }
 }
 
-/// The fragments that came, to before the second number.
+/// Returns the fragments, as a half-open range.
 const fn range(sample: Sample<'_>) -> (u32, u32) {
     match sample {
         Sample::Data(_) => (0, 1),
@@ -154,7 +154,7 @@ const fn range(sample: Sample<'_>) -> (u32, u32) {
     }
 }
 
-/// From its first datagram to its last.
+/// Returns the times of its first and last datagram.
 fn span(record: &Record) -> (u64, u64) {
     let begin = match record.elapsed {
         u32::MAX => 0,

@@ -1,5 +1,5 @@
-//! What to watch and what to expect of it: plain data, already checked, and the matcher that tells
-//! which entries cover a topic.
+//! Watches and their expectations as validated data, and the matcher that finds the entries for a
+//! topic.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -12,93 +12,93 @@ use crate::glob;
 /// One watchlist entry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Watch {
-    /// Exact ROS name (`/points`) or glob: `*` within one token, `**` across tokens.
+    /// Exact ROS name (`/points`) or glob: `*` within a token, `**` across tokens.
     pub pattern: String,
-    /// Only this domain; `None` = every domain.
+    /// Domain; `None` for every domain.
     pub domain_id: Option<DomainId>,
-    /// What should hold.
+    /// Expectations of each topic.
     pub expectations: Expectations,
-    /// Series per delivery.
+    /// Whether metrics have series per delivery.
     pub per_subscriber: bool,
-    /// The part of the messages of which spans are told, 0 to 1.
+    /// Share of messages for which spans are exported, from 0 to 1.
     pub trace: f64,
-    /// What is kept of its messages.
+    /// Messages that are kept for later recordings.
     pub retain: Retain,
 }
 
-/// What is kept of a topic's messages for recordings that begin later.
+/// Messages that the agent keeps for recordings that begin later.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Retain {
-    /// Nothing.
+    /// No messages.
     #[default]
     None,
-    /// The last one of each writer that keeps its own for late joiners (transient local).
+    /// The last message of each writer that keeps messages for late joiners (transient local).
     Last,
 }
 
-/// Limits on a topic; `None` = no opinion.
+/// Expectations of a topic; `None` expects nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Expectations {
-    /// At least this many messages a second.
+    /// Smallest rate, in messages per second.
     pub min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
+    /// Largest rate, in messages per second.
     pub max_rate_hz: Option<f64>,
-    /// Lost / (received + lost), 0 to 1.
+    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
     pub max_loss_ratio: Option<f64>,
-    /// INFO_TS to capture, milliseconds.
+    /// Longest time from INFO_TS to the capture, in milliseconds.
     pub max_latency_ms: Option<f64>,
-    /// Longest time without a message, seconds.
+    /// Longest time without a message, in seconds.
     pub max_silence_s: Option<f64>,
 }
 
-/// Why a topic name or glob cannot match anything.
+/// Why a topic name or glob cannot match any topic.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum PatternError {
-    /// Nothing there.
+    /// The text is empty.
     #[error("is empty")]
     Empty,
-    /// Relative or private names mean nothing outside a node.
+    /// The name is relative or private, which is only meaningful within a node.
     #[error("must begin with a slash, as in `/points`")]
     NoSlash,
-    /// `//` or a slash at the end.
+    /// The name contains `//` or ends with a slash.
     #[error("has a name token without letters")]
     EmptyToken,
-    /// ROS forbids it.
+    /// A token begins with a digit, which ROS forbids.
     #[error("has a name token that begins with a digit, which ROS does not allow")]
     Digit,
-    /// `**` stands for whole tokens.
+    /// `**` is not a whole token.
     #[error("`**` must stand alone between slashes")]
     Stars,
-    /// ROS names are made of ASCII letters, digits and `_`.
+    /// The name contains a character other than ASCII letters, digits and `_`.
     #[error("has the character `{0}`: ROS names have letters, digits and `_`, globs also `*`")]
     Character(char),
-    /// Longer than DDS allows.
+    /// The name is longer than DDS allows.
     #[error("is longer than 255 characters")]
     Long,
-    /// More than [`MAX_STARS`].
+    /// The glob has more than [`MAX_STARS`] stars.
     #[error("has more than {MAX_STARS} stars")]
     ManyStars,
 }
 
-/// Why globs are not watched together: matching them against a topic takes too long.
+/// Too many globs: matching all of them against a topic would take too long.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "{count} globs of {bytes} bytes; at most {MAX_GLOBS} of {MAX_GLOB_BYTES} bytes are matched: \
      use names, or fewer and shorter globs"
 )]
 pub struct ManyGlobs {
-    /// How many there are.
+    /// Number of globs.
     pub count: usize,
-    /// Bytes of all of them.
+    /// Total length of all globs in bytes.
     pub bytes: usize,
 }
 
 impl Watch {
-    /// Everything of this name in every domain, without expectations.
+    /// Returns a watch of this name or glob in every domain, without expectations.
     ///
     /// # Errors
-    /// When `pattern` is no ROS name or glob.
+    /// Fails if `pattern` is neither a ROS name nor a glob.
     pub fn named(pattern: &str) -> Result<Self, PatternError> {
         check_pattern(pattern)?;
         let pattern = pattern.to_owned();
@@ -112,7 +112,7 @@ impl Watch {
         })
     }
 
-    /// Names one topic rather than a family.
+    /// Returns whether the pattern is an exact name rather than a glob.
     #[must_use]
     pub fn is_literal(&self) -> bool {
         !self.pattern.contains('*')
@@ -120,7 +120,7 @@ impl Watch {
 }
 
 impl Expectations {
-    /// `(key, is it set)` for each.
+    /// Returns each key and whether it is set.
     #[must_use]
     pub const fn keys(&self) -> [(&'static str, bool); 5] {
         [
@@ -132,10 +132,10 @@ impl Expectations {
         ]
     }
 
-    /// Says whether this can be expected of a topic, where no schema has looked at it.
+    /// Validates expectations that no schema has checked.
     ///
     /// # Errors
-    /// The first mistake.
+    /// Returns a description of the first error.
     pub fn check(&self) -> Result<(), String> {
         let values = [
             self.min_rate_hz,
@@ -160,14 +160,14 @@ impl Expectations {
     }
 }
 
-/// Stars of one glob, `**` counted as two.
+/// Largest number of stars in a glob; `**` counts as two.
 pub const MAX_STARS: usize = 16;
-/// Globs of one watchlist, and bytes of all of them: a topic that appears is matched against each.
+/// Largest number of globs in a watchlist, since each new topic is matched against all of them.
 pub const MAX_GLOBS: usize = 256;
-/// See [`MAX_GLOBS`].
+/// Largest total length of the globs in a watchlist, in bytes.
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
-/// Ranges of what may be expected, as the configuration's schema has them.
+/// Valid ranges of expectations, as in the configuration's schema.
 const RANGES: [(&str, f64, f64); 5] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
     ("max_rate_hz", 0.0, 1_000_000.0),
@@ -176,10 +176,10 @@ const RANGES: [(&str, f64, f64); 5] = [
     ("max_silence_s", 0.001, 604_800.0),
 ];
 
-/// Says whether `ratio` is a part of the messages.
+/// Validates a share of messages for tracing.
 ///
 /// # Errors
-/// The range.
+/// Returns a description of the valid range.
 pub fn check_trace(ratio: f64) -> Result<(), String> {
     if (0.0..=1.0).contains(&ratio) {
         return Ok(());
@@ -187,10 +187,10 @@ pub fn check_trace(ratio: f64) -> Result<(), String> {
     Err(format!("trace is {ratio}, must be between 0 and 1"))
 }
 
-/// Says whether `pattern` can be a ROS topic name or a glob over such names.
+/// Validates a ROS topic name or a glob over such names.
 ///
 /// # Errors
-/// The first rule it breaks.
+/// Returns the first broken rule.
 pub fn check_pattern(pattern: &str) -> Result<(), PatternError> {
     if pattern.is_empty() {
         return Err(PatternError::Empty);
@@ -222,10 +222,10 @@ pub fn check_pattern(pattern: &str) -> Result<(), PatternError> {
     Ok(())
 }
 
-/// Counts `patterns` that are globs.
+/// Validates the number and length of the globs in `patterns`.
 ///
 /// # Errors
-/// They are too many to be matched against every topic.
+/// Fails if matching them against every topic would take too long.
 pub fn check_globs<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<(), ManyGlobs> {
     let globs = patterns.into_iter().filter(|pattern| pattern.contains('*'));
     let (count, bytes) = globs.fold((0, 0), |(count, bytes), glob| {
@@ -237,13 +237,13 @@ pub fn check_globs<'a>(patterns: impl IntoIterator<Item = &'a str>) -> Result<()
     Ok(())
 }
 
-/// A watchlist, ready to be asked.
+/// A watchlist, prepared for matching.
 #[derive(Clone, Debug, Default)]
 pub struct Watchlist {
     watches: Vec<Arc<Watch>>,
-    /// Places in `watches` of the entries with this pattern, which are for different domains.
+    /// Indices in `watches` of the entries with this pattern, one per domain.
     patterns: HashMap<String, Vec<usize>>,
-    /// Places in `watches` of the globs.
+    /// Indices in `watches` of the globs.
     globs: Vec<usize>,
 }
 
@@ -251,15 +251,15 @@ impl Watchlist {
     /// Prepares `watches`, keeping their order.
     ///
     /// # Errors
-    /// The globs are too many to be matched.
+    /// Fails if there are too many globs.
     pub fn new(watches: Vec<Watch>) -> Result<Self, ManyGlobs> {
         Self::of(watches.into_iter().map(Arc::new).collect())
     }
 
-    /// As [`Self::new`], of entries that other watchlists share.
+    /// Prepares entries that other watchlists share, as [`Self::new`] does.
     ///
     /// # Errors
-    /// As [`Self::new`].
+    /// Fails as [`Self::new`] does.
     pub fn of(watches: Vec<Arc<Watch>>) -> Result<Self, ManyGlobs> {
         check_globs(watches.iter().map(|watch| watch.pattern.as_str()))?;
         let mut patterns: HashMap<String, Vec<usize>> = HashMap::with_capacity(watches.len());
@@ -280,19 +280,19 @@ impl Watchlist {
         })
     }
 
-    /// The entries, in configuration order.
+    /// Returns the entries, in configuration order.
     #[must_use]
     pub fn watches(&self) -> &[Arc<Watch>] {
         &self.watches
     }
 
-    /// How many globs each topic's name is matched against.
+    /// Returns the number of globs that each topic's name is matched against.
     #[must_use]
     pub const fn globs(&self) -> usize {
         self.globs.len()
     }
 
-    /// The entries that cover this topic, as indices into [`Self::watches`].
+    /// Returns the entries that cover this topic, as indices into [`Self::watches`].
     #[must_use]
     pub fn matching(&self, domain_id: DomainId, topic: &str) -> Vec<usize> {
         let covers = |place: &usize| {
@@ -300,7 +300,7 @@ impl Watchlist {
             watch.is_some_and(|watch| glob::covers(&watch.pattern, topic))
         };
         let globs = self.globs.iter().copied().filter(covers);
-        // A hostile topic may be called as a glob is written: then the glob has decided.
+        // A hostile topic's name may equal a glob; then matching the glob has decided already.
         let named = self.patterns.get(topic).into_iter().flatten().copied();
         let named =
             named.filter(|place| self.watches.get(*place).is_some_and(|it| it.is_literal()));
@@ -313,13 +313,13 @@ impl Watchlist {
         matching
     }
 
-    /// Whether any entry is an exact name.
+    /// Returns whether any entry is an exact name.
     #[must_use]
     pub fn has_names(&self) -> bool {
         self.watches.len() > self.globs.len()
     }
 
-    /// Whether an entry is this exact name, for this domain or, with `None`, for any.
+    /// Returns whether an entry has this exact name, for this domain or, with `None`, for any.
     #[must_use]
     pub fn names(&self, domain_id: Option<DomainId>, topic: &str) -> bool {
         let mut places = self.patterns.get(topic).into_iter().flatten();
@@ -332,7 +332,7 @@ impl Watchlist {
         })
     }
 
-    /// Where the entry with this pattern for this domain stands.
+    /// Returns the index of the entry with this pattern and domain.
     #[must_use]
     pub fn position(&self, pattern: &str, domain_id: Option<DomainId>) -> Option<usize> {
         let mut places = self.patterns.get(pattern)?.iter().copied();

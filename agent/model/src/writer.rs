@@ -1,7 +1,7 @@
-//! What is measured of one writer: samples, bytes, losses, intervals, latencies.
+//! Measurement of one writer: samples, bytes, losses, intervals, latencies.
 //!
-//! Fed with records, wherever they come from. A sample counts once, at the record that completes
-//! it. An idle writer takes under 2 KiB; what grows with traffic (bitmaps) is bounded in
+//! Its input is records from any source. A sample counts once, at the record that completes it. An
+//! idle writer needs less than 2 KiB; bitmaps, which grow with traffic, are bounded in
 //! [`super::sequence`] and [`super::samples`].
 
 mod latency;
@@ -25,63 +25,63 @@ use super::sequence::{FAR, REACH};
 use super::size::Size;
 use super::wall_clock::WallClock;
 
-/// How long a gap of a best-effort writer may fill by reordering.
+/// Time in which reordering may fill a gap of a best-effort writer.
 pub const BEST_EFFORT_WINDOW: u64 = SECOND;
-/// How long a reliable writer may take to retransmit: three of Fast DDS's HEARTBEAT periods.
+/// Time in which a reliable writer may retransmit: three HEARTBEAT periods of Fast DDS.
 pub const RELIABLE_WINDOW: u64 = 10 * SECOND;
-/// A first sample older than this is history that a late joiner asked for.
+/// A first sample older than this is history that a late joiner requested.
 const HISTORY: u64 = 10 * SECOND;
 
-/// A writer that was seen in its own process is so for this long after its last record: what else
-/// is read in shared memory in that time has been seen.
+/// A uprobe's view of a writer stays exact for this long after its last record: samples read from
+/// shared memory in that time were seen already.
 const EXACT_FOR: u64 = 10 * SECOND;
 
-/// What discovery says about the writer; all false while it is unknown.
+/// Properties of the writer from discovery; all false if it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traits {
-    /// It retransmits. Also concluded from its HEARTBEATs.
+    /// Whether it retransmits; also concluded from its HEARTBEATs.
     pub reliable: bool,
-    /// It sends old samples to late joiners.
+    /// Whether it sends old samples to late joiners.
     pub keeps_history: bool,
-    /// Its messages begin with a `std_msgs/Header`.
+    /// Whether its messages begin with a `std_msgs/Header`.
     pub has_header: bool,
 }
 
-/// What one record changes besides the writer itself.
+/// State outside the writer that a record changes.
 #[derive(Debug)]
 pub struct MeasurementContext<'a> {
-    /// The time of the record, or of the look at the clock.
+    /// Time of the record, or of the tick.
     pub now: Timestamp,
-    /// Memory for fragmented samples.
+    /// Memory budget for fragmented samples.
     pub budget: &'a mut Budget,
-    /// Where losses are told.
+    /// Journal that receives the losses.
     pub journal: &'a mut Journal,
-    /// What the writer's clock is held against.
+    /// Difference between model time and calendar time, for the writer's timestamps.
     pub wall_clock: WallClock,
 }
 
-/// A message as it was counted.
+/// A counted message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counted {
     /// Its sequence number.
     pub number: u64,
-    /// Payload bytes, encapsulation included.
+    /// Payload bytes, including encapsulation.
     pub bytes: u64,
-    /// INFO_TS.
+    /// INFO_TS of the message.
     pub source: RtpsTime,
-    /// Its header's stamp, where the type begins with a header.
+    /// Stamp of its header, if the type begins with one.
     pub stamp: Option<(i32, u32)>,
     /// Time of the datagram that completed it.
     pub at: Timestamp,
-    /// Time of its first one.
+    /// Time of its first datagram.
     pub began: Timestamp,
-    /// It was seen where not every message is seen.
+    /// Whether it was sampled, so that others may have been missed.
     pub sampled: bool,
-    /// Its number is not believed to be the writer's: it has no place in an order.
+    /// Whether its number is not confirmed as the writer's; it then has no place in an order.
     pub unconfirmed: bool,
 }
 
-/// One measured writer.
+/// A measured writer.
 #[derive(Debug)]
 pub struct Writer {
     guid: Guid,
@@ -94,13 +94,13 @@ pub struct Writer {
     last_message: Option<Timestamp>,
     negative_latency: u64,
     implausible_latency: u64,
-    /// Of a writer that was seen in shared memory.
+    /// State of a writer that was sampled in shared memory.
     sampled: Option<Box<Sampled>>,
-    /// Of a writer that was seen in the process that it belongs to: its last record from there.
+    /// Time of the last record from a uprobe in the writer's own process.
     exact: Option<Timestamp>,
 }
 
-/// The counters that settling changes.
+/// Counters that settling changes.
 #[derive(Debug, Default)]
 struct Tally {
     messages: u64,
@@ -114,7 +114,7 @@ struct Tally {
 }
 
 impl Writer {
-    /// Nothing measured yet.
+    /// Creates a writer without measurements.
     #[must_use]
     pub fn new(guid: Guid, traits: Traits) -> Self {
         Self {
@@ -133,9 +133,9 @@ impl Writer {
         }
     }
 
-    /// Entries, or bytes, and cap of every list.
+    /// Returns the size and cap of each list, in entries or bytes.
     pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             guid: _,
             traits: _,
@@ -154,39 +154,39 @@ impl Writer {
         reception.sizes().chain(sampled)
     }
 
-    /// Discovery says more.
+    /// Updates the properties from discovery.
     pub const fn learn(&mut self, traits: Traits) {
         self.traits = traits;
     }
 
-    /// Moves what its unfinished samples take from one budget to another.
+    /// Moves the memory of unfinished samples from one budget to another.
     pub fn transfer(&self, from: &mut Budget, to: &mut Budget) {
         self.reception.transfer(from, to);
     }
 
-    /// Samples in fragments that begin before this may lack some that nobody lost.
+    /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
     pub const fn allow_incomplete(&mut self, until: Timestamp) {
         self.reception.allow_incomplete(until);
     }
 
-    /// What discovery and its HEARTBEATs said.
+    /// Returns the properties from discovery and HEARTBEATs.
     #[must_use]
     pub const fn traits(&self) -> Traits {
         self.traits
     }
 
-    /// One past the highest number known to exist.
+    /// Returns the highest sequence number known to exist, plus one.
     #[must_use]
     pub const fn next(&self) -> u64 {
         self.reception.sequence().next()
     }
 
-    /// A sample or fragment came again the way it had come before.
+    /// Counts a sample or fragment that arrived again on the same route.
     pub const fn came_again(&mut self) {
         self.tally.duplicates += 1;
     }
 
-    /// Whether this sample needs nothing more: it was counted, or is settled.
+    /// Returns whether this sample is counted or settled.
     #[must_use]
     pub fn has(&self, sample: Sample<'_>) -> bool {
         let record = sample.record();
@@ -207,38 +207,38 @@ impl Writer {
         }
     }
 
-    /// Whether this ACKNACK acknowledges samples that are not known to exist.
+    /// Returns whether this ACKNACK acknowledges samples that are not known to exist.
     pub const fn refuses(&mut self, acknack: AckNack<'_>) -> bool {
         let sequence = self.reception.sequence_mut();
         sequence.refuses(acknack.base())
     }
 
-    /// Messages counted.
+    /// Returns the number of messages counted.
     #[must_use]
     pub const fn messages(&self) -> u64 {
         self.tally.messages
     }
 
-    /// Time of the last one.
+    /// Returns the time of the last message.
     #[must_use]
     pub const fn last_message(&self) -> Option<Timestamp> {
         self.last_message
     }
 
-    /// The tap on shared memory cannot tell what passed before `now`.
+    /// Records that samples in shared memory before `now` may have been missed.
     pub fn uncertain(&mut self, now: Timestamp) {
         if let Some(sampled) = self.sampled.as_mut().filter(|each| each.is_current(now)) {
             sampled.uncertain();
         }
     }
 
-    /// It is no longer seen in the process that it belongs to.
+    /// Ends the exact view of the writer by uprobes.
     pub const fn end_exact_view(&mut self) {
         self.exact = None;
     }
 
-    /// Takes in a record of this writer; gives the message that it completed. `opened` is when last
-    /// a way for its samples was opened that this host sees: what is missing before it went
+    /// Processes a record of this writer and returns the message that it completed. `opened` is the
+    /// time at which this host last gained a view of its samples: those missing before it went
     /// elsewhere.
     pub fn record(
         &mut self,
@@ -259,7 +259,7 @@ impl Writer {
             return self.catch_up(sample, context);
         }
         if is_sampled && self.is_exact(at) {
-            // It has been seen already, or is on its way.
+            // The sample has been seen already, or will be.
             return None;
         }
         let takes = self.sampled.as_mut().is_some_and(|sampled| match body {
@@ -302,22 +302,22 @@ impl Writer {
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
         if next > 0 && advanced < opened && sequence.next() > next {
-            // The newest one is excused too, which means nothing once it is received.
+            // The newest sample is excused too, which has no effect once it is received.
             sequence.excuse(next, sequence.next());
         }
         counted
     }
 
-    /// Its readers have all below `base`.
+    /// Records that all readers have every sample below `base`.
     pub fn acknowledged(&mut self, base: u64) {
         self.reception.sequence_mut().acknowledged(base);
     }
 
-    /// How far its samples are decided; `acknowledged` = by readers that acknowledge.
+    /// Returns how far its samples are decided. `acknowledged` states whether readers acknowledge.
     pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
         let waits = self.traits.reliable && acknowledged;
         let reliable = self.traits.reliable && !self.is_sampled(now);
-        // A repair may pass by shared memory, too, as long as a sample is looked for there.
+        // While a sample is waited for in shared memory, its retransmission may pass there, too.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
         let unseen = unseen.filter(|_| waits).unwrap_or(u64::MAX);
         let sequence = self.reception.sequence_mut();
@@ -333,18 +333,18 @@ impl Writer {
         }
     }
 
-    /// Nothing below `number` is waited for any more.
+    /// Stops waiting for samples below `number`.
     pub fn skip(&mut self, number: u64) {
         self.reception.sequence_mut().skip(number);
     }
 
-    /// Since when a sample is waited for that was sent and not seen.
+    /// Returns the time since which a sent but unseen sample is waited for.
     #[must_use]
     pub fn unseen_since(&self) -> Option<Timestamp> {
         self.sampled.as_ref()?.unseen_since()
     }
 
-    /// Settles what has waited long enough.
+    /// Settles samples whose waiting time is over.
     pub fn advance(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.tick(context.now);
@@ -358,7 +358,7 @@ impl Writer {
         });
     }
 
-    /// Settles everything: nothing more will come.
+    /// Settles all samples at the end of the input.
     pub fn settle(&mut self, context: &mut MeasurementContext<'_>) {
         if let Some(sampled) = &mut self.sampled {
             sampled.settle_all();
@@ -368,7 +368,7 @@ impl Writer {
         reception.settle(context.budget, &mut |decision| settling.take(decision));
     }
 
-    /// Everything counted so far.
+    /// Returns all counts so far.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -404,13 +404,13 @@ impl Writer {
         }
     }
 
-    /// Counts of the last whole seconds, and how many those are.
+    /// Returns the counts of the last whole seconds, and the number of these seconds.
     #[must_use]
     pub fn recent(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
         self.tally.window.sum(now, seconds)
     }
 
-    /// The reception, and what its decisions change.
+    /// Splits the borrow into the reception and the accounting of its decisions.
     const fn parts<'a>(
         &'a mut self,
         journal: &'a mut Journal,
@@ -439,7 +439,7 @@ impl Writer {
         });
         match outcome {
             Outcome::Open => {}
-            // Seen at several sockets is not sent again: there the caller knows.
+            // A copy at another socket is no retransmission; the caller can distinguish them.
             Outcome::Duplicate => {
                 self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
             }
@@ -471,7 +471,7 @@ impl Writer {
         None
     }
 
-    /// Whether the number of this DATA or DATA_FRAG is away from those that the writer uses.
+    /// Returns whether the number of this DATA or DATA_FRAG is outside the writer's live run.
     fn is_unconfirmed(&self, sample: Sample<'_>) -> bool {
         let source = sample.source_timestamp().timestamp();
         let sequence = self.reception.sequence();
@@ -498,7 +498,7 @@ impl Writer {
     }
 }
 
-/// How long the gap of a writer may fill that retransmits, or does not.
+/// Returns the time in which a gap may fill, for a writer that is `reliable` or not.
 #[must_use]
 pub const fn settle_window(reliable: bool) -> u64 {
     if reliable {
@@ -508,7 +508,7 @@ pub const fn settle_window(reliable: bool) -> u64 {
     }
 }
 
-/// What settling does to the counters.
+/// Effects of settling on the counters.
 struct Settling<'a> {
     tally: &'a mut Tally,
     journal: &'a mut Journal,
@@ -549,13 +549,12 @@ impl Settling<'_> {
     }
 }
 
-/// How far ahead of those that came the numbers of a record may be: looks at shared memory miss
-/// more.
+/// Returns how far the numbers of a record may be ahead; polling shared memory misses more.
 const fn reach(record: &Record) -> u64 {
     if is_polled(record) { FAR } else { REACH }
 }
 
-/// Whether it was read in shared memory, where others may have been missed.
+/// Returns whether it was read by polling shared memory, where others may have been missed.
 const fn is_polled(record: &Record) -> bool {
     record.flags & (flag::SHM | flag::EXACT) == flag::SHM
 }

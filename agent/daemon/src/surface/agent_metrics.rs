@@ -1,5 +1,5 @@
-//! The agent's part of the page: what it drops, cannot read or cannot hold (`ros2probe_*`), and its
-//! own process (`process_*`).
+//! Metrics of the agent: drops, decode errors, limits (`ros2probe_*`), and its own process
+//! (`process_*`).
 
 use std::fmt;
 use std::sync::atomic::Ordering;
@@ -18,7 +18,7 @@ use crate::settings_cell::Reload;
 use crate::snapshot_cell::State;
 use ros2probe_model::dispatch::MissedReason;
 
-/// What runs, where its packets come from, and whether it sees.
+/// Writes version, source and readiness of the agent.
 pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -> fmt::Result {
     sink.family(&metric::BUILD_INFO, |family| {
         let version = Label::Text(env!("CARGO_PKG_VERSION"));
@@ -42,7 +42,7 @@ pub(super) fn identity(sink: &mut MetricSink<'_>, state: &State, now: Instant) -
     sink.single(&metric::READY, state.ready(now).is_ok())
 }
 
-/// The capture and the kernel filter.
+/// Writes the metrics of the capture and the kernel filter.
 pub(super) fn capture(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     let agent = &state.agent;
     sink.family(&metric::CAPTURE_PACKETS, |family| {
@@ -93,7 +93,7 @@ pub(super) fn capture(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     })
 }
 
-/// The look at shared memory; nothing where there is none.
+/// Writes the metrics of shared-memory sampling, if it is enabled.
 fn shared_memory(sink: &mut MetricSink<'_>, facts: Option<&SharedMemoryFacts>) -> fmt::Result {
     sink.family(&metric::SHM_OPEN, |family| {
         let mut open = facts.into_iter().flat_map(|facts| &facts.open);
@@ -113,7 +113,7 @@ fn shared_memory(sink: &mut MetricSink<'_>, facts: Option<&SharedMemoryFacts>) -
     })
 }
 
-/// The model's tables and what it could not read.
+/// Writes the sizes of the model's tables and its parse failures.
 pub(super) fn model(
     sink: &mut MetricSink<'_>,
     state: &State,
@@ -166,7 +166,7 @@ pub(super) fn model(
     sink.single(&metric::DELIVERIES_HIDDEN, hidden_deliveries)
 }
 
-/// The caps of the configuration.
+/// Writes the limits of the configuration and their use.
 fn limits(sink: &mut MetricSink<'_>, figures: &LimitFigures, state: &State) -> fmt::Result {
     type Read = fn(&LimitFacts) -> u64;
     let families: [(_, Read); 4] = [
@@ -186,7 +186,7 @@ fn limits(sink: &mut MetricSink<'_>, figures: &LimitFigures, state: &State) -> f
     Ok(())
 }
 
-/// What is kept for the next start, and what came from the last one.
+/// Writes the metrics of saved and restored state.
 pub(super) fn kept(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     let kept = state.agent.state;
     sink.family(&metric::STATE_WRITES, |family| {
@@ -205,7 +205,7 @@ pub(super) fn kept(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     sink.single(&metric::RESTORED, restored.count())
 }
 
-/// The surface itself.
+/// Writes the metrics of the surface itself.
 pub(super) fn surface(
     sink: &mut MetricSink<'_>,
     state: &State,
@@ -224,7 +224,7 @@ pub(super) fn surface(
     )
 }
 
-/// Who gets messages one by one.
+/// Writes the metrics of subscriptions.
 pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Result {
     let facts = &state.agent.subscriptions;
     sink.single(&metric::SUBSCRIPTIONS, facts.open)?;
@@ -238,7 +238,7 @@ pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Re
     sink.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
 }
 
-/// Events, told and not told.
+/// Writes the number of events, and of events and log lines that were dropped.
 pub(super) fn events(sink: &mut MetricSink<'_>, log: &EventLog, lost_lines: u64) -> fmt::Result {
     for (metric, counts) in [
         (&metric::EVENTS, log.recorded()),
@@ -252,7 +252,7 @@ pub(super) fn events(sink: &mut MetricSink<'_>, log: &EventLog, lost_lines: u64)
     sink.single(&metric::LOG_LINES_LOST, lost_lines)
 }
 
-/// Bags that the agent writes, and what snapshots keep.
+/// Writes the metrics of recordings and snapshots.
 pub(super) fn recordings(sink: &mut MetricSink<'_>, figures: &RecordingFigures) -> fmt::Result {
     let counts = [
         (&metric::RECORDINGS, &figures.active),
@@ -282,7 +282,7 @@ pub(super) fn recordings(sink: &mut MetricSink<'_>, figures: &RecordingFigures) 
     Ok(())
 }
 
-/// What became of what was to be exported; nothing where nothing is.
+/// Writes the results of exports, if any signal is exported.
 pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Result {
     sink.family(&metric::OTLP_EXPORTS, |family| {
         for signal in exports.signals() {
@@ -304,7 +304,7 @@ pub(super) fn exports(sink: &mut MetricSink<'_>, exports: &Exports) -> fmt::Resu
     })
 }
 
-/// The process; what cannot be read is left out.
+/// Writes the metrics of the process, without values that are unknown.
 pub(super) fn process(sink: &mut MetricSink<'_>) -> fmt::Result {
     let Process {
         cpu_seconds,

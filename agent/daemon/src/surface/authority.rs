@@ -1,17 +1,17 @@
 //! The names under which a loopback listener answers (RFC 9112, 3.2: the Host header).
 //!
-//! A web page can make a browser of this host send requests to loopback under a name of its own
-//! (DNS rebinding). It cannot make its own name `localhost` or a loopback address.
+//! A web page can make a browser on this host send requests to loopback under a name of its own
+//! (DNS rebinding). It cannot make `localhost` or a loopback address its own name.
 
 use std::net::{IpAddr, Ipv6Addr};
 
 use axum::http::HeaderMap;
 use axum::http::header::HOST;
 
-/// Whether the request has exactly one Host header, which names this host.
+/// Checks that the request has exactly one Host header, which names this host.
 ///
 /// # Errors
-/// Returns what the header holds: empty where there is none, or several.
+/// Returns the header's value; empty if it is missing or repeated.
 pub(super) fn own(headers: &HeaderMap) -> Result<(), &str> {
     let mut hosts = headers.get_all(HOST).iter();
     let (Some(host), None) = (hosts.next(), hosts.next()) else {
@@ -21,7 +21,7 @@ pub(super) fn own(headers: &HeaderMap) -> Result<(), &str> {
     if is_own(host) { Ok(()) } else { Err(host) }
 }
 
-/// `localhost` or a loopback address, alone or with a port, and nothing else.
+/// Returns whether the text is `localhost` or a loopback address, with or without a port.
 fn is_own(host: &str) -> bool {
     if let Some(rest) = host.strip_prefix('[') {
         let Some((address, port)) = rest.split_once(']') else {
@@ -37,7 +37,7 @@ fn is_own(host: &str) -> bool {
     is_here && is_port(port)
 }
 
-/// Nothing, or a colon and a port.
+/// Returns whether the text is empty, or a colon and a port.
 fn is_port(text: &str) -> bool {
     let digits = |port: &str| port.bytes().all(|byte| byte.is_ascii_digit());
     let port = |port: &str| digits(port) && port.parse::<u16>().is_ok();

@@ -1,7 +1,7 @@
 //! Basic authentication against bcrypt hashes.
 //!
-//! A hash takes a core for a tenth of a second on purpose: one is computed at a time, off the
-//! runtime, and a password that was right is remembered, since a scraper sends it every few
+//! A hash takes a core for a tenth of a second by design. One hash is computed at a time, on a
+//! blocking thread. Correct passwords are remembered, since a scraper sends its password every few
 //! seconds.
 
 use std::collections::BTreeMap;
@@ -17,15 +17,15 @@ use base64::engine::general_purpose::STANDARD;
 use subtle::ConstantTimeEq as _;
 use tokio::sync::Semaphore;
 
-/// Hash of no password: an unknown name takes as long as a known one.
+/// A hash without a known password, so that an unknown name takes as long as a known one.
 const NOBODY: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
 
-/// Who may come in.
+/// Checks the credentials of requests.
 #[derive(Debug)]
 pub(super) struct Gate {
-    /// Names and hashes.
+    /// Hashes by name.
     users: BTreeMap<String, String>,
-    /// Names and the passwords that were right.
+    /// Correct passwords by name.
     known: Mutex<BTreeMap<String, Vec<u8>>>,
     turn: Semaphore,
 }
@@ -68,7 +68,7 @@ impl Gate {
     }
 }
 
-/// Answers who may not come in.
+/// Answers requests without valid credentials.
 pub(super) async fn guard(State(gate): State<Arc<Gate>>, request: Request, next: Next) -> Response {
     if gate.lets_in(request.headers()).await {
         return next.run(request).await;
@@ -104,7 +104,7 @@ mod tests {
 
     #[tokio::test]
     async fn the_right_password_opens_and_is_remembered_and_no_other_does() {
-        // Of "open sesame" at the lowest cost.
+        // This is the hash of "open sesame" at the lowest cost.
         let hash = bcrypt::hash("open sesame", 4).unwrap();
         let users = [("alice".to_owned(), hash)];
         let gate = Gate::new(users.into_iter().collect());

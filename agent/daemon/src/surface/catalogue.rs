@@ -1,8 +1,9 @@
-//! Every metric the agent exports, once: name, type, unit, labels, help, stability. The renderer, the
-//! tables of `docs/metrics-*.md` and the tests work from it; nothing else spells a metric name.
+//! Every metric of the agent, declared once: name, type, unit, labels, help, stability. The
+//! renderer, the tables of `docs/metrics-*.md` and the tests derive from it; no other code spells a
+//! metric name.
 //!
-//! Names follow the Prometheus naming practices; labels of topic series are `domain_id` and `topic`
-//! alone, details are in one info series.
+//! Names follow the Prometheus naming practices. Series of topics have only the labels `domain_id`
+//! and `topic`; details are in one info series.
 
 mod agent;
 mod delivery;
@@ -13,10 +14,10 @@ pub(super) use agent::*;
 pub(super) use delivery::*;
 pub(super) use diagnosis::*;
 
-/// One metric family.
+/// A metric family.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Metric {
-    /// As it is queried, with `_total` or `_info`; histograms without `_bucket`.
+    /// Name in queries, with `_total` or `_info`; histograms without `_bucket`.
     pub name: &'static str,
     /// Type.
     pub kind: Kind,
@@ -24,7 +25,7 @@ pub struct Metric {
     pub unit: Option<&'static str>,
     /// Label names, in order.
     pub labels: &'static [&'static str],
-    /// One sentence.
+    /// Help text, one sentence.
     pub help: &'static str,
     /// Whether name and meaning may still change.
     pub stability: Stability,
@@ -33,13 +34,13 @@ pub struct Metric {
 /// Metric types.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Only grows while its series exists.
+    /// Only increases while its series exists.
     Counter,
-    /// Goes up and down.
+    /// Increases and decreases.
     Gauge,
     /// Buckets, sum and count.
     Histogram,
-    /// Always 1; its labels are the message.
+    /// Always 1; the labels contain the information.
     Info,
 }
 
@@ -103,7 +104,7 @@ impl Metric {
         }
     }
 
-    /// The name of the family in OpenMetrics: without the suffix of its samples.
+    /// Returns the name of the family in OpenMetrics, without the suffix of its samples.
     #[must_use]
     pub fn family(&self) -> &'static str {
         match self.kind {
@@ -116,7 +117,7 @@ impl Metric {
 }
 
 impl Kind {
-    /// In words.
+    /// Returns the type as text.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -133,7 +134,7 @@ const TOPIC: &[&str] = &["domain_id", "topic"];
 const WRITER: &[&str] = &["domain_id", "topic", "writer", "ros_node"];
 const UNKNOWN: &[&str] = &["writer", "vendor"];
 
-// The graph.
+// Graph.
 pub(super) const PARTICIPANTS: Metric = Metric::gauge(
     "ros2_participants",
     DOMAIN,
@@ -358,7 +359,7 @@ pub(super) const WRITER_LOST: Metric = Metric::counter(
 )
 .experimental();
 
-// The watchlist.
+// Watchlist.
 pub(super) const WATCH_STATE: Metric = Metric::gauge(
     "ros2_watch_state",
     &["domain_id", "topic", "watch", "state"],
@@ -371,7 +372,7 @@ pub(super) const WATCH_VIOLATED: Metric = Metric::gauge(
     "1 while a configured expectation is violated, after hysteresis.",
 );
 
-/// All of them, in the order of the page.
+/// All metrics, in the order of the page.
 pub const CATALOGUE: &[Metric] = &[
     PARTICIPANTS,
     SECURED_PARTICIPANTS,
@@ -520,7 +521,7 @@ pub const CATALOGUE: &[Metric] = &[
     PROCESS_START_TIME,
 ];
 
-/// The catalogue as a Markdown table, for `docs/metrics-*.md`.
+/// Returns the catalogue as a Markdown table, for `docs/metrics-*.md`.
 #[must_use]
 pub fn markdown() -> String {
     let mut table = "| metric | type | labels | meaning |\n| --- | --- | --- | --- |\n".to_owned();

@@ -1,5 +1,5 @@
-//! The one collection of all metrics, family by family in the catalogue's order. Scrapes
-//! and exports both use it, so they show the same.
+//! The collection of all metrics, family by family in the catalogue's order. Scrapes and exports
+//! both use it, so they show the same values.
 
 use std::fmt;
 use std::sync::Arc;
@@ -20,28 +20,28 @@ use crate::settings_cell::{Settings, SettingsCell};
 use crate::snapshot_cell::SnapshotCell;
 use ros2probe_model::snapshot::Snapshot;
 
-/// What a collection reads. Each part belongs to its writer; only the composition of the agent and the
-/// collections hold them together.
+/// Input of a collection. Each part has its own writer; only the agent's setup and the collections
+/// hold all parts.
 #[derive(Clone, Debug)]
 pub struct MetricSources {
-    /// The robot and the agent.
+    /// State of the robot and the agent.
     pub latest: Arc<SnapshotCell>,
-    /// What is to be shown, and how the last reload went.
+    /// Display settings and the result of the last reload.
     pub settings: Arc<SettingsCell>,
-    /// What happened lately.
+    /// The event log.
     pub events: Arc<EventLog>,
-    /// The caps, and what reached them.
+    /// The limits and their use.
     pub limits: Arc<LimitFigures>,
-    /// What recordings have done.
+    /// Counters of recordings.
     pub recordings: Arc<RecordingFigures>,
-    /// What became of what was to be exported.
+    /// Counters of exports.
     pub exports: Arc<Exports>,
-    /// Lines of the log that standard error did not take.
+    /// Lines of the log that standard error did not accept.
     pub lost_lines: Arc<AtomicU64>,
 }
 
 impl MetricSources {
-    /// Of an agent that was configured just now; its start is the first event.
+    /// Creates the sources of an agent that was just configured; its start is the first event.
     #[must_use]
     pub fn new(source: SourceKind, settings: Settings) -> Self {
         let events = EventLog::new();
@@ -58,7 +58,7 @@ impl MetricSources {
     }
 }
 
-/// Writes everything to `sink`; `previous` is how long that took the last time.
+/// Writes all metrics to `sink`; `previous` is the duration of the last collection.
 pub(super) fn collect(
     sink: &mut MetricSink<'_>,
     sources: &MetricSources,

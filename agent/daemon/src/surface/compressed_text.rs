@@ -1,5 +1,6 @@
-//! Text that is kept compressed until it is sent: a page of metrics repeats the same names thousands of
-//! times, 2 MB for 200 topics. Compressed piece by piece as it is written, and read piece by piece once.
+//! Text that is kept compressed until it is sent. A page of metrics repeats the same names
+//! thousands of times: 2 MB for 200 topics. The text is compressed piece by piece as it is written,
+//! and each piece is read once.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -13,32 +14,32 @@ use lz4_flex::block::{compress_prepend_size, decompress_size_prepended};
 
 use super::large_responses::Reservation;
 
-/// Bytes in a piece as it is sent, or a little more.
+/// Approximate size of a piece in bytes, as it is sent.
 const PIECE: usize = 64 << 10;
 
-/// How the client gets the text.
+/// Encoding of the text for the client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
-    /// As it is.
+    /// Uncompressed.
     Identity,
     /// Compressed with gzip (RFC 1952).
     Gzip,
 }
 
-/// Takes text and keeps it compressed.
+/// Accepts text and keeps it compressed.
 pub(super) struct TextCompressor {
     pieces: VecDeque<Box<[u8]>>,
     length: usize,
     form: Form,
 }
 
-/// What is not a piece yet.
+/// Text that is not a complete piece yet.
 enum Form {
     Plain(Vec<u8>),
     Gzip(GzEncoder<Vec<u8>>),
 }
 
-/// The text, whole.
+/// The complete text.
 #[derive(Debug)]
 pub(super) struct CompressedText {
     encoding: Encoding,
@@ -47,7 +48,7 @@ pub(super) struct CompressedText {
 }
 
 impl TextCompressor {
-    /// Nothing yet.
+    /// Creates an empty text.
     pub(super) fn new(encoding: Encoding) -> Self {
         Self {
             pieces: VecDeque::new(),
@@ -59,10 +60,10 @@ impl TextCompressor {
         }
     }
 
-    /// Adds to the text.
+    /// Appends to the text.
     ///
     /// # Errors
-    /// Never: it is written to memory.
+    /// Never fails, because it writes to memory.
     pub(super) fn write(&mut self, text: &[u8]) -> io::Result<()> {
         for part in text.chunks(PIECE) {
             match &mut self.form {
@@ -74,10 +75,10 @@ impl TextCompressor {
         Ok(())
     }
 
-    /// The whole text.
+    /// Returns the complete text.
     ///
     /// # Errors
-    /// Never: it is in memory.
+    /// Never fails, because it writes to memory.
     pub(super) fn finish(mut self) -> io::Result<CompressedText> {
         let encoding = match &mut self.form {
             Form::Plain(_) => Encoding::Identity,
@@ -94,7 +95,7 @@ impl TextCompressor {
         })
     }
 
-    /// Makes a piece of what is not one yet, if that has so many bytes.
+    /// Completes a piece if at least this many bytes are pending.
     fn pack(&mut self, least: usize) {
         let rest = match &mut self.form {
             Form::Plain(rest) => rest,
@@ -123,17 +124,18 @@ impl fmt::Write for TextCompressor {
 }
 
 impl CompressedText {
-    /// Bytes that the client gets.
+    /// Returns the number of bytes that the client receives.
     pub(super) const fn len(&self) -> usize {
         self.length
     }
 
-    /// Bytes that are kept.
+    /// Returns the number of bytes in memory.
     pub(super) fn kept(&self) -> usize {
         self.pieces.iter().map(|piece| piece.len()).sum()
     }
 
-    /// The answer, which ends with an error when its `reservation` is given up.
+    /// Returns the text as a response body, which ends with an error if its `reservation` is
+    /// revoked.
     pub(super) fn into_body(self, reservation: Option<Reservation>) -> Body {
         let encoding = self.encoding;
         let pieces = self.pieces.into_iter().map(move |piece| {

@@ -1,6 +1,6 @@
-//! How long a connection may take, and how much it may make the agent hold. A client keeps its
-//! place by what it does: a whole request within a time, an answer read at a least rate. One that
-//! waits between requests makes room for the next client.
+//! Limits of time and memory per connection. A client keeps its slot while it makes progress: a
+//! complete request within a time, an answer read at a minimum rate. An idle connection makes room
+//! for the next client.
 
 use std::io;
 use std::pin::Pin;
@@ -16,17 +16,17 @@ use tokio_util::sync::CancellationToken;
 
 use crate::limit_facts::Slot;
 
-/// A connection without a request is closed after so long; a stream on which nothing can be written
-/// for so long, too.
+/// A connection is closed after this long without a request, and a stream after this long without a
+/// successful write.
 const IDLE: Duration = Duration::from_secs(75);
-/// From the first byte of a request to its last one.
+/// Longest time from the first to the last byte of a request.
 const REQUEST: Duration = Duration::from_secs(10);
-/// A client that does not read must take [`LEAST`] bytes of a whole answer within this time.
+/// A client must read [`LEAST`] bytes of a complete answer within this time.
 const PROGRESS: Duration = Duration::from_secs(10);
 const LEAST: usize = 64 << 10;
-/// Bytes of unfinished requests that a listener holds beside [`FREE`] for each connection.
+/// Bytes of unfinished requests that a listener holds, in addition to [`FREE`] per connection.
 const UNFINISHED: usize = 256 << 10;
-/// Bytes of an unfinished request that every connection may hold.
+/// Bytes of an unfinished request that every connection may use.
 const FREE: usize = 4 << 10;
 
 /// The connections of one listener.
@@ -37,7 +37,7 @@ pub(super) struct Connections {
     left: Notify,
 }
 
-/// How far one connection is; shared by its stream and by what answers its requests.
+/// Progress of one connection; shared by its stream and its request handler.
 #[derive(Debug)]
 pub(super) struct ConnectionState {
     progress: Mutex<Progress>,
@@ -51,27 +51,27 @@ struct Progress {
     since: Instant,
     /// Bytes of the request that were read.
     read: usize,
-    /// Counted in [`Connections::unfinished`].
+    /// Bytes that are counted in [`Connections::unfinished`].
     counted: usize,
-    /// Since when the client takes nothing, and what it took since then.
+    /// Time since which the client reads too slowly, and the bytes read since then.
     stalled: Option<(Instant, usize)>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
-    /// No request, or a part of its head.
+    /// No request, or a part of its head, has arrived.
     Waiting,
-    /// A part of its body.
+    /// A part of the body has arrived.
     Receiving,
-    /// It is being handled.
+    /// The request is being handled.
     Working,
-    /// A whole answer is being sent.
+    /// A complete answer is being sent.
     Answering,
-    /// An answer without an end is being sent.
+    /// A stream is being sent.
     Streaming,
 }
 
-/// A stream that fails when it takes too long or is asked to hold too much.
+/// A stream that fails if it exceeds its limits of time or memory.
 #[derive(Debug)]
 pub(super) struct Connection<S> {
     stream: S,
@@ -82,7 +82,7 @@ pub(super) struct Connection<S> {
 }
 
 impl Connections {
-    /// Takes a connection in, which leaves with its value.
+    /// Registers a connection until it is dropped.
     pub(super) fn join<S>(self: &Arc<Self>, stream: S, slot: Slot) -> Connection<S> {
         let state = Arc::new(ConnectionState::new());
         self.lock().push(Arc::clone(&state));
@@ -95,13 +95,14 @@ impl Connections {
         }
     }
 
-    /// Closes the connection that has been without a whole request for longest, if there is one.
+    /// Closes the connection with the longest time without a complete request. Returns false if
+    /// there is no such connection.
     pub(super) fn make_room(&self) -> bool {
         let connections = self.lock();
         let waiting = connections.iter().filter_map(|state| {
             let progress = state.lock();
             let is_waiting = matches!(progress.phase, Phase::Waiting | Phase::Receiving)
-                // The end of an answer is still on its way.
+                // The end of an answer is still being sent.
                 && progress.stalled.is_none();
             (is_waiting && !state.end.is_cancelled()).then_some((progress.since, state))
         });
@@ -109,12 +110,12 @@ impl Connections {
         longest.map(|(_, state)| state.end.cancel()).is_some()
     }
 
-    /// Returns when a connection has gone.
+    /// Returns when a connection has been closed.
     pub(super) async fn left(&self) {
         self.left.notified().await;
     }
 
-    /// Counts bytes of an unfinished request.
+    /// Counts bytes of an unfinished request; returns false if they exceed the limit.
     fn hold(&self, bytes: usize) -> bool {
         let more = |held: usize| Some(held + bytes).filter(|held| *held <= UNFINISHED);
         let unfinished = &self.unfinished;
@@ -147,18 +148,18 @@ impl ConnectionState {
         }
     }
 
-    /// The head of a request is here, and its body unless `is_whole`.
+    /// Records that the head of a request has arrived, and its body if `is_whole`.
     pub(super) fn requested(&self, is_whole: bool) {
         let mut progress = self.lock();
         if is_whole {
             progress.enter(Phase::Working);
         } else {
-            // Head and body have one time together.
+            // Head and body share one time limit.
             progress.phase = Phase::Receiving;
         }
     }
 
-    /// The body of the request is here.
+    /// Records that the body of the request has arrived.
     pub(super) fn received(&self) {
         let mut progress = self.lock();
         if progress.phase == Phase::Receiving {
@@ -166,7 +167,7 @@ impl ConnectionState {
         }
     }
 
-    /// The answer begins, which has an end if it `is_whole`.
+    /// Records that the answer begins; it has an end if `is_whole`.
     pub(super) fn answers(&self, is_whole: bool) {
         let phase = if is_whole {
             Phase::Answering
@@ -176,18 +177,18 @@ impl ConnectionState {
         self.lock().enter(phase);
     }
 
-    /// The answer has been handed over.
+    /// Records that the answer has been handed over.
     pub(super) fn answered(&self) {
         self.lock().enter(Phase::Waiting);
     }
 
-    /// Whether nothing is being asked or answered.
+    /// Returns whether no request is in progress.
     pub(super) fn is_idle(&self) -> bool {
         let progress = self.lock();
         progress.phase == Phase::Waiting && progress.stalled.is_none()
     }
 
-    /// Returns when the connection is to be closed.
+    /// Returns when the connection must be closed.
     pub(super) async fn ended(&self) {
         self.end.cancelled().await;
     }
@@ -206,7 +207,7 @@ impl Progress {
         }
     }
 
-    /// Until when there must be progress.
+    /// Returns the time by which progress is required.
     fn deadline(&self) -> Instant {
         if let Some((since, _)) = self.stalled
             && self.phase != Phase::Streaming
@@ -230,7 +231,7 @@ impl<S> Connection<S> {
         &self.stream
     }
 
-    /// Pending, unless the time is over.
+    /// Returns an error after the deadline, otherwise `Pending`.
     fn overdue<T>(&mut self, context: &mut Context<'_>) -> Poll<io::Result<T>> {
         let deadline = self.state.lock().deadline();
         if self.deadline.deadline() != deadline {
@@ -242,14 +243,14 @@ impl<S> Connection<S> {
             .map(|()| Err(io::ErrorKind::TimedOut.into()))
     }
 
-    /// Counts what was read of a request.
+    /// Counts bytes read of a request.
     fn has_read(&self, bytes: usize) -> io::Result<()> {
         let mut progress = self.state.lock();
         if !matches!(progress.phase, Phase::Waiting | Phase::Receiving) {
             return Ok(());
         }
         if progress.read == 0 {
-            // The first bytes of a request after a pause.
+            // These are the first bytes of a request after a pause.
             progress.since = Instant::now();
         }
         progress.read += bytes;
@@ -262,12 +263,12 @@ impl<S> Connection<S> {
         Ok(())
     }
 
-    /// Counts what was written, or that nothing could be; fails where that was too little for too
-    /// long.
+    /// Counts written bytes, or a failed attempt (0). Fails if the client has read too slowly for
+    /// too long.
     fn has_written(&self, bytes: usize) -> io::Result<()> {
         let now = Instant::now();
         let mut progress = self.state.lock();
-        // The request is behind it.
+        // The request has been processed.
         self.connections
             .release(std::mem::take(&mut progress.counted));
         if matches!(progress.phase, Phase::Answering | Phase::Streaming) {
@@ -339,7 +340,7 @@ impl<S: AsyncWrite + Unpin> AsyncWrite for Connection<S> {
     }
 
     fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
-        // All that there was has been taken.
+        // The client has read everything so far.
         self.state.lock().stalled = None;
         Pin::new(&mut self.stream).poll_flush(context)
     }
@@ -357,7 +358,7 @@ mod tests {
     use crate::config::{Limit, Limits};
     use crate::limit_facts::LimitFigures;
 
-    /// A crowd, and a way to add a connection to it.
+    /// Creates connections, and a function that adds one.
     fn connections() -> (
         Arc<Connections>,
         impl Fn() -> (Connection<DuplexStream>, DuplexStream),
@@ -372,7 +373,7 @@ mod tests {
         (connections, join)
     }
 
-    /// Reads until the connection fails or ends; for how long, and why.
+    /// Reads until the connection fails or ends. Returns the duration and the reason.
     async fn read(connection: &mut Connection<DuplexStream>) -> (Duration, io::ErrorKind) {
         let start = Instant::now();
         let mut bytes = vec![0; 1 << 16];
@@ -417,7 +418,7 @@ mod tests {
             connection.state().answers(is_whole);
             let start = Instant::now();
             let sent = connection.write_all(&[7; 1 << 20]);
-            // 5 KB a second of a whole answer; nothing of a stream.
+            // The client reads 5 KB per second of a complete answer, and nothing of a stream.
             let reading = async {
                 let mut bytes = [0; 512];
                 loop {

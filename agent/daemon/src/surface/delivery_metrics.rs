@@ -1,5 +1,5 @@
-//! What became of messages on the way to each receiver: sums per topic, and series per delivery for
-//! the topics whose watch asks for them. Bounded: what has no series of its own is counted.
+//! Metrics of deliveries to receivers: sums per topic, and series per delivery for topics whose
+//! watch requests them. The number of series is bounded, and omitted deliveries are counted.
 
 use std::cmp::Reverse;
 use std::fmt;
@@ -16,30 +16,30 @@ use ros2probe_model::snapshot::{
     AcknowledgementFacts, Breakdown, Delivered, DeliveryFacts, Direction, SocketFacts, TopicFacts,
 };
 
-/// Deliveries, and acknowledging readers, with series of their own.
+/// Largest number of deliveries, and of acknowledging readers, with their own series.
 const MAX_SHOWN: usize = 1_000;
-/// Sockets with series of their own.
+/// Largest number of sockets with their own series.
 const MAX_SOCKETS: usize = 64;
-/// Nodes named in one label.
+/// Largest number of nodes in one label.
 const MAX_NODES: usize = 4;
 
-/// How a counter is read.
+/// Reads a counter.
 type Count = fn(&Delivered) -> u64;
-/// How a reader's value is read.
+/// Reads a value of a reader.
 type Acknowledged = fn(&AcknowledgementFacts) -> Number;
-/// How a histogram is read.
+/// Reads a histogram.
 type Values = fn(&Breakdown) -> &Histogram;
 
-/// The deliveries and acknowledging readers that have series of their own.
+/// Deliveries and acknowledging readers with their own series.
 pub(super) struct Deliveries<'a> {
     sent: Vec<Delivery<'a>>,
     received: Vec<Delivery<'a>>,
     readers: Vec<(&'a TopicRow<'a>, &'a AcknowledgementFacts)>,
-    /// How many have none.
+    /// Number of deliveries and readers without series.
     pub(super) hidden: usize,
 }
 
-/// One series: what no label tells apart is added up.
+/// A series; deliveries with equal labels are added.
 struct Delivery<'a> {
     row: &'a TopicRow<'a>,
     facts: &'a DeliveryFacts,
@@ -70,7 +70,7 @@ impl<'a> Deliveries<'a> {
         all
     }
 
-    /// The snapshot's lists are sorted by what the labels show, so twins follow one another.
+    /// Adds a delivery. The snapshot's lists are sorted by the labels, so equal ones are adjacent.
     fn add(&mut self, row: &'a TopicRow<'a>, facts: &'a DeliveryFacts) {
         let shown = self.sent.len() + self.received.len();
         let list = match facts.direction {
@@ -162,10 +162,10 @@ impl<'a> Deliveries<'a> {
         })
     }
 
-    /// Each receiver once, whatever the number of its writers.
+    /// Writes each receiver once, whatever the number of its writers.
     fn subscribers(&self, family: &mut Family<'_, '_>) -> fmt::Result {
         let mut subscribers: Vec<&Delivery<'_>> = self.received.iter().collect();
-        // Of one receiver's deliveries the one that was seen last knows most.
+        // Among one receiver's deliveries, the latest has the most complete facts.
         subscribers.sort_by_key(|one| (one.receiver(), Reverse(one.facts.last_seen)));
         subscribers.dedup_by_key(|one| one.receiver());
         for Delivery { row, facts, .. } in subscribers {
@@ -220,7 +220,7 @@ impl<'a> Deliveries<'a> {
 }
 
 impl<'a> Delivery<'a> {
-    /// What tells receivers apart in the labels that describe them.
+    /// Returns the key that identifies a receiver in the labels.
     fn receiver(&self) -> (*const TopicRow<'a>, SocketAddr, Subscriber) {
         let row = std::ptr::from_ref(self.row);
         (row, self.facts.destination, self.facts.subscriber)
@@ -238,7 +238,7 @@ impl<'a> Delivery<'a> {
     }
 }
 
-/// Sums over a topic's deliveries, for the topics of which any was seen.
+/// Writes the sums over a topic's deliveries, for topics with any.
 pub(super) fn sums(
     sink: &mut MetricSink<'_>,
     rows: &[TopicRow<'_>],
@@ -320,7 +320,7 @@ pub(super) fn sums(
     Ok(())
 }
 
-/// One sample for each topic that has a value.
+/// Writes a sample for each topic that has a value.
 fn each<N: Into<Number>>(
     sink: &mut MetricSink<'_>,
     metric: &'static Metric,
@@ -336,7 +336,7 @@ fn each<N: Into<Number>>(
     })
 }
 
-/// Sockets of which it is not known what they dropped.
+/// Writes the sockets that dropped datagrams with unknown content.
 pub(super) fn sockets(sink: &mut MetricSink<'_>, sockets: &[SocketFacts]) -> fmt::Result {
     sink.family(&metric::SOCKET_DROPS, |family| {
         let dropping = sockets
@@ -355,7 +355,7 @@ pub(super) fn sockets(sink: &mut MetricSink<'_>, sockets: &[SocketFacts]) -> fmt
     })
 }
 
-/// Older than is remembered is no number, but no zero either.
+/// Returns the lag in seconds, or infinity if it is no longer known.
 fn lag_seconds(facts: &AcknowledgementFacts) -> f64 {
     facts.lag_seconds.unwrap_or(f64::INFINITY)
 }

@@ -1,4 +1,4 @@
-//! What is wrong with the graph, as the page shows it.
+//! Metrics of problems in the graph.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,12 +11,12 @@ use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
 
-/// What one finding adds to a family.
+/// Returns how much one finding adds to a family.
 type Count = fn(&Diagnosis) -> usize;
-/// How many of something on each topic.
+/// Counts by topic.
 type PerTopic<'a> = BTreeMap<(DomainId, Cow<'a, str>), usize>;
 
-/// One family of each kind of finding.
+/// Writes one family per kind of finding.
 pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     let found = &*snapshot.diagnoses;
     sink.family(&metric::DIAGNOSES, |family| {
@@ -70,7 +70,7 @@ pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::
     })
 }
 
-/// How many of something each topic has.
+/// Writes the counts of each topic.
 fn per_topic(sink: &mut MetricSink<'_>, list: &[Diagnosis]) -> fmt::Result {
     let metrics: [(&'static Metric, Count); 4] = [
         (&metric::TOPIC_CONFLICTING_TYPES, |each| match each {

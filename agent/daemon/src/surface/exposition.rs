@@ -1,5 +1,5 @@
-//! One scrape as text: OpenMetrics 1.0 when the client asks for it, classic Prometheus text
-//! otherwise. Both come from the same writer, so they cannot disagree.
+//! A scrape as text: OpenMetrics 1.0 if the client requests it, otherwise classic Prometheus text.
+//! Both use the same writer, so they cannot differ in content.
 
 use std::fmt::{self, Write};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -26,7 +26,7 @@ pub struct Exposition {
 }
 
 impl Format {
-    /// The best of what an `Accept` header allows; classic text when it says nothing.
+    /// Returns the best format that an `Accept` header allows; classic text by default.
     #[must_use]
     pub fn negotiate(accept: &str) -> Self {
         let quality = |wanted: fn(&str) -> bool| {
@@ -58,7 +58,7 @@ impl Format {
         }
     }
 
-    /// The answer's `Content-Type`.
+    /// Returns the value of the answer's `Content-Type`.
     #[must_use]
     pub const fn content_type(self) -> &'static str {
         match self {
@@ -71,7 +71,7 @@ impl Format {
 const OPENMETRICS: &str = "application/openmetrics-text";
 
 impl Exposition {
-    /// Of these sources.
+    /// Creates an exposition of these sources.
     #[must_use]
     pub fn new(sources: MetricSources) -> Self {
         Self {
@@ -80,20 +80,20 @@ impl Exposition {
         }
     }
 
-    /// The whole page.
+    /// Returns the complete page.
     ///
     /// # Errors
-    /// Never while writing to memory; the formatting machinery wants to be asked.
+    /// Never fails in practice, because it writes to memory.
     pub fn render(&self, format: Format) -> Result<String, fmt::Error> {
         let mut page = String::new();
         self.write(format, &mut page)?;
         Ok(page)
     }
 
-    /// Writes the whole page.
+    /// Writes the complete page.
     ///
     /// # Errors
-    /// `page` takes no more.
+    /// Fails if `page` does.
     pub fn write(&self, format: Format, page: &mut impl Write) -> fmt::Result {
         let start = Instant::now();
         let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));

@@ -1,5 +1,5 @@
-//! The metrics listener: read-only, bounded in connections and in how long one may idle, and open to
-//! those whom `metrics.web_config` names, or to everybody.
+//! The metrics listener: read-only, bounded in connections and idle time. `metrics.web_config` can
+//! restrict it to certain clients.
 
 use std::io;
 use std::net::SocketAddr;
@@ -44,30 +44,30 @@ const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <li><a href=\"/healthz\">/healthz</a> whether the process runs</ul>
 ";
 
-/// Why there is no listener.
+/// Why the listener cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum ListenError {
-    /// The address is taken or not this host's.
+    /// The address is in use or does not belong to this host.
     #[error(
         "cannot listen on {address}: change `metrics.listen` in the configuration or pass \
          `--metrics`"
     )]
     Address {
-        /// Where.
+        /// The address.
         address: SocketAddr,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// It cannot be protected as asked for.
+    /// `metrics.web_config` cannot be applied.
     #[error(transparent)]
     Web(#[from] WebConfigError),
-    /// It cannot be encrypted as asked for.
+    /// TLS cannot be set up.
     #[cfg(feature = "tls")]
     #[error(transparent)]
     Tls(#[from] super::tls::TlsError),
 }
 
-/// A bound listener that does not answer yet.
+/// A bound listener that is not served yet.
 #[derive(Debug)]
 pub struct Server {
     listener: std::net::TcpListener,
@@ -85,10 +85,11 @@ struct Pages {
 }
 
 impl Server {
-    /// Binds; needs no runtime. The file `web_config` says who may come in.
+    /// Binds the address without a runtime. The file `web_config` restricts the clients.
     ///
     /// # Errors
-    /// When the address is taken or not this host's, or the file asks for what cannot be.
+    /// Fails if the address is in use or does not belong to this host, or if the file cannot be
+    /// applied.
     pub fn bind(
         address: SocketAddr,
         web_config: Option<&Path>,
@@ -110,18 +111,18 @@ impl Server {
         })
     }
 
-    /// Where it listens, with the port the kernel chose when it was 0.
+    /// Returns the address, with the port that the kernel chose for port 0.
     ///
     /// # Errors
-    /// When the kernel does not tell.
+    /// Fails if the kernel does not return the address.
     pub fn local_addr(&self) -> io::Result<SocketAddr> {
         self.listener.local_addr()
     }
 
-    /// Answers until `stop`, then finishes the answers that have begun.
+    /// Serves requests until `stop`, then completes the answers in progress.
     ///
     /// # Errors
-    /// When the runtime cannot take the socket over.
+    /// Fails if the runtime cannot take over the socket.
     pub async fn serve(self, stop: CancellationToken) -> io::Result<()> {
         let limit = Limit::MetricsClients;
         let connections = self.sources.limits.caps().get(limit);
@@ -132,7 +133,7 @@ impl Server {
             ),
         );
         #[cfg(feature = "tls")]
-        // Who expects a handshake cannot read an answer without one.
+        // A client that expects a TLS handshake cannot read a plain answer.
         let full = self.acceptor.is_none().then_some(full);
         #[cfg(not(feature = "tls"))]
         let full = Some(full);
@@ -154,23 +155,24 @@ impl Server {
     }
 }
 
-/// Whether a connection came over loopback.
+/// Whether a connection uses loopback.
 #[derive(Clone, Copy, Debug)]
 struct Local(bool);
 
 impl Local {
     fn of(connection: &Connection<TcpStream>) -> Self {
         let address = connection.stream().local_addr();
-        // A connection that is broken already is answered nothing.
+        // A broken connection needs no answer.
         Self(address.is_ok_and(|address| address.ip().to_canonical().is_loopback()))
     }
 }
 
-/// Over loopback only requests for this host's own names are answered: a page in a browser of this
-/// host could make others resolve to it. Other addresses have names that the agent cannot know.
+/// Rejects requests over loopback that are not for this host's own names: a web page could make a
+/// browser on this host resolve its name to loopback. Names of other addresses are unknown to the
+/// agent.
 async fn own_names(Extension(local): Extension<Local>, request: Request, next: Next) -> Response {
     let headers = request.headers();
-    // A program without the header is no browser.
+    // A client without the header is no browser.
     if local.0 && headers.contains_key(HOST) && authority::own(headers).is_err() {
         let reason = "the request is for another host; this listener answers to localhost and \
                       loopback addresses\n";
@@ -202,10 +204,11 @@ fn router(sources: MetricSources) -> Router {
         })
 }
 
-/// Pages that are being made and read.
+/// Pages that are being created and read.
 static PAGES: LargeResponses = LargeResponses::new();
 
-/// The capture thread hears the bell at once, unless it has a flood of packets to read.
+/// Longest time that a scrape waits for a fresh snapshot; the capture thread usually responds at
+/// once.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
 async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response {
@@ -250,7 +253,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
     answer
 }
 
-/// What the client accepts (RFC 9110, 12.5.3).
+/// Returns the encoding that the client accepts (RFC 9110, 12.5.3).
 fn encoding(headers: &HeaderMap) -> Encoding {
     let lists = headers.get_all(ACCEPT_ENCODING).iter();
     let lists = lists.filter_map(|list| list.to_str().ok());

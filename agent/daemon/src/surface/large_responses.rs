@@ -1,6 +1,6 @@
-//! Answers that hold everything, as a page of metrics or all topics: megabytes on a large robot. A
-//! few are made at a time; they are kept compressed until they are read, and within a budget. A
-//! fresh answer takes the room of the one that has been read for longest.
+//! Large answers, such as a page of metrics or all topics: megabytes on a large robot. Few are
+//! created at a time, and they are kept compressed within a budget until they are read. A new
+//! answer revokes the memory of the one that has been read for longest.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -12,13 +12,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::compressed_text::{CompressedText, Encoding, TextCompressor};
 
-/// Large answers of one surface that are made at once.
+/// Number of large answers of one surface that are created at once.
 const AT_ONCE: usize = 2;
-/// Bytes of answers of one surface that wait for their readers, compressed.
+/// Budget in bytes for compressed answers of one surface that are being read.
 const KEPT: usize = 4 << 20;
-/// From here on an answer is large.
+/// Size in bytes from which an answer is large.
 const LARGE: usize = 256 << 10;
-/// How long a turn is waited for.
+/// Longest time that a request waits for a permit.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Large answers of one surface.
@@ -29,22 +29,22 @@ pub(super) struct LargeResponses {
     kept: Mutex<Vec<Pending>>,
 }
 
-/// An answer that is being read, by age.
+/// Answers that are being read, by age.
 #[derive(Debug)]
 struct Pending {
     bytes: usize,
-    /// Its reader gets no more.
+    /// Revokes the answer; its reader gets no more.
     given_up: CancellationToken,
 }
 
-/// The turn of one answer, while it is made.
+/// Permission to create one answer.
 #[derive(Debug)]
 pub(super) struct RenderPermit {
     of: &'static LargeResponses,
     _making: SemaphorePermit<'static>,
 }
 
-/// The room of one answer, until it is read.
+/// Memory of one answer until it is read.
 #[derive(Debug)]
 pub(super) struct Reservation {
     of: &'static LargeResponses,
@@ -52,7 +52,7 @@ pub(super) struct Reservation {
 }
 
 impl LargeResponses {
-    /// Nothing made or kept.
+    /// Creates an empty state.
     pub(super) const fn new() -> Self {
         Self {
             making: Semaphore::const_new(AT_ONCE),
@@ -61,7 +61,7 @@ impl LargeResponses {
         }
     }
 
-    /// A turn, within a moment.
+    /// Returns a permit, or `None` after a timeout.
     pub(super) async fn turn(&'static self) -> Option<RenderPermit> {
         let making = timeout(self.longest, self.making.acquire()).await;
         let making = making.ok()?.ok()?;
@@ -71,7 +71,7 @@ impl LargeResponses {
         })
     }
 
-    /// Room for an answer of so many bytes, that of the oldest ones where need be.
+    /// Reserves memory for an answer of this size, revoking the oldest answers if necessary.
     fn room(&'static self, bytes: usize) -> Reservation {
         let given_up = CancellationToken::new();
         let mut kept = self.lock();
@@ -97,7 +97,7 @@ impl LargeResponses {
 }
 
 impl RenderPermit {
-    /// The text as an answer.
+    /// Returns the text as a response body.
     pub(super) fn keep_packed(self, text: CompressedText) -> Body {
         if text.len() < LARGE {
             return text.into_body(None);
@@ -106,7 +106,7 @@ impl RenderPermit {
         text.into_body(Some(room))
     }
 
-    /// The bytes as an answer of the same length.
+    /// Returns the bytes as a response body of the same length.
     pub(super) fn keep(self, bytes: Bytes) -> Body {
         if bytes.len() < LARGE {
             return bytes.into();
@@ -115,14 +115,14 @@ impl RenderPermit {
         let packed = packer.write(&bytes).and_then(|()| packer.finish());
         match packed {
             Ok(packed) => self.keep_packed(packed),
-            // Memory does not fail to be written.
+            // Writing to memory cannot fail.
             Err(_) => Body::empty(),
         }
     }
 }
 
 impl Reservation {
-    /// Whether another answer has it.
+    /// Returns whether the memory is revoked.
     pub(super) fn is_given_up(&self) -> bool {
         self.given_up.is_cancelled()
     }
@@ -141,7 +141,7 @@ mod tests {
 
     use super::*;
 
-    /// Bytes that do not become fewer when they are compressed.
+    /// Returns bytes that cannot be compressed.
     fn noise(length: usize) -> Bytes {
         let mut state = 1_u64;
         let mut next = || {
@@ -168,7 +168,7 @@ mod tests {
         }
         let held: usize = ANSWERS.lock().iter().map(|kept| kept.bytes).sum();
         assert!(held <= KEPT, "{held}");
-        // The last ones are whole, the first ones end early.
+        // The last answers are complete, the first ones end early.
         let mut whole = 0;
         for body in bodies {
             match to_bytes(body, usize::MAX).await {

@@ -1,6 +1,6 @@
-//! A listener that cannot be used up: a limited number of connections. Where all slots are taken,
-//! the connection that waits longest for its client makes room; where none waits, a further client
-//! is answered 503 at once.
+//! A listener with a limited number of connections. If all slots are in use, the connection with
+//! the longest wait for its client makes room. If none waits, a further client receives 503 at
+//! once.
 
 use std::io;
 use std::sync::Arc;
@@ -15,15 +15,16 @@ use super::connection::{Connection, Connections};
 use crate::config::Limit;
 use crate::limit_facts::{LimitFigures, Slot, Slots};
 
-/// How long a client that is turned away may take to read why, and how many may do so at once.
+/// Longest time for a refused client to read the answer, and largest number of such clients at
+/// once.
 const FAREWELL: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
-/// Bytes of a request that are read so that its sender sees the answer to it.
+/// Bytes of a request that are read so that its sender receives the answer.
 const REQUEST: u64 = 64 << 10;
-/// How long the connection that makes room may take to go.
+/// Longest time that a connection that makes room may take to close.
 const ROOM: Duration = Duration::from_millis(100);
 
-/// A listener with a limited number of connections; a further one is refused and closed.
+/// A listener with a limited number of connections; further ones are refused and closed.
 #[derive(Debug)]
 pub(super) struct LimitedListener<L> {
     listener: L,
@@ -35,13 +36,13 @@ pub(super) struct LimitedListener<L> {
     leaving: JoinSet<()>,
 }
 
-/// The answer to each connection beyond the limit.
+/// The answer to connections beyond the limit.
 #[derive(Clone, Debug)]
 pub(super) struct Refusal(Arc<str>);
 
 impl<L> LimitedListener<L> {
-    /// At most as many connections at a time as `limit` says, which `limits` counts. Without
-    /// a refusal a further one is closed without a word.
+    /// Creates a listener with the number of connections that `limit` allows, counted in `limits`.
+    /// Without a refusal, further connections are closed without an answer.
     pub(super) fn new(
         listener: L,
         limits: Arc<LimitFigures>,
@@ -59,7 +60,7 @@ impl<L> LimitedListener<L> {
         }
     }
 
-    /// A slot, if need be that of a connection on which nothing is being answered.
+    /// Returns a slot, if necessary that of an idle connection.
     async fn slot(&self) -> Option<Slot> {
         if let Some(slot) = self.slots.take() {
             return Some(slot);
@@ -79,7 +80,7 @@ impl<L> LimitedListener<L> {
         timeout(ROOM, freed).await.ok()
     }
 
-    /// No slot for this one. It is not waited for, nor are many kept that take their time.
+    /// Answers a connection without a slot in the background. Few such answers are kept at a time.
     fn reject(&mut self, stream: impl AsyncRead + AsyncWrite + Unpin + Send + 'static) {
         while self.leaving.try_join_next().is_some() {}
         if let Some(refusal) = self.refusal.clone()
@@ -93,7 +94,7 @@ impl<L> LimitedListener<L> {
 }
 
 impl<L: Listener> LimitedListener<L> {
-    /// The next connection that has a slot.
+    /// Returns the next connection that has a slot.
     pub(super) async fn accept(&mut self) -> Connection<L::Io> {
         loop {
             let (stream, _) = self.listener.accept().await;
@@ -106,7 +107,7 @@ impl<L: Listener> LimitedListener<L> {
 }
 
 impl Refusal {
-    /// 503 with this body.
+    /// Creates an answer with status 503 and this body.
     pub(super) fn new(media_type: &str, body: &str) -> Self {
         let length = body.len();
         Self(
@@ -121,7 +122,7 @@ impl Refusal {
     async fn send(self, mut stream: impl AsyncRead + AsyncWrite + Unpin) -> io::Result<()> {
         stream.write_all(self.0.as_bytes()).await?;
         stream.shutdown().await?;
-        // Closed with something unread, the connection would be reset and the answer perhaps lost.
+        // Closing with unread data would reset the connection and might lose the answer.
         tokio::io::copy(&mut stream.take(REQUEST), &mut tokio::io::sink()).await?;
         Ok(())
     }

@@ -1,19 +1,19 @@
-//! TCP listeners whose clients cannot make the kernel hold much for them: what waits to be read by a
-//! slow one counts for the agent's `MemoryMax`, up to 4 MB a connection by default.
+//! TCP listeners that bound the kernel's memory per connection: unread data of a slow client counts
+//! against the agent's `MemoryMax`, by default up to 4 MB per connection.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};
 
 use rustix::net::sockopt;
 
-/// What the kernel doubles, and each connection takes at most.
+/// Send buffer per connection in bytes; the kernel doubles this value.
 const SEND_BUFFER: usize = 128 << 10;
 
-/// Listens there; for a runtime to take over.
+/// Binds a listener, which a runtime can take over.
 pub(super) fn listen(address: SocketAddr) -> io::Result<TcpListener> {
     let listener = TcpListener::bind(address)?;
     listener.set_nonblocking(true)?;
-    // Connections have it from their listener.
+    // Connections inherit the size from their listener.
     sockopt::set_socket_send_buffer_size(&listener, SEND_BUFFER)?;
     Ok(listener)
 }
@@ -33,7 +33,7 @@ mod tests {
         let (server, _) = listener.accept().unwrap();
         let room = sockopt::socket_send_buffer_size(&server).unwrap();
         assert_eq!(room, 2 * SEND_BUFFER);
-        // As it grows while something is sent.
+        // The buffer would grow while data is sent.
         server
             .set_write_timeout(Some(Duration::from_millis(100)))
             .unwrap();

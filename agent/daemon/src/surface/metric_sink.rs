@@ -1,7 +1,7 @@
-//! Families and samples, straight from facts, in the catalogue's order, as text or as OTLP data
-//! points: who writes them cannot tell which.
+//! Metric families and samples, written from facts in the catalogue's order, as text or as OTLP
+//! data points. Writers need not know which.
 //!
-//! Nothing is kept between two pages: what is gone from the facts is gone from the page.
+//! No state is kept between two pages: series vanish with their facts.
 
 use std::collections::hash_map::DefaultHasher;
 use std::fmt;
@@ -17,7 +17,7 @@ use super::otlp::points::Points;
 use super::text::Text;
 use ros2probe_model::histogram::Histogram;
 
-/// Longer label values are cut. ROS allows 255 characters; what is longer is hostile.
+/// Longest label value in bytes; ROS allows 255 characters, so longer ones are hostile.
 const MAX_LABEL_BYTES: usize = 256;
 
 /// A label value.
@@ -38,20 +38,20 @@ pub(super) enum Number {
     Real(f64),
 }
 
-/// One scrape or one export being written.
+/// A scrape or export in progress.
 pub(super) enum MetricSink<'a> {
     Text(Text<'a>),
     Points(&'a mut Points),
 }
 
-/// One family being written; its samples follow one another.
+/// A family in progress; its samples are contiguous.
 pub(super) struct Family<'a, 'b> {
     metric: &'static Metric,
     sink: &'a mut MetricSink<'b>,
 }
 
 impl<'b> MetricSink<'b> {
-    /// Begins a family; `samples` writes what it holds.
+    /// Begins a family; `samples` writes its samples.
     pub(super) fn family(
         &mut self,
         metric: &'static Metric,
@@ -64,7 +64,7 @@ impl<'b> MetricSink<'b> {
         samples(&mut Family { metric, sink: self })
     }
 
-    /// A family with one sample and no labels.
+    /// Writes a family with one sample and no labels.
     pub(super) fn single(
         &mut self,
         metric: &'static Metric,
@@ -75,7 +75,7 @@ impl<'b> MetricSink<'b> {
 }
 
 impl Family<'_, '_> {
-    /// One counter, gauge or info sample; an info's value is ignored.
+    /// Writes a sample of a counter, gauge or info; the value of an info is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
         match self.sink {
             MetricSink::Text(text) => text.sample(self.metric, labels, value.into()),
@@ -86,12 +86,12 @@ impl Family<'_, '_> {
         }
     }
 
-    /// One info sample.
+    /// Writes an info sample.
     pub(super) fn info(&mut self, labels: &[Label<'_>]) -> fmt::Result {
         self.sample(labels, 1_u64)
     }
 
-    /// One histogram.
+    /// Writes a histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
         match self.sink {
             MetricSink::Text(text) => text.histogram(self.metric, labels, values),
@@ -103,8 +103,8 @@ impl Family<'_, '_> {
     }
 }
 
-/// Text up to the cap. What is longer keeps its beginning and a hash of the whole, so that two long
-/// names do not become one series.
+/// Writes text up to the cap. A longer text is replaced by its beginning and a hash of the whole,
+/// so that two long names remain two series.
 pub(super) fn write_capped(out: &mut impl fmt::Write, text: &str) -> fmt::Result {
     if text.len() <= MAX_LABEL_BYTES {
         return out.write_str(text);

@@ -1,5 +1,5 @@
-//! What people and machines read and write: metrics, health and the control API over HTTP, from
-//! immutable snapshots. Nothing here ever makes the capture wait.
+//! Interfaces for people and machines: metrics, health and the control API over HTTP, based on
+//! immutable snapshots. The capture never waits for them.
 
 mod agent_metrics;
 pub mod api;

@@ -1,9 +1,9 @@
-//! What the kernel says about this process and others, from `/proc`. A value that cannot be read is absent:
-//! hardened services may not see all of it.
+//! Resource usage of this process and others, from `/proc`. Unreadable values are absent, because
+//! hardened services may hide some.
 
 use std::fs;
 
-/// One reading.
+/// A reading of this process.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Process {
     pub(super) cpu_seconds: Option<f64>,
@@ -15,19 +15,19 @@ pub(super) struct Process {
     pub(super) start_time: Option<f64>,
 }
 
-/// What another process has used.
+/// Resource usage of another process.
 #[derive(Clone, Debug)]
 pub(super) struct Usage {
     pub(super) name: String,
     pub(super) cpu_seconds: f64,
     pub(super) resident_bytes: u64,
     pub(super) threads: u32,
-    /// Unix time.
+    /// Unix time of the process's start.
     pub(super) started: Option<f64>,
 }
 
 impl Usage {
-    /// `None` where the process has gone, or the kernel does not show it.
+    /// Returns `None` if the process has ended or is hidden.
     pub(super) fn read(id: u32) -> Option<Self> {
         let stat = fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
         let fields = Fields::of(&stat);
@@ -58,14 +58,15 @@ struct Fields<'a>(Vec<&'a str>);
 
 impl<'a> Fields<'a> {
     fn of(stat: &'a str) -> Self {
-        // The command name may hold spaces and brackets; fields count from behind its last one.
+        // The command name may contain spaces and brackets, so the fields begin after its last
+        // bracket.
         Self(match stat.rsplit_once(") ") {
             Some((_, rest)) => rest.split(' ').collect(),
             None => Vec::new(),
         })
     }
 
-    /// proc(5) counts fields from 1 and the state is the third.
+    /// proc(5) counts fields from 1, and the state is the third.
     fn text(&self, number: usize) -> Option<&'a str> {
         Some(self.0.get(number.checked_sub(3)?)?.trim())
     }
@@ -100,8 +101,8 @@ impl Process {
     }
 }
 
-/// What the kernel cannot have back while the process runs: its own pages (anonymous, changed, swapped)
-/// and the rings that it shares with the kernel, whose pages look like those of files.
+/// Returns the memory that the kernel cannot reclaim while the process runs: its own pages
+/// (anonymous, changed, swapped), and the rings shared with the kernel, which are mapped as files.
 fn unreclaimable_bytes() -> Option<f64> {
     let maps = fs::read_to_string("/proc/self/smaps").ok()?;
     let mut bytes = 0.0;
@@ -110,7 +111,7 @@ fn unreclaimable_bytes() -> Option<f64> {
         let mut words = line.split_ascii_whitespace();
         let key = words.next().unwrap_or_default();
         let counts = match key {
-            // They are mapped twice, one behind the other: RSS counts them twice.
+            // The rings are mapped twice in a row, so RSS counts them twice.
             "Pss:" => is_ring,
             "Anonymous:" | "Swap:" => !is_ring,
             address if address.contains('-') => {
@@ -146,11 +147,11 @@ fn max_fds() -> Option<f64> {
 }
 
 fn ticks_per_second() -> f64 {
-    // USER_HZ is 100 on every architecture the agent supports, whatever the kernel's own HZ.
+    // USER_HZ is 100 on every supported architecture, whatever the kernel's own HZ.
     100.0
 }
 
-/// From the auxiliary vector: 16 KiB on a Raspberry Pi 5.
+/// Returns the page size from the auxiliary vector, such as 16 KiB on a Raspberry Pi 5.
 fn page_bytes() -> f64 {
     const AT_PAGESZ: usize = 6;
     let vector = fs::read("/proc/self/auxv").unwrap_or_default();

@@ -1,4 +1,4 @@
-//! The robot's part of the page: graph, topics, watchlist (`ros2_*`).
+//! Metrics of the robot: graph, topics, watchlist (`ros2_*`).
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,37 +20,38 @@ use ros2probe_model::snapshot::{
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::DomainId;
 
-/// Unknown writers with series of their own.
+/// Largest number of unknown writers with their own series.
 const MAX_UNKNOWN_WRITERS: usize = 32;
-/// Different types or policies named in one label.
+/// Largest number of types or policies in one label.
 const MAX_JOINED: usize = 4;
 
-/// How a counter is read.
+/// Reads a counter.
 type Count = fn(&Measurement) -> u64;
-/// How a counter of a sampled view is read.
+/// Reads a counter of a sampled view.
 type SampledCount = fn(&SampledFacts) -> u64;
-/// How a histogram is read.
+/// Reads a histogram.
 type Values = fn(&Measurement) -> &Histogram;
 
-/// A topic with series of its own.
+/// A topic with its own series.
 pub(super) struct TopicRow<'a> {
     domain_id: u32,
     name: Cow<'a, str>,
-    /// `None`: watched by name, but not announced.
+    /// Facts about the topic; `None` if it is watched by name but not announced.
     pub(super) facts: Option<&'a TopicFacts>,
     watched: bool,
-    /// A watch asks for series per delivery.
+    /// Whether a watch requests series per delivery.
     pub(super) per_subscriber: bool,
 }
 
-/// The topics to show, sorted, and how many are left out.
+/// The topics to show, sorted, and the number of omitted ones.
 pub(super) struct TopicRows<'a> {
     pub(super) shown: Vec<TopicRow<'a>>,
     pub(super) hidden: usize,
 }
 
 impl<'a> TopicRows<'a> {
-    /// Topics that are measured come first; services and other plumbing are shown when measured.
+    /// Selects the topics to show: measured ones first. Service and other internal topics are shown
+    /// if they are measured.
     pub(super) fn new(snapshot: &'a Snapshot, settings: &Settings) -> Self {
         let max_topics = settings.limits.topics;
         let mut rows: BTreeMap<(DomainId, Cow<'a, str>), TopicRow<'a>> = BTreeMap::new();
@@ -130,7 +131,7 @@ impl<'a> TopicRow<'a> {
     }
 }
 
-/// The graph.
+/// Writes the metrics of the graph.
 pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     let mut domains: BTreeMap<DomainId, (usize, usize, usize)> = BTreeMap::new();
     for participant in &snapshot.participants {
@@ -196,7 +197,7 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
     unknown_writers(sink, snapshot)
 }
 
-/// Writers whose announcement was missed.
+/// Writes the metrics of writers whose announcement was missed.
 fn unknown_writers(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     sink.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
     let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
@@ -221,7 +222,7 @@ fn unknown_writers(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resul
     })
 }
 
-/// Host, process, process id and control group, each empty where it is not known.
+/// Returns the labels host, process, process id and control group; unknown ones are empty.
 fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
     [
         Label::Text(process.host.as_deref().unwrap_or_default()),
@@ -251,7 +252,7 @@ fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
         .collect();
     let mut seen = BTreeSet::new();
     for node in &snapshot.nodes {
-        // Two nodes of one name in one participant are a fault of the robot, not two series.
+        // Two nodes with one name in a participant are a fault, but only one series.
         if !seen.insert((node.participant, node.name.as_str())) {
             continue;
         }
@@ -269,7 +270,7 @@ fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
     Ok(())
 }
 
-/// Topics.
+/// Writes the metrics of topics.
 pub(super) fn topics(
     sink: &mut MetricSink<'_>,
     rows: &[TopicRow<'_>],
@@ -341,7 +342,7 @@ pub(super) fn topics(
     histograms(sink, rows, settings)
 }
 
-/// Distributions of intervals and latencies.
+/// Writes the histograms of intervals and latencies.
 fn histograms(
     sink: &mut MetricSink<'_>,
     rows: &[TopicRow<'_>],
@@ -373,7 +374,7 @@ fn histograms(
     Ok(())
 }
 
-/// Topics of which a part was seen in shared memory, and how messages pass.
+/// Writes the metrics of sampled topics and of transports.
 fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     let counters: [(&Metric, SampledCount); 3] = [
         (&metric::TOPIC_SAMPLED, |sampled| sampled.span),
@@ -410,7 +411,7 @@ fn sampled(sink: &mut MetricSink<'_>, rows: &[TopicRow<'_>]) -> fmt::Result {
     })
 }
 
-/// Writers, when `settings` ask for them.
+/// Writes the metrics of writers if `settings` request them.
 pub(super) fn writers(
     sink: &mut MetricSink<'_>,
     rows: &[TopicRow<'_>],
@@ -431,7 +432,7 @@ pub(super) fn writers(
     Ok(())
 }
 
-/// One sample for each topic that is measured or will be: watched ones begin with 0.
+/// Writes a sample for each topic that is measured or watched; a watched topic begins with 0.
 fn measured(
     family: &mut Family<'_, '_>,
     rows: &[TopicRow<'_>],
@@ -454,7 +455,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
         return Ok(());
     };
     let [domain_id, topic] = row.labels();
-    // Subscriptions describe the topic only while it has no publisher.
+    // Subscriptions describe the topic only if it has no publisher.
     let endpoints = if facts.publishers.is_empty() {
         &facts.subscriptions
     } else {
@@ -475,7 +476,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
     ])
 }
 
-/// The different values, sorted, a few of them.
+/// Joins different values, sorted, up to a cap.
 fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
     let different: BTreeSet<&str> = values.collect();
     let mut text = String::new();
@@ -513,7 +514,7 @@ fn each_writer(family: &mut Family<'_, '_>, row: &TopicRow<'_>, value: Count) ->
     Ok(())
 }
 
-/// The watchlist's states and broken expectations.
+/// Writes the states and violated expectations of the watchlist.
 pub(super) fn watches(
     sink: &mut MetricSink<'_>,
     snapshot: &Snapshot,
@@ -559,7 +560,7 @@ pub(super) fn watches(
     })
 }
 
-/// The entry that is in force for what the model calls `watch`: in the same place, unless the list
+/// Returns the configured entry of `watch` in the model: usually at the same index, unless the list
 /// has just changed.
 fn configured<'c>(
     place: usize,
@@ -573,12 +574,12 @@ fn configured<'c>(
     there.or_else(|| configured.iter().map(|watch| &**watch).find(same))
 }
 
-/// What the vendor of a writer is, as far as it is known.
+/// Returns the vendor of a writer, as far as it is known.
 fn unknown_vendor(writer: &UnknownWriterFacts) -> Label<'static> {
     writer.vendor.map_or(Label::Text(""), Label::Vendor)
 }
 
-/// `/points`, or `/points@5` when it is for one domain; `@` is in no ROS name.
+/// Returns `/points`, or `/points@5` for a single domain; ROS names contain no `@`.
 fn watch_name(facts: &WatchFacts) -> Cow<'_, str> {
     let watch = &facts.watch;
     match watch.domain_id {

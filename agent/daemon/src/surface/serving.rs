@@ -1,5 +1,5 @@
-//! Serving connections: HTTP/1.1 with bounded heads, each request watched by the [`ConnectionState`] of its
-//! connection, and an orderly end.
+//! Serves connections: HTTP/1.1 with bounded heads, the [`ConnectionState`] of each connection, and
+//! a graceful shutdown.
 
 use std::convert::Infallible;
 use std::pin::Pin;
@@ -24,20 +24,20 @@ use tokio_util::sync::CancellationToken;
 use super::connection::{Connection, ConnectionState};
 use super::limited_listener::LimitedListener;
 
-/// Bytes of a request's head, and how many fields it may have.
+/// Largest size of a request's head in bytes, and largest number of its fields.
 pub(super) const MAX_HEAD: usize = 48 << 10;
 const MAX_FIELDS: usize = 64;
 
-/// How the connections of a listener become streams of HTTP.
+/// Turns the connections of a listener into HTTP streams.
 pub(super) trait Wrap<S>: Send + 'static {
-    /// The stream of requests.
+    /// The HTTP stream.
     type Io: AsyncRead + AsyncWrite + Unpin + Send + 'static;
 
-    /// Of this connection.
+    /// Wraps a connection.
     fn wrap(&self, connection: Connection<S>) -> Self::Io;
 }
 
-/// As they are.
+/// Plain connections, without TLS.
 pub(super) struct Plain;
 
 impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Plain {
@@ -48,8 +48,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Plain {
     }
 }
 
-/// Answers every connection until `stop`, then finishes the answers that have begun. `mark` adds to
-/// each request of a connection what the routes want to know of it.
+/// Serves every connection until `stop`, then completes the answers in progress. `mark` adds facts
+/// about the connection to each of its requests.
 pub(super) async fn serve<L, W, M>(
     mut listener: LimitedListener<L>,
     wrap: W,
@@ -77,7 +77,7 @@ pub(super) async fn serve<L, W, M>(
     while connections.join_next().await.is_some() {}
 }
 
-/// The requests of one connection.
+/// Serves the requests of one connection.
 async fn answer<M: Clone + Send + Sync + 'static>(
     io: impl AsyncRead + AsyncWrite + Unpin + Send + 'static,
     state: Arc<ConnectionState>,
@@ -106,12 +106,12 @@ async fn answer<M: Clone + Send + Sync + 'static>(
     let connection = Builder::new()
         .max_buf_size(MAX_HEAD)
         .max_headers(MAX_FIELDS)
-        // The pace has its own.
+        // [`ConnectionState`] has its own timeouts.
         .header_read_timeout(None::<Duration>)
         .serve_connection(TokioIo::new(io), service);
     let mut connection = std::pin::pin!(connection);
     tokio::select! {
-        // A client that breaks off is no concern of the log.
+        // Disconnects of clients are not logged.
         _ = connection.as_mut() => return,
         () = state.ended() => return,
         () = stop.cancelled() => {}
@@ -126,13 +126,13 @@ async fn answer<M: Clone + Send + Sync + 'static>(
     }
 }
 
-/// The body of a request; the pace hears of its end.
+/// The body of a request; reports its end to the connection's state.
 struct Received {
     body: Incoming,
     state: Arc<ConnectionState>,
 }
 
-/// The body of an answer; the pace hears of its end.
+/// The body of an answer; reports its end to the connection's state.
 struct Answered {
     body: Body,
     state: Arc<ConnectionState>,

@@ -1,5 +1,5 @@
 //! Families and samples as text: OpenMetrics 1.0 and the classic Prometheus format 0.0.4, which
-//! differ in how a family begins.
+//! differ in the first lines of a family.
 
 use std::fmt::{self, Write};
 
@@ -8,19 +8,19 @@ use super::exposition::Format;
 use super::metric_sink::{Label, Number, write_capped};
 use ros2probe_model::histogram::Histogram;
 
-/// A page being written.
+/// A page in progress.
 pub(super) struct Text<'a> {
     out: &'a mut dyn Write,
     format: Format,
 }
 
 impl<'a> Text<'a> {
-    /// An empty page.
+    /// Creates an empty page.
     pub(super) fn new(out: &'a mut dyn Write, format: Format) -> Self {
         Self { out, format }
     }
 
-    /// The lines that begin a family.
+    /// Writes the first lines of a family.
     pub(super) fn begin(&mut self, metric: &Metric) -> fmt::Result {
         let Metric { name, help, .. } = metric;
         match self.format {
@@ -32,7 +32,7 @@ impl<'a> Text<'a> {
                 writeln!(self.out, "# HELP {name} {help}")?;
                 writeln!(self.out, "# TYPE {name} {}", kind.label())
             }
-            // The family has the name without the suffix of its samples.
+            // The family's name lacks the suffix of its samples.
             Format::OpenMetrics => {
                 let family = metric.family();
                 writeln!(self.out, "# HELP {family} {help}")?;
@@ -45,7 +45,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// The end of the page.
+    /// Writes the end of the page.
     pub(super) fn end(&mut self) -> fmt::Result {
         match self.format {
             Format::Classic => Ok(()),
@@ -53,7 +53,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// A counter, a gauge or an info, whose value is always 1.
+    /// Writes a counter, a gauge or an info, whose value is always 1.
     pub(super) fn sample(
         &mut self,
         metric: &Metric,
@@ -69,7 +69,7 @@ impl<'a> Text<'a> {
         }
     }
 
-    /// A histogram: sum, count and cumulated buckets.
+    /// Writes a histogram: sum, count and cumulative buckets.
     pub(super) fn histogram(
         &mut self,
         metric: &Metric,
@@ -126,7 +126,7 @@ impl<'a> Text<'a> {
     }
 }
 
-/// A label value: backslash, quotation mark and line feed are escaped.
+/// Writes a label value, escaping backslash, quotation mark and line feed.
 struct Escaped<'a>(&'a mut dyn Write);
 
 impl Write for Escaped<'_> {
@@ -145,7 +145,7 @@ impl Write for Escaped<'_> {
     }
 }
 
-/// A number as both formats want it: always with a point or an exponent.
+/// Writes a number as both formats require it, always with a point or an exponent.
 struct Real(f64);
 
 impl fmt::Display for Real {

@@ -1,7 +1,7 @@
 //! TLS on the metrics listener (feature `tls`: rustls with ring, which is partly C and assembly).
 //!
-//! A handshake takes place while the connection is read, so that a slow client holds up itself
-//! alone; the limits of the connection below hold for it as well.
+//! The handshake takes place while the connection is read, so a slow client only delays itself. The
+//! limits of the underlying connection apply as well.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -23,52 +23,52 @@ use super::connection::Connection;
 use super::serving::Wrap;
 use super::web_config::TlsFiles;
 
-/// Longest file of certificates or a key.
+/// Largest size of a file with certificates or a key.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Why TLS cannot be spoken.
+/// Why TLS cannot be set up.
 #[derive(Debug, thiserror::Error)]
 pub enum TlsError {
     /// A file cannot be read.
     #[error("cannot read {} (`tls_server_config`)", path.display())]
     Read {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// A file holds something else.
+    /// A file is not valid PEM.
     #[error("{} (`tls_server_config`) is invalid", path.display())]
     Pem {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the parser.
         source: pem::Error,
     },
-    /// Certificate and key do not fit.
+    /// Certificate and key do not match.
     #[error("certificate and key (`tls_server_config`) cannot be used")]
     Unfit(#[from] rustls::Error),
-    /// No client could be verified.
+    /// The client authorities are invalid.
     #[error("client_ca_file (`tls_server_config`) cannot be used")]
     Authorities(#[from] VerifierBuilderError),
 }
 
-/// Certificates and key, ready to be used.
+/// Certificates and key, loaded and checked.
 #[derive(Clone)]
 pub(super) struct Acceptor(TlsAcceptor);
 
 /// A connection, from its first byte on.
 pub(super) enum Stream<S> {
-    /// Not agreed yet.
+    /// The handshake is in progress.
     Handshake(Box<Accept<S>>),
-    /// Agreed.
+    /// The handshake is complete.
     Open(Box<TlsStream<S>>),
-    /// Not agreed.
+    /// The handshake failed.
     Failed,
 }
 
 impl Acceptor {
-    /// What the files say.
+    /// Loads certificates and key from the files.
     pub(super) fn new(files: &TlsFiles) -> Result<Self, TlsError> {
         let provider = Arc::new(default_provider());
         let versions: &[_] = if files.only_tls13 {
@@ -134,7 +134,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send + 'static> Wrap<S> for Acceptor {
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Stream<S> {
-    /// The stream behind the handshake, which goes on with each call.
+    /// Returns the stream after the handshake, which each call advances.
     fn poll_open(&mut self, context: &mut Context<'_>) -> Poll<io::Result<Pin<&mut TlsStream<S>>>> {
         if let Self::Handshake(accept) = self {
             let agreed = ready!(Pin::new(&mut **accept).poll(context));
@@ -174,7 +174,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> AsyncWrite for Stream<S> {
     fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
         match ready!(self.poll_open(context)) {
             Ok(stream) => stream.poll_shutdown(context),
-            // Nothing was agreed on: nothing to take leave of.
+            // After a failed handshake, no shutdown message is possible.
             Err(_) => Poll::Ready(Ok(())),
         }
     }

@@ -1,9 +1,8 @@
-//! Who may scrape, and how it is encrypted: the file `metrics.web_config`, of the form that the
-//! exporters of Prometheus share (exporter-toolkit's `web.yml`).
+//! Access control and TLS of the metrics listener: the file `metrics.web_config`, in the format of
+//! Prometheus exporters (exporter-toolkit's `web.yml`).
 //!
-//! Of that form it knows `basic_auth_users` and of `tls_server_config` the keys below; what it does
-//! not know it refuses rather than leave a listener open that was meant to be closed. The file is
-//! read once, at the start.
+//! The supported keys are `basic_auth_users` and a part of `tls_server_config`. Other keys are
+//! rejected, because ignoring them could leave a listener open. The file is read once at startup.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -11,59 +10,59 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-/// A larger file is none of these.
+/// Largest size of the file.
 const MAX_BYTES: u64 = 1 << 20;
-/// Each step doubles the time that a password takes: 16 is seconds on a robot.
+/// Accepted bcrypt costs. Each step doubles the time of a check; 16 takes seconds on a robot.
 const COSTS: std::ops::RangeInclusive<u8> = 4..=16;
 
-/// What the file says, checked.
+/// The validated content of the file.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct WebConfig {
-    /// Names and the bcrypt hashes of their passwords; everybody may scrape when it is empty.
+    /// Bcrypt hashes by user name; if empty, no password is required.
     pub(super) users: BTreeMap<String, String>,
-    /// Where certificates are.
+    /// Files for TLS, if enabled.
     pub(super) tls: Option<TlsFiles>,
 }
 
-/// What TLS needs.
+/// Files and settings of TLS.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct TlsFiles {
-    /// The chain, PEM.
+    /// Certificate chain, PEM.
     pub(super) certificates: PathBuf,
-    /// The private key, PEM.
+    /// Private key, PEM.
     pub(super) key: PathBuf,
-    /// Clients must have a certificate of one of these, PEM.
+    /// Authorities of client certificates, PEM; if set, clients need a certificate.
     pub(super) client_authorities: Option<PathBuf>,
-    /// TLS 1.2 is not spoken.
+    /// Whether TLS 1.2 is disabled.
     pub(super) only_tls13: bool,
 }
 
-/// Why the listener cannot be protected as asked for.
+/// Why the listener cannot be protected as configured.
 #[derive(Debug, thiserror::Error)]
 pub enum WebConfigError {
-    /// A file cannot be read.
+    /// The file cannot be read.
     #[error("cannot read {} (`metrics.web_config`)", path.display())]
     Read {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// It says what is not possible.
+    /// The file has an invalid setting.
     #[error("{} (`metrics.web_config`): {reason}", path.display())]
     Invalid {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// Description of the error.
         reason: String,
     },
-    /// Encryption is no part of this program.
+    /// The build lacks TLS.
     #[error(
         "{} (`metrics.web_config`) requires TLS, which this build lacks: build `rp` with \
          `--features tls`, or encrypt with a proxy", path.display()
     )]
     WithoutTls {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
     },
 }
@@ -86,10 +85,11 @@ struct TlsShape {
 }
 
 impl WebConfig {
-    /// Reads and checks the file; paths in it are relative to it.
+    /// Reads and validates the file; paths in it are relative to it.
     ///
     /// # Errors
-    /// It cannot be read, says what is not known, or asks for what this program cannot do.
+    /// Fails if the file cannot be read, has unknown or invalid settings, or needs a missing
+    /// feature.
     pub fn load(path: &Path) -> Result<Self, WebConfigError> {
         let text =
             crate::file::read_text(path, MAX_BYTES).map_err(|source| WebConfigError::Read {
@@ -165,7 +165,7 @@ impl TlsShape {
     }
 }
 
-/// `$2y$10$` and 53 letters; the cost is bounded, since every client can cause it.
+/// Checks `$2y$10$` and 53 characters. The cost is bounded, because every client can cause it.
 fn check_hash(hash: &str) -> Result<(), String> {
     let unfit = "is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`";
     let mut parts = hash.split('$');
@@ -189,7 +189,7 @@ fn check_hash(hash: &str) -> Result<(), String> {
 mod tests {
     use super::*;
 
-    /// The example of exporter-toolkit's documentation.
+    /// The example in exporter-toolkit's documentation.
     const ALICE: &str = "$2y$10$mDwo.lAisC94iLAyP81MCesa29IzH37oigHC/42V2pdJlUprsJPze";
 
     fn parse(text: &str) -> Result<WebConfig, String> {

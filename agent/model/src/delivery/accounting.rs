@@ -1,4 +1,4 @@
-//! What the decisions about a delivery's samples change: counters, causes, the journal.
+//! Effects of decisions about a delivery's samples: counters, causes, journal entries.
 
 use ros2probe_wire::{Guid, Timestamp};
 
@@ -12,21 +12,21 @@ use crate::reception::Decision;
 use crate::route::Direction;
 use crate::route::Route;
 
-/// What is counted of all deliveries of a writer.
+/// Sums over all deliveries of a writer.
 #[derive(Clone, Debug, Default)]
 pub struct Totals {
-    /// At receivers.
+    /// Samples at receivers.
     pub received: Delivered,
-    /// On their way out.
+    /// Samples that left this host.
     pub sent: Delivered,
-    /// Where the time went.
+    /// Time spent in each stage.
     pub breakdown: Option<Box<Breakdown>>,
-    /// Whether anything arrived, or left.
+    /// Whether anything arrived, and whether anything left.
     pub seen: [bool; 2],
 }
 
 impl Totals {
-    /// Those of one direction.
+    /// Returns the counts of one direction.
     pub const fn of(&mut self, direction: Direction) -> &mut Delivered {
         match direction {
             Direction::Sent => &mut self.sent,
@@ -47,7 +47,7 @@ impl Totals {
     }
 }
 
-/// What decisions change.
+/// State that decisions change.
 pub(super) struct Accounting<'a> {
     pub(super) tally: &'a mut Delivered,
     pub(super) loss_causes: &'a mut LossCauses,
@@ -57,7 +57,7 @@ pub(super) struct Accounting<'a> {
     pub(super) receiver: Receiver,
     pub(super) main: Route,
     pub(super) at: Timestamp,
-    /// A loss stays pending until then.
+    /// Time until which a new loss stays pending.
     pub(super) until: Option<Timestamp>,
 }
 
@@ -87,7 +87,7 @@ impl Accounting<'_> {
         }
     }
 
-    /// Nothing is known yet of where these died.
+    /// Marks samples as pending: their cause is not known yet.
     pub(super) fn wait(&mut self, first: u64, last: u64) {
         let Some(until) = self.until else {
             self.lose(LossCause::BeforeHost, first, last);
@@ -100,7 +100,7 @@ impl Accounting<'_> {
         }
     }
 
-    /// What was pending died before it came to this host.
+    /// Settles pending samples as lost before this host.
     pub(super) fn conclude(&mut self, first: u64, last: u64) {
         let count = last - first + 1;
         self.tally.pending = self.tally.pending.saturating_sub(count);

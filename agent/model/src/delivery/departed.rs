@@ -1,12 +1,13 @@
-//! Samples that left this host for a receiver on it: whether they arrive, or count as lost.
+//! Samples that left this host for a receiver on the same host: whether they arrive or are lost.
 
 use ros2probe_wire::Timestamp;
 
 use super::{Delivery, DeliveryContext, FIRST_MOMENTS, SILENCE, UNDER_WAY};
 
 impl Delivery {
-    /// Samples up to `newest` have left this host for here, `left_by` tells which by when. What
-    /// does not arrive at a receiver that was `alive` afterwards is lost.
+    /// Records that samples up to `newest` have left for this receiver; `left_by` returns the
+    /// highest number that had left at a time. Samples that do not arrive are lost if the receiver
+    /// was `alive` afterwards.
     pub fn expect(
         &mut self,
         newest: u64,
@@ -32,15 +33,15 @@ impl Delivery {
         }
     }
 
-    /// Nothing more will come of what has left for here.
+    /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
     pub fn expect_no_more(&mut self, newest: u64, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
             self.exists(newest, context);
         }
     }
 
-    /// What was written until its reader appeared is for no reader here: `next` and when it last
-    /// rose are those before the record that is taken in.
+    /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
+    /// of its last rise are the values from before the current record.
     pub(super) fn excuse_unheard(&mut self, (next, advanced): (u64, Timestamp)) {
         let sequence = self.reception.sequence_mut();
         if next > 0 && advanced < self.opened && sequence.next() > next {

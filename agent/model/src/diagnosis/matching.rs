@@ -1,9 +1,8 @@
-//! Whether a writer and a reader of one topic understand each other: the request/offered rules of
-//! DDS (DDS 1.4, 2.2.3; XTypes 1.3, 7.6.3.1.1), one by one, from what both announced.
+//! Whether a writer and a reader of one topic match: the request/offered rules of DDS (DDS 1.4,
+//! 2.2.3; XTypes 1.3, 7.6.3.1.1), applied to their announcements.
 //!
-//! Says what the participants themselves decide, not what would be reasonable: a value that the
-//! specification does not know is nobody's fault, and what an implementation does not check keeps
-//! nobody apart.
+//! The result is the participants' own decision. Values that the specification does not define
+//! never prevent a match, and neither do policies that an implementation does not check.
 
 use std::fmt;
 use std::str::Chars;
@@ -15,52 +14,52 @@ use ros2probe_wire::rtps::VendorId;
 /// A policy that a writer offers and a reader requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Policy {
-    /// The reader wants all samples, the writer does not repeat lost ones.
+    /// The reader requests reliable delivery; the writer is best effort.
     Reliability,
-    /// The reader wants samples from before its time, the writer does not keep them as long.
+    /// The reader requests earlier samples; the writer keeps them for a shorter time.
     Durability,
-    /// The reader wants samples more often than the writer promises.
+    /// The reader requests a shorter period than the writer offers.
     Deadline,
-    /// The writer may delay samples longer than the reader allows.
+    /// The writer's latency budget exceeds the reader's.
     LatencyBudget,
-    /// The writer says it is alive in a weaker way than the reader wants, or less often.
+    /// The writer's liveliness kind is weaker, or its lease longer, than the reader requests.
     Liveliness,
-    /// One wants an owner for each instance, the other shares.
+    /// One endpoint uses exclusive ownership, the other shared.
     Ownership,
-    /// The reader wants the writers' order, the writer does not offer it.
+    /// The reader requests order by source timestamp; the writer does not offer it.
     DestinationOrder,
-    /// The reader wants changes together that the writer does not keep together.
+    /// The reader requests coherent or ordered access that the writer does not offer.
     Presentation,
-    /// The reader does not read the encoding that the writer uses.
+    /// The reader does not accept the writer's data representation.
     DataRepresentation,
 }
 
-/// Policies in which a writer and a reader differ.
+/// A set of policies.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Policies(u16);
 
-/// How a writer and a reader stand.
+/// The result for a writer and a reader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// They talk.
+    /// They match.
     Match,
-    /// They do not, on purpose: no partition is common to both.
+    /// They do not match because they share no partition, which is intentional.
     Partition,
-    /// They do not: these policies are in the way.
+    /// They do not match because of these policies.
     Incompatible(Policies),
 }
 
-/// What matching asks of one endpoint.
+/// The properties of an endpoint that matching uses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Offer<'a> {
     /// Quality of service.
     pub qos: &'a Qos,
-    /// Implementation, for not all check all policies.
+    /// Implementation; some do not check all policies.
     pub vendor: VendorId,
 }
 
 impl Policy {
-    /// All of them.
+    /// All policies.
     pub const ALL: [Self; 9] = [
         Self::Reliability,
         Self::Durability,
@@ -73,7 +72,7 @@ impl Policy {
         Self::DataRepresentation,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -89,7 +88,7 @@ impl Policy {
         }
     }
 
-    /// Fast DDS announces these three and lets nothing depend on them.
+    /// Returns whether Fast DDS checks the policy. It announces three policies but ignores them.
     const fn is_checked_by_fast_dds(self) -> bool {
         !matches!(
             self,
@@ -98,7 +97,7 @@ impl Policy {
     }
 
     fn is_satisfied(self, offered: &Qos, requested: &Qos) -> bool {
-        /// At least as much, as far as both values have a meaning.
+        /// Returns whether the offer is at least the request. Undefined values always are.
         fn at_least(offered: (u32, Option<&str>), requested: (u32, Option<&str>)) -> bool {
             offered.1.is_none() || requested.1.is_none() || offered.0 >= requested.0
         }
@@ -135,24 +134,24 @@ impl Policy {
 }
 
 impl Policies {
-    /// One more.
+    /// Adds a policy.
     pub const fn insert(&mut self, policy: Policy) {
         self.0 |= 1 << policy as u16;
     }
 
-    /// Whether it is one of them.
+    /// Returns whether the set contains the policy.
     #[must_use]
     pub const fn contains(self, policy: Policy) -> bool {
         self.0 & (1 << policy as u16) != 0
     }
 
-    /// Whether there is none.
+    /// Returns whether the set is empty.
     #[must_use]
     pub const fn is_empty(self) -> bool {
         self.0 == 0
     }
 
-    /// In the order of [`Policy::ALL`].
+    /// Returns the policies in the order of [`Policy::ALL`].
     pub fn iter(self) -> impl Iterator<Item = Policy> {
         let all = Policy::ALL.into_iter();
         all.filter(move |policy| self.contains(*policy))
@@ -165,7 +164,7 @@ impl fmt::Debug for Policies {
     }
 }
 
-/// Whether samples of this writer go to this reader of its topic and type.
+/// Returns whether this writer matches this reader of its topic and type.
 #[must_use]
 pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     let both = [offered.vendor, requested.vendor];
@@ -178,7 +177,7 @@ pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
         }
     }
     if !have_common_partition(offered.qos, requested.qos) {
-        // Apart on purpose: whether they would understand each other is nobody's question.
+        // Different partitions are intentional, so other policies do not matter.
         Verdict::Partition
     } else if policies.is_empty() {
         Verdict::Match
@@ -187,15 +186,15 @@ pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     }
 }
 
-/// Upper bound of the steps that [`verdict`] takes for these two.
+/// Returns an upper bound of the steps that [`verdict`] takes for these two.
 #[must_use]
 pub fn effort(offered: &Qos, requested: &Qos) -> usize {
     let length = |qos: &Qos| -> usize { qos.partitions.iter().map(|name| name.len() + 1).sum() };
     1 + length(offered) * length(requested)
 }
 
-/// Not longer. Implementations convert between nanoseconds and 2^-32 s each in their own way: one
-/// nanosecond is no difference.
+/// Returns whether the offer is at most the request. Implementations round differently between
+/// nanoseconds and 2^-32 s, so a difference of one nanosecond is ignored.
 fn within(offered: Duration, requested: Duration) -> bool {
     match (offered, requested) {
         (_, Duration::Infinite) => true,
@@ -215,8 +214,9 @@ fn presents(offered: Presentation, requested: Presentation) -> bool {
         && (offered.is_ordered || !requested.is_ordered)
 }
 
-/// DDS 1.4, 2.2.3.13: a name that is equal, or that matches the other side's pattern; two patterns
-/// never match. No partition at all is the one with the empty name.
+/// Returns whether two endpoints share a partition (DDS 1.4, 2.2.3.13). Names match if they are
+/// equal, or if one matches the other's pattern. Two patterns never match. An empty list is the
+/// partition with the empty name.
 fn have_common_partition(one: &Qos, other: &Qos) -> bool {
     fn names(qos: &Qos) -> impl Iterator<Item = &str> {
         let default = qos.partitions.is_empty().then_some("");
@@ -225,14 +225,14 @@ fn have_common_partition(one: &Qos, other: &Qos) -> bool {
     names(one).any(|one| names(other).any(|other| meet(one, other) || meet(other, one)))
 }
 
-/// Whether a name, which is no pattern, matches a name or a pattern of `*` and `?`.
+/// Returns whether `name`, which is not a pattern, matches a name or a pattern of `*` and `?`.
 fn meet(pattern: &str, name: &str) -> bool {
     let is_pattern = |text: &str| text.contains(['*', '?']);
     if is_pattern(name) || !is_pattern(pattern) {
         return pattern == name && !is_pattern(name);
     }
     let (mut pattern, mut name) = (pattern.chars(), name.chars());
-    // Behind the last star: the pattern, and the name from where it may swallow one more.
+    // Where to resume after the last star: in the pattern, and one character further in the name.
     let mut retry: Option<(Chars<'_>, Chars<'_>)> = None;
     loop {
         let mut next = pattern.clone();
@@ -269,7 +269,7 @@ mod tests {
 
     use super::*;
 
-    /// Makes a reader ask for more, or a writer offer it.
+    /// Increases what a reader requests or a writer offers.
     type Demand = fn(&mut Qos);
 
     const CYCLONE: VendorId = VendorId::CYCLONE;
@@ -305,8 +305,8 @@ mod tests {
         assert_eq!(policies(&qos(Role::Writer), &qos(Role::Reader)), []);
     }
 
-    /// Each policy broken alone, and the same pair the other way round, which holds for all but
-    /// the one that has to be equal.
+    /// Breaks each policy alone, then swaps both endpoints. The swapped pair matches, except for
+    /// ownership, which must be equal.
     #[test]
     fn each_policy_is_named() {
         let weak = qos(Role::Writer);
@@ -454,7 +454,7 @@ mod tests {
             representations in proptest::collection::vec(0_i16..3, 0..3),
         ) -> Qos {
             let [reliability, durability, liveliness, ownership, order, scope] = kinds;
-            // Steps of a microsecond: far from rounding.
+            // Durations differ by whole microseconds, far more than rounding does.
             let [deadline, budget, lease] = durations
                 .map(|it| it.map_or(Duration::Infinite, |it| Duration::Finite(it * 1_000)));
             let mut qos = Qos::defaults(Role::Writer, CYCLONE);
@@ -472,7 +472,7 @@ mod tests {
     }
 
     proptest! {
-        /// The rules as the specification's table has them, written down a second time.
+        /// Compares with a second implementation, written after the specification's table.
         #[test]
         fn the_rules_are_those_of_the_specification(offered in any_qos(), requested in any_qos()) {
             let used = *offered.representations.first().unwrap_or(&DataRepresentation::XCDR1);
@@ -500,8 +500,7 @@ mod tests {
             }
         }
 
-        /// Whoever offers what a third one requests of a second one, and gets it, offers it too:
-        /// "at least" is an order. Encodings and owners are no order, only equal or not.
+        /// Checks that "at least" is transitive. Representations and ownership have no order.
         #[test]
         fn at_least_is_an_order(mut three in proptest::array::uniform3(any_qos())) {
             for qos in &mut three {
@@ -514,7 +513,7 @@ mod tests {
             }
         }
 
-        /// Against the slow and obvious way.
+        /// Compares with a simple recursive matcher.
         #[test]
         fn patterns_match_as_a_naive_matcher_says(pattern in "[ab*?]{0,7}", name in "[ab]{0,7}") {
             fn naive(pattern: &[u8], name: &[u8]) -> bool {

@@ -1,5 +1,4 @@
-//! What was disposed of a moment ago: copies of an announcement and samples may still be on their
-//! way, and must not raise it from the dead.
+//! Recent disposals: delayed copies of an announcement or samples must not bring the entity back.
 
 use std::collections::VecDeque;
 
@@ -9,23 +8,23 @@ use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 use super::facts::Origin;
 use crate::size::Size;
 
-/// Announcements older than a disposal are stale, for this long after it.
+/// Announcements older than a disposal are ignored for this long after it.
 const STALE_WITHIN: u64 = 500 * MILLISECOND;
 const MAX_DISPOSALS: usize = 256;
-/// Samples on their way arrive within this.
+/// Samples that were already sent arrive within this time.
 const UNDER_WAY: u64 = 4 * STALE_WITHIN;
 
 /// The latest disposals, oldest first.
 #[derive(Debug, Default)]
 pub(super) struct Disposals {
-    /// What, when, and by which sender's which sample.
+    /// The GUID, the time, and the sender and sequence number of the disposal.
     latest: VecDeque<(Guid, Timestamp, GuidPrefix, u64)>,
 }
 
 impl Disposals {
-    /// Entries and cap.
+    /// Returns the number of entries and its cap.
     pub(super) fn sizes(&self) -> [Size; 1] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self { latest } = self;
         [Size::new(
             "discovery.disposals",
@@ -42,7 +41,7 @@ impl Disposals {
         self.latest.push_back(disposal);
     }
 
-    /// Whether this one was disposed of so recently that it may still be heard.
+    /// Returns whether the entity was disposed so recently that its samples may still arrive.
     pub(super) fn is_recent(&self, guid: Guid, now: Timestamp) -> bool {
         let fresh = |at: Timestamp| at.0.saturating_add(UNDER_WAY) > now.0;
         self.latest
@@ -50,7 +49,7 @@ impl Disposals {
             .any(|(disposed, at, ..)| *disposed == guid && fresh(*at))
     }
 
-    /// A copy of an announcement that its own disposal overtook.
+    /// Returns whether an announcement is a delayed copy from before the entity's disposal.
     pub(super) fn is_stale(&self, guid: Guid, origin: &Origin) -> bool {
         self.latest
             .iter()

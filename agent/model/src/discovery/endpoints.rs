@@ -1,4 +1,4 @@
-//! SEDP: writers and readers, and those that wait for their participant (RTPS 2.5, 8.5.4).
+//! SEDP: writers and readers, including those that wait for their participant (RTPS 2.5, 8.5.4).
 
 use std::sync::Arc;
 
@@ -20,8 +20,8 @@ use crate::churn::Event;
 use crate::journal::Journal;
 
 impl Discovery {
-    /// SEDP: an endpoint is there. `evidence` is what is known in its participant's favour. Returns
-    /// whether the participant finds room by that.
+    /// Records the SEDP announcement of an endpoint. `evidence` is the priority known for its
+    /// participant. Returns whether the participant is admitted because of it.
     pub fn endpoint(
         &mut self,
         announcement: EndpointAnnouncement,
@@ -64,7 +64,7 @@ impl Discovery {
         is_more && self.learn(guid.prefix, priority, origin.at, journal)
     }
 
-    /// SEDP: an endpoint says goodbye.
+    /// Records the SEDP disposal of an endpoint.
     pub fn endpoint_gone(&mut self, guid: Guid, origin: &Origin, journal: &mut Journal) {
         self.disposals.add(guid, origin);
         self.pending_endpoints.remove(&guid);
@@ -74,7 +74,7 @@ impl Discovery {
         self.drop_endpoint(guid, Some(Event::Disposed), origin.at, journal);
     }
 
-    /// Puts an announced endpoint into its known participant; gives it back where it finds no room.
+    /// Adds an announced endpoint to its known participant, or returns it if the table is full.
     fn admit(
         &mut self,
         pending: PendingEndpoint,
@@ -108,7 +108,7 @@ impl Discovery {
                 }
                 return None;
             }
-            // The same GUID on another topic: its dispose was missed.
+            // The GUID now belongs to another topic, so the agent missed its disposal.
             participant.endpoints.remove(&guid);
             self.drop_endpoint(guid, Some(Event::Disposed), at, journal);
         }
@@ -152,7 +152,8 @@ impl Discovery {
         None
     }
 
-    /// What waited for this participant, or for room, until there is none for what is worth most.
+    /// Admits waiting endpoints and nodes of this participant, by priority, until the table is
+    /// full.
     pub(super) fn adopt_pending(
         &mut self,
         prefix: GuidPrefix,

@@ -1,4 +1,4 @@
-//! Whom an event of discovery is about, in the forms in which counters, journal and events keep it.
+//! The subject of a discovery event, in the forms for counters, journal and events.
 
 use std::sync::Arc;
 
@@ -10,14 +10,14 @@ use crate::churn::{Entity, Event};
 use crate::event::{EventKind, TEXT, bounded};
 use crate::names::{DdsName, NodeName, TypeName};
 
-/// One participant, endpoint or node.
+/// A participant, endpoint or node.
 pub(super) struct DiscoveredEntity<'a> {
     pub(super) domain_id: DomainId,
     pub(super) guid: Guid,
     details: EntityDetails<'a>,
 }
 
-/// What it is. An endpoint's names are shared, for it is often taken out before it is told of.
+/// Kind and details. Names are shared, since an endpoint is often removed before its event.
 enum EntityDetails<'a> {
     Participant(&'a ParticipantProxy),
     Endpoint(Role, DdsName, TypeName),
@@ -46,7 +46,7 @@ impl<'a> DiscoveredEntity<'a> {
         }
     }
 
-    /// A node of this participant.
+    /// Describes a node of this participant.
     pub(super) const fn node(domain_id: DomainId, participant: Guid, name: &'a NodeName) -> Self {
         Self {
             domain_id,
@@ -63,7 +63,7 @@ impl<'a> DiscoveredEntity<'a> {
         }
     }
 
-    /// Topic of an endpoint, name of a node, empty for a participant.
+    /// Returns the topic of an endpoint or the name of a node; empty for a participant.
     pub(super) fn name(&self) -> Arc<str> {
         match &self.details {
             EntityDetails::Participant(_) => Arc::default(),
@@ -72,7 +72,7 @@ impl<'a> DiscoveredEntity<'a> {
         }
     }
 
-    /// This happened to it.
+    /// Returns the event for this change of the entity.
     pub(super) fn event(&self, change: Event) -> EventKind {
         let Self {
             domain_id,

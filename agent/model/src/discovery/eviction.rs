@@ -1,15 +1,14 @@
-//! Room in a full table: which entry goes for a newcomer.
+//! Eviction from full tables: which entry makes room for a newcomer.
 //!
-//! An entry is doubtful that is heard no more: after 5 s where it was there for less than 2 s, else
-//! after 90 s; one with a socket on this host never is. Doubtful ones go first. Any other goes only
-//! for a newcomer that is worth more, and the least worth of them that has been silent longest
-//! goes.
+//! Silent entries go first. An entry is silent after 5 s if it existed for less than 2 s, otherwise
+//! after 90 s; one with a socket on this host never is. Other entries only go for a newcomer of
+//! higher priority: the lowest priority first, and among equals the longest silence.
 //!
-//! Names and user data can be forged, too. So newcomers without a socket on this host displace what
-//! is worth something, or was there for 2 s, only until their like fill half of the table.
+//! Names and user data can be forged, too. Without a socket on this host, newcomers displace
+//! established entries only until such newcomers fill half of the table.
 //!
-//! A search visits the whole table, and a flood makes one necessary for every packet: one search
-//! serves many newcomers, and searches wait for each other.
+//! A search visits the whole table, and a flood would trigger one per packet. So one search serves
+//! many newcomers, and the rate of searches is limited.
 
 use ros2probe_wire::{EntityId, Guid, Timestamp};
 
@@ -18,61 +17,61 @@ use super::priority::Priority;
 use super::{Discovery, SECOND};
 use crate::journal::Journal;
 
-/// A participant that was seen over this span is no forgery of the moment.
+/// A participant seen over at least this span is established.
 const ESTABLISHED: u64 = 2 * SECOND;
-/// One that is not established makes room after this long without a word.
+/// A participant that is not established is silent after this time without a packet.
 const UNESTABLISHED_SILENCE: u64 = 5 * SECOND;
-/// Any participant makes room after this long without a word, whatever its lease: real ones repeat
-/// themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
+/// Any participant is silent after this time without a packet, whatever its lease: real ones
+/// announce themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
 pub(super) const FORSAKEN: u64 = 90 * SECOND;
-/// How often a full table is searched for room: at most, and for each of its entries.
+/// Minimum time between two searches of a full table; it grows with the number of entries.
 const SEARCH: u64 = SECOND / 10;
 const SEARCH_EACH: u64 = 10_000;
-/// Entries that one search finds, of each kind.
+/// Largest number of candidates of each kind that one search finds.
 const FOUND: usize = 64;
 
-/// What a search of one table found.
+/// Candidates that a search of one table found.
 #[derive(Debug, Default)]
 pub(super) struct Victims {
-    /// Heard no more, the least worth last.
+    /// Silent entries, with the lowest priority last.
     silent: Vec<Victim>,
-    /// All others, likewise.
+    /// All other entries, with the lowest priority last.
     others: Vec<Victim>,
-    /// Entries that are worth something without a socket on this host.
+    /// Entries with a priority but without a socket on this host.
     claims: usize,
-    /// Those of them that are watched.
+    /// Watched entries among `claims`.
     watched_claims: usize,
     search_after: Timestamp,
 }
 
-/// One entry that may go.
+/// An entry that may be evicted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Victim {
     priority: Priority,
     is_established: bool,
     last_seen: Timestamp,
-    /// An endpoint, or a participant with all it has.
+    /// GUID of an endpoint, or of a participant that is evicted with all its entries.
     guid: Guid,
 }
 
-/// An entry for which there is no room.
+/// An entry for which the table has no room.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Newcomer {
     pub(super) guid: Guid,
     pub(super) priority: Priority,
 }
 
-/// A table that may be full.
+/// A table that can be full.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Table {
     Participants,
     Endpoints,
-    /// Nodes and what they name: a participant gives up all of its own.
+    /// Nodes and the endpoints that they list; eviction removes all nodes of a participant.
     Nodes,
 }
 
 impl Victims {
-    /// Entries that were found and are still there to go.
+    /// Returns the number of remaining candidates.
     pub(super) fn len(&self) -> usize {
         let Self {
             silent,
@@ -84,7 +83,7 @@ impl Victims {
         silent.len() + others.len()
     }
 
-    /// Most that there may be.
+    /// Largest number of candidates.
     pub(super) const CAP: usize = 2 * FOUND;
 
     fn search(&mut self, discovery: &Discovery, table: Table, now: Timestamp) {
@@ -134,10 +133,10 @@ impl Victims {
         self.search_after = Timestamp(now.0.saturating_add(pause));
     }
 
-    /// The next entry that goes for a newcomer of this worth.
+    /// Returns the next entry to evict for this newcomer.
     fn next(&mut self, discovery: &Discovery, table: Table, newcomer: Newcomer) -> Option<Guid> {
         let Newcomer { guid, priority } = newcomer;
-        // What was said since the search speaks for an entry.
+        // A packet since the search makes an entry active again.
         let is_silent = |victim: &Victim| {
             let participant = discovery.participants.get(&victim.guid.prefix);
             let heard = participant.map(|participant| participant.last_seen);
@@ -181,7 +180,7 @@ impl Victim {
 }
 
 impl Discovery {
-    /// Gives up an entry of a full table for this newcomer, where one may go.
+    /// Evicts an entry for this newcomer from a full table; returns false if every entry stays.
     pub(super) fn evict_for(&mut self, table: Table, newcomer: Newcomer, now: Timestamp) -> bool {
         let mut victims = std::mem::take(self.victims(table));
         if now >= victims.search_after {
@@ -225,12 +224,12 @@ impl Discovery {
         match table {
             Table::Participants => self.caps.participants,
             Table::Endpoints => self.caps.endpoints,
-            // Half of those that may be there.
+            // Victims are participants, which give up all of their nodes.
             Table::Nodes => self.caps.participants,
         }
     }
 
-    /// What an entry is worth that is there.
+    /// Returns the priority of an entry, or `None` if it is gone.
     fn priority(&self, guid: Guid) -> Option<Priority> {
         let priority = self.participants.get(&guid.prefix)?.priority();
         if guid.entity == EntityId::PARTICIPANT {
@@ -244,7 +243,7 @@ impl Discovery {
     }
 }
 
-/// As how much this participant counts if it is heard no more.
+/// Returns the priority of this participant if it is silent, otherwise `None`.
 fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priority> {
     let last = participant.last_seen.0;
     let is_silent_for = |span: u64| last.saturating_add(span) <= now.0;
@@ -259,7 +258,7 @@ fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priorit
     (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)
 }
 
-/// How many are left when those at the end have gone of which `is_valid` does not hold.
+/// Returns the length that remains without the invalid candidates at the end.
 fn last(victims: &[Victim], is_valid: impl Fn(&Victim) -> bool) -> usize {
     victims
         .iter()

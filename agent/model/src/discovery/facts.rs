@@ -1,5 +1,4 @@
-//! What is kept of participants, endpoints and nodes, and where a participant's domain is read
-//! from.
+//! State of participants, endpoints and nodes, and how a participant's domain is determined.
 
 use std::collections::BTreeSet;
 use std::net::SocketAddr;
@@ -15,31 +14,31 @@ use serde::{Deserialize, Serialize};
 use super::priority::Priority;
 use crate::names::{DdsName, NodeName, TypeName};
 
-/// Addresses kept of one participant and kind.
+/// Largest number of addresses kept per participant and kind.
 pub(super) const ADDRESSES: usize = 16;
 
-/// How sure a participant's domain is, least first.
+/// Source of a participant's domain, from the least to the most reliable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum DomainSource {
-    /// Nothing told.
+    /// No source; domain 0 is assumed.
     Assumed,
-    /// A unicast port that has the form of a discovery port.
+    /// A unicast port in the range of discovery ports.
     UnicastPort,
-    /// The multicast port it announces itself on.
+    /// The multicast port of its announcements.
     MulticastPort,
-    /// It said so.
+    /// The announcement itself.
     Announced,
 }
 
-/// Where an announcement came from.
+/// Origin of an announcement.
 #[derive(Clone, Copy, Debug)]
 pub struct Origin {
-    /// When.
+    /// Time of capture.
     pub at: Timestamp,
-    /// Who sent it, perhaps on somebody else's behalf.
+    /// GUID prefix of the sender, which may relay another participant's announcement.
     pub sender: GuidPrefix,
-    /// Its number among those of its writer.
+    /// Sequence number, counted by the sender's writer.
     pub sequence_number: u64,
     /// Destination address, IPv4-mapped for IPv4.
     pub destination: [u8; 16],
@@ -47,7 +46,7 @@ pub struct Origin {
     pub port: u16,
 }
 
-/// What a participant says about itself, as far as it is shown.
+/// Properties that a participant announces.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParticipantProxy {
     /// Implementation.
@@ -62,54 +61,54 @@ pub struct ParticipantProxy {
     pub process_id: Option<u32>,
     /// Lease.
     pub lease: Duration,
-    /// Announces security.
+    /// Whether it announces DDS security.
     pub secured: bool,
-    /// Its endpoints can be reached through shared memory, unless they say otherwise.
+    /// Whether its endpoints accept shared memory, unless they announce otherwise.
     pub shared_memory: bool,
 }
 
-/// Where a participant is reached over UDP by unicast.
+/// Unicast UDP addresses of a participant.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Addresses {
-    /// Its discovery endpoints.
+    /// Addresses of its discovery endpoints.
     pub metatraffic: Box<[SocketAddr]>,
-    /// Its other endpoints.
+    /// Addresses of its other endpoints.
     pub default: Box<[SocketAddr]>,
 }
 
-/// One participant.
+/// A participant.
 #[derive(Debug)]
 pub struct Participant {
-    /// What it says.
+    /// Announced properties.
     pub proxy: ParticipantProxy,
-    /// Where it is reached.
+    /// Unicast addresses.
     pub addresses: Addresses,
-    /// Known from before the agent's start, restored then, and not heard since.
+    /// Time of restoration from saved state, until its first packet.
     pub restored: Option<Timestamp>,
     /// Its domain.
     pub domain_id: DomainId,
     /// First announcement.
     pub first_seen: Timestamp,
-    /// Last sign of life.
+    /// Time of its last packet.
     pub last_seen: Timestamp,
     /// Its endpoints.
     pub endpoints: BTreeSet<Guid>,
     /// Its nodes.
     pub nodes: Vec<Node>,
-    /// Its announcements of readers were seen from the first on.
+    /// Whether all of its reader announcements were captured, from the first on.
     pub all_readers_announced: bool,
-    /// Its endpoints whose topics are watched by their exact names.
+    /// Number of its endpoints whose topics are watched by exact name.
     pub(super) watched: usize,
-    /// A socket of this host sends for it.
+    /// Whether a socket on this host sends for it.
     pub(super) local: bool,
-    /// It has sent user data.
+    /// Whether it has sent user data.
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
-    /// The `ros_discovery_info` sample that told the nodes.
+    /// Writer and number of the `ros_discovery_info` sample that announced the nodes.
     pub(super) nodes_from: Option<(Guid, u64)>,
 }
 
-/// One node.
+/// A node.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Node {
     /// Fully qualified name.
@@ -120,7 +119,7 @@ pub struct Node {
     pub readers: Vec<Guid>,
 }
 
-/// One writer or reader.
+/// A writer or reader.
 #[derive(Clone, Debug)]
 pub struct Endpoint {
     /// Writer or reader.
@@ -137,11 +136,11 @@ pub struct Endpoint {
     pub qos: Arc<Qos>,
     /// First announcement.
     pub first_seen: Timestamp,
-    /// Whether it can be reached through shared memory; `None` = as its participant.
+    /// Whether it accepts shared memory; `None` if it announces nothing, as its participant does.
     pub shared_memory: Option<bool>,
-    /// It can share its history in memory with endpoints of its host.
+    /// Whether it supports data sharing with endpoints on its host.
     pub data_sharing: bool,
-    /// Its topic is watched by its exact name.
+    /// Whether its topic is watched by exact name.
     pub(super) watched: bool,
 }
 
@@ -178,7 +177,7 @@ impl Addresses {
 }
 
 impl Participant {
-    /// A sign of life.
+    /// Records a packet of this participant.
     pub(super) fn seen(&mut self, at: Timestamp) {
         if self.restored.is_some_and(|restored| at > restored) {
             self.restored = None;
@@ -186,7 +185,7 @@ impl Participant {
         self.last_seen = self.last_seen.max(at);
     }
 
-    /// What it is worth when there is no room.
+    /// Returns its priority in a full table.
     pub(super) const fn priority(&self) -> Priority {
         Priority {
             watched: self.watched > 0,
@@ -205,7 +204,7 @@ impl Node {
         }
     }
 
-    /// Leaves it so many of its writers and readers at most; whether some had to go.
+    /// Truncates its writers and readers to `left` entries; returns whether any were removed.
     pub(super) fn cut(&mut self, left: &mut usize) -> bool {
         let mut is_cut = false;
         for list in [&mut self.writers, &mut self.readers] {
@@ -216,14 +215,14 @@ impl Node {
         is_cut
     }
 
-    /// What it takes.
+    /// Returns its size in bytes.
     pub(super) fn bytes(&self) -> usize {
         let guids = self.writers.len() + self.readers.len();
         size_of::<Self>() + self.name.len() + guids * size_of::<Guid>()
     }
 }
 
-/// Writers and readers that these nodes name.
+/// Returns the number of writers and readers that these nodes list.
 pub(super) fn named(nodes: &[Node]) -> usize {
     let named = |node: &Node| {
         let Node {
@@ -241,13 +240,13 @@ pub(super) struct Lists {
     pub(super) endpoints: usize,
     pub(super) nodes: usize,
     pub(super) named: usize,
-    /// Of the longer list.
+    /// Length of the longer address list.
     pub(super) addresses: usize,
 }
 
 impl Participant {
     pub(super) fn lists(&self) -> Lists {
-        // A new list does not compile before it has a place here.
+        // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             proxy: _,
             addresses,
@@ -277,9 +276,9 @@ impl Participant {
     }
 }
 
-/// The participant's domain: as announced, else by the port its announcement went to (RTPS 2.5,
-/// 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p), else 0. Ports from 32768 on are
-/// mostly ephemeral ones and tell nothing.
+/// Returns the participant's domain and its source. Without an announced domain, it follows from
+/// the destination port (RTPS 2.5, 9.6.1.1: 7400 + 250 d, multicast + 0, unicast + 10 + 2 p). Ports
+/// from 32768 on are mostly ephemeral, so the domain is then assumed to be 0.
 pub(super) fn domain(announced: Option<DomainId>, origin: &Origin) -> (DomainId, DomainSource) {
     const EPHEMERAL: u16 = 32_768;
     if let Some(domain_id) = announced.filter(|domain_id| *domain_id <= DomainId::MAX) {

@@ -1,9 +1,9 @@
-//! What discovery knew, as plain data that outlives the agent.
+//! Discovery state as plain data that outlives the agent.
 //!
-//! Most of discovery is said once; an agent that is started anew on a running robot would know
-//! GUIDs without names. What is taken over from before is believed for one lease: whoever is heard
-//! by then stays, with all that was known of it. Bytes and files are somebody else's business; but
-//! what comes back from there is checked like anything that comes from outside.
+//! Most announcements are sent once, so an agent that restarts on a running robot would know GUIDs
+//! without names. Restored entries are valid for one lease; a participant that sends a packet
+//! within it stays, with all its entries. Encoding and files are the caller's task. Restored data
+//! is validated like any other external input.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -21,14 +21,14 @@ use serde::{Deserialize, Serialize};
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
 use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
 
-/// Everybody that was there.
+/// All participants with their endpoints and nodes.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Memory {
-    /// Sorted by GUID prefix.
+    /// Participants, sorted by GUID prefix.
     pub participants: Vec<Remembered>,
 }
 
-/// One participant with all it had. GUIDs and vendors are hexadecimal digits.
+/// A participant with its endpoints and nodes. GUIDs and vendors are hexadecimal.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Remembered {
     prefix: String,
@@ -39,14 +39,14 @@ pub struct Remembered {
     host: Option<String>,
     process_name: Option<String>,
     process_id: Option<u32>,
-    /// Nanoseconds; `None` = infinite, here and below.
+    /// Lease in nanoseconds; here and below, `None` is infinite.
     lease: Option<u64>,
     secured: bool,
     #[serde(default)]
     shared_memory: bool,
     addresses: Addresses,
     nodes: Vec<RememberedNode>,
-    /// Writer and number of the sample that told the nodes.
+    /// Writer and number of the sample that announced the nodes.
     nodes_from: Option<(String, u64)>,
     endpoints: Vec<RememberedEndpoint>,
 }
@@ -74,7 +74,7 @@ struct RememberedEndpoint {
     ownership: u32,
     minimum_separation: Option<u64>,
     partitions: Vec<String>,
-    /// What follows is what only matching asks for; earlier agents did not keep it.
+    /// Properties that only matching needs; older agents did not save them.
     #[serde(default)]
     matching: Matching,
     #[serde(default)]
@@ -93,11 +93,11 @@ struct Matching {
     representations: Vec<i16>,
 }
 
-/// Most data representations taken back of one endpoint.
+/// Largest number of data representations restored per endpoint.
 const MAX_REPRESENTATIONS: usize = 8;
 
 impl Discovery {
-    /// All that is worth keeping.
+    /// Returns the state to save.
     #[must_use]
     pub fn memory(&self) -> Memory {
         let mut participants: Vec<_> = self.participants.iter().collect();
@@ -115,8 +115,8 @@ impl Discovery {
         }
     }
 
-    /// Takes over what was known before the start, for one lease. What cannot be is left out; whom
-    /// discovery has met already knows better. No event: nothing happened to anybody.
+    /// Restores saved state for one lease. Invalid entries and entries that discovery already knows
+    /// are skipped. Restoring records no discovery events.
     pub fn restore(&mut self, memory: &Memory, now: Timestamp) {
         for remembered in &memory.participants {
             let Some((prefix, mut participant)) = remembered.participant(now) else {
@@ -216,7 +216,7 @@ impl Remembered {
             last_seen: now,
             endpoints: BTreeSet::new(),
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
-            // Readers may have come while nobody looked.
+            // The agent may have missed announcements of readers while it did not run.
             all_readers_announced: false,
             watched: 0,
             local: false,
@@ -369,7 +369,7 @@ impl Matching {
 }
 
 impl Default for Matching {
-    /// What nearly all endpoints have.
+    /// Returns the properties of nearly all endpoints.
     fn default() -> Self {
         Self::of(&Qos::defaults(Role::Writer, VendorId::EPROSIMA))
     }
@@ -379,13 +379,13 @@ fn digits(guid: Guid) -> String {
     format!("{}{}", guid.prefix, guid.entity)
 }
 
-/// A GUID of this participant.
+/// Parses a GUID of this participant.
 fn guid(text: &str, prefix: GuidPrefix) -> Option<Guid> {
     let guid = Guid::from_bytes(hexadecimal(text)?);
     (guid.prefix == prefix && guid.entity != EntityId::PARTICIPANT).then_some(guid)
 }
 
-/// `N` bytes from exactly as many pairs of hexadecimal digits.
+/// Parses `N` bytes from exactly `2 * N` hexadecimal digits.
 #[must_use]
 pub fn hexadecimal<const N: usize>(text: &str) -> Option<[u8; N]> {
     let (pairs, []) = text.as_bytes().as_chunks::<2>() else {
@@ -404,7 +404,8 @@ pub fn hexadecimal<const N: usize>(text: &str) -> Option<[u8; N]> {
     Some(bytes)
 }
 
-/// As names on the wire have to be; the empty one is the root enclave's in some releases.
+/// Returns whether the text satisfies the rules for names on the wire. Some releases announce the
+/// root enclave as an empty string.
 fn is_plain(text: &str) -> bool {
     text.is_empty() || text.len() <= MAX_NAME_LEN && DdsTopic::parse(text).is_ok()
 }

@@ -1,4 +1,4 @@
-//! Nodes, as `ros_discovery_info` announces them.
+//! Nodes, from `ros_discovery_info`.
 
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
@@ -14,7 +14,7 @@ use crate::churn::Event;
 use crate::journal::Journal;
 use crate::names::NodeName;
 
-/// Names of `one` that are not in `other`, each as often as it is missing there.
+/// Returns the names in `one` that `other` lacks, repeated as often as they are missing.
 pub(super) fn difference(one: &[NodeName], other: &[NodeName]) -> Vec<NodeName> {
     let mut rest: Vec<_> = other.to_vec();
     let mut missing = Vec::new();
@@ -28,8 +28,8 @@ pub(super) fn difference(one: &[NodeName], other: &[NodeName]) -> Vec<NodeName> 
 }
 
 impl Discovery {
-    /// `ros_discovery_info`: these are the participant's nodes now. `evidence` is what is known in its
-    /// favour.
+    /// Replaces the nodes of a participant with those of a `ros_discovery_info` sample. `evidence`
+    /// is the priority known for the participant.
     pub fn entities(
         &mut self,
         entities: &ParticipantEntities,
@@ -38,7 +38,7 @@ impl Discovery {
         evidence: Priority,
         journal: &mut Journal,
     ) {
-        // A participant tells of its own nodes only.
+        // A participant announces only its own nodes.
         let prefix = entities.participant.prefix;
         if prefix != writer.prefix {
             return;
@@ -108,7 +108,7 @@ impl Discovery {
         self.pending_nodes.insert(prefix, pending);
     }
 
-    /// How many nodes this participant may have, and how many endpoints these may name.
+    /// Returns how many nodes this participant may have, and how many endpoints they may list.
     fn node_quota(&self, prefix: GuidPrefix) -> (usize, usize) {
         let known: &[Node] = match self.participants.get(&prefix) {
             Some(known) => &known.nodes,

@@ -1,15 +1,14 @@
-//! What came before there was a place for it: endpoints before their participant, and participants
-//! for which there was no room.
+//! Entries that wait: endpoints for their participant, and participants for a free entry.
 //!
-//! Bounded: when full, the oldest entry of the least worth goes. Each step takes logarithmic time,
-//! for every packet of a flood may cause one.
+//! The table is bounded: when it is full, the oldest entry of the lowest priority is dropped. Every
+//! operation takes logarithmic time, since each packet of a flood may cause one.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
 use super::priority::Priority;
 
-/// Entries by key, and in the order in which they go.
+/// Entries by key, and in the order of eviction.
 #[derive(Debug)]
 pub(super) struct PendingTable<K, T> {
     cap: usize,
@@ -26,7 +25,7 @@ struct Entry<T> {
 }
 
 impl<K: Copy + Ord, T> PendingTable<K, T> {
-    /// Empty, for at most `cap` entries.
+    /// Creates an empty table for at most `cap` entries.
     pub(super) const fn new(cap: usize) -> Self {
         Self {
             cap,
@@ -36,7 +35,7 @@ impl<K: Copy + Ord, T> PendingTable<K, T> {
         }
     }
 
-    /// Entries, and places in their order.
+    /// Returns the number of entries and of places in their order.
     pub(super) fn sizes(&self) -> (usize, usize) {
         let Self {
             cap: _,
@@ -47,8 +46,8 @@ impl<K: Copy + Ord, T> PendingTable<K, T> {
         (entries.len(), order.len())
     }
 
-    /// Puts an entry in place of the one with this key; whether one had to go for that, which is
-    /// this one where all others are worth more.
+    /// Inserts or replaces an entry. Returns whether an entry was dropped for it; that is the new
+    /// entry if all others have a higher priority.
     pub(super) fn put(&mut self, key: K, priority: Priority, value: T) -> bool {
         self.remove(&key);
         let is_full = self.entries.len() >= self.cap;
@@ -72,19 +71,19 @@ impl<K: Copy + Ord, T> PendingTable<K, T> {
         is_full
     }
 
-    /// Takes an entry out.
+    /// Removes an entry.
     pub(super) fn remove(&mut self, key: &K) -> Option<(Priority, T)> {
         let entry = self.entries.remove(key)?;
         self.order.remove(&(entry.priority, entry.age, *key));
         Some((entry.priority, entry.value))
     }
 
-    /// What this entry is worth.
+    /// Returns the priority of this entry.
     pub(super) fn priority(&self, key: &K) -> Option<Priority> {
         Some(self.entries.get(key)?.priority)
     }
 
-    /// The keys in this range, each with what its entry is worth.
+    /// Returns the keys in this range with their priorities.
     pub(super) fn range(
         &self,
         keys: RangeInclusive<K>,
@@ -93,14 +92,14 @@ impl<K: Copy + Ord, T> PendingTable<K, T> {
         range.map(|(key, entry)| (*key, entry.priority))
     }
 
-    /// Keeps those that `keep` wants.
+    /// Keeps the entries for which `keep` returns true.
     pub(super) fn retain(&mut self, keep: impl Fn(&K, &T) -> bool) {
         self.entries.retain(|key, entry| keep(key, &entry.value));
         let entries = &self.entries;
         self.order.retain(|(_, _, key)| entries.contains_key(key));
     }
 
-    /// Asks anew what each is worth.
+    /// Recomputes every priority.
     pub(super) fn rate(&mut self, priority: impl Fn(Priority, &T) -> Priority) {
         self.order.clear();
         for (key, entry) in &mut self.entries {
@@ -131,7 +130,7 @@ mod tests {
         assert!(waiting.put(7, Priority::NOTHING, 'g'));
         let left: Vec<_> = waiting.range(0..=9).map(|(key, _)| key).collect();
         assert_eq!((left, waiting.sizes()), (vec![1, 5, 6], (3, 3)));
-        // In its own place it makes nobody go.
+        // Replacing an entry drops no other entry.
         assert!(!waiting.put(5, Priority::NOTHING, 'h'));
         assert_eq!(waiting.priority(&5), Some(Priority::NOTHING));
         waiting.rate(|_, value| {

@@ -1,28 +1,28 @@
-//! What an entry is worth when its table is full.
+//! Priorities of entries in a full table.
 //!
-//! An announcement costs a forger one packet, so a full table is no reason to miss a real newcomer:
-//! who is worth more displaces who is worth less.
+//! An announcement costs a forger one packet, so a full table must not keep out real newcomers:
+//! entries of higher priority displace those of lower priority.
 
-/// What is known in favour of a participant or an endpoint; the first field counts most.
+/// Evidence that a participant or endpoint is real; the first field has the most weight.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Priority {
-    /// Its topic is watched by its exact name; of a participant, that of one of its endpoints.
+    /// Its topic, or the topic of one of the participant's endpoints, is watched by exact name.
     pub watched: bool,
-    /// A socket of this host sends for its participant: no forger elsewhere has one.
+    /// A socket on this host sends for its participant, which a remote forger cannot fake.
     pub local: bool,
     /// Its participant has sent user data.
     pub sends: bool,
 }
 
 impl Priority {
-    /// An announcement and nothing else.
+    /// No evidence but an announcement.
     pub const NOTHING: Self = Self {
         watched: false,
         local: false,
         sends: false,
     };
 
-    /// What either of both has.
+    /// Returns the combined evidence of both.
     #[must_use]
     pub const fn or(self, other: Self) -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! One topic: do its writers and readers understand each other, and has each one somebody?
+//! Examines one topic: which of its writers and readers match, and which have no counterpart.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -16,32 +16,32 @@ use crate::names::TypeName;
 use crate::topic::Topic;
 use crate::topic_kind::TopicKind;
 
-/// Incompatible pairs listed of one topic.
+/// Largest number of incompatible pairs listed per topic.
 const PAIRS_PER_TOPIC: usize = 32;
-/// Types and hashes named in one finding.
+/// Largest number of types and hashes listed in one finding.
 const MAX_NAMED: usize = 16;
 
-/// Looks at topics, with what it has to know of the whole.
+/// Examines topics, with the context that it needs.
 #[derive(Debug)]
 pub(super) struct EndpointExaminer<'a> {
     discovery: &'a Discovery,
     half_known: BTreeSet<DomainId>,
 }
 
-/// An endpoint without a counterpart: a finding once it lasts.
+/// An endpoint without a counterpart; it becomes a finding if that lasts.
 #[derive(Debug)]
 pub(super) struct UnmatchedEndpoint {
     pub(super) guid: Guid,
     pub(super) diagnosis: Diagnosis,
 }
 
-/// Endpoints of one role for which every verdict is the same.
+/// Endpoints of one role that have the same verdict against any endpoint.
 #[derive(Debug)]
 struct Group<'a> {
     message_type: &'a TypeName,
     offer: Offer<'a>,
     members: Vec<Guid>,
-    /// Why they have no counterpart; `None` once they have, or may have.
+    /// Why the group has no counterpart; `None` if it has one or may have one.
     unmatched: Option<Unmatched>,
 }
 
@@ -54,7 +54,7 @@ impl<'a> EndpointExaminer<'a> {
         }
     }
 
-    /// Adds what is found; gives who is alone.
+    /// Adds findings and returns the endpoints without a counterpart.
     pub(super) fn examine(&self, topic: &Topic, findings: &mut Findings) -> Vec<UnmatchedEndpoint> {
         let naming = &topic.naming;
         let key = || TopicKey {
@@ -135,7 +135,7 @@ impl<'a> EndpointExaminer<'a> {
         groups
     }
 
-    /// Are there several types, or several definitions of one?
+    /// Adds findings for several types, or several definitions of one type.
     fn types(&self, topic: &Topic, key: &impl Fn() -> TopicKey, findings: &mut Findings) {
         let mut types: BTreeMap<&TypeName, BTreeSet<TypeHash>> = BTreeMap::new();
         for guid in topic.writers.iter().chain(&topic.readers) {
@@ -160,7 +160,7 @@ impl<'a> EndpointExaminer<'a> {
     }
 }
 
-/// Every kind of writer against every kind of reader.
+/// Compares each group of writers with each group of readers.
 fn compare<'a>(
     writers: &mut [Group<'a>],
     readers: &mut [Group<'a>],
@@ -202,7 +202,7 @@ fn compare<'a>(
         }
     }
     if open > 0 {
-        // Whoever was not looked at may well have somebody.
+        // Groups that were not compared may have a counterpart.
         let groups = writers.iter_mut().chain(readers);
         groups.for_each(|group| group.unmatched = None);
         findings.unexamined += open;
@@ -218,7 +218,7 @@ fn compare<'a>(
     }
 }
 
-/// Names pairs of these two kinds, as far as there is room; gives how many.
+/// Lists pairs of these two groups while the list has room; returns their number.
 fn list(
     writers: &Group<'_>,
     readers: &Group<'_>,
@@ -244,9 +244,9 @@ fn list(
     count
 }
 
-/// Whether somebody should listen and somebody should speak. Not so where every node has an end as
-/// a matter of course, of which most lead nowhere: `/rosout`, `/parameter_events`, a lifecycle
-/// node's `transition_event`, hidden topics, and the topics of services and actions.
+/// Returns whether an endpoint without a counterpart is a problem on this topic. It is not on
+/// topics that every node has anyway: `/rosout`, `/parameter_events`, a lifecycle node's
+/// `transition_event`, hidden topics, and topics of services and actions.
 fn is_about_hearing(topic: &Topic) -> bool {
     let naming = &topic.naming;
     naming.kind == TopicKind::Topic

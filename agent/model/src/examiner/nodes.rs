@@ -1,4 +1,4 @@
-//! Nodes: is a name taken twice, is one node in several domains?
+//! Examines nodes: duplicate names, and nodes in several domains.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::IpAddr;
@@ -10,7 +10,7 @@ use crate::diagnosis::Diagnosis;
 use crate::discovery::{Discovery, Node, Participant};
 use crate::names::NodeName;
 
-/// One node with whom it belongs to.
+/// A node with its participant.
 #[derive(Clone, Copy, Debug)]
 struct HostedNode<'a> {
     prefix: GuidPrefix,
@@ -18,11 +18,11 @@ struct HostedNode<'a> {
     node: &'a Node,
 }
 
-/// Adds what is found.
+/// Adds the findings about nodes.
 pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
     let mut names: BTreeMap<&NodeName, Vec<HostedNode<'_>>> = BTreeMap::new();
     for (prefix, participant) in discovery.participants() {
-        // Who was there before the agent's start and was not heard since may be its own successor.
+        // A restored participant without a packet so far may be an earlier run of the same node.
         if participant.restored.is_some() {
             continue;
         }
@@ -52,9 +52,9 @@ pub(super) fn examine(discovery: &Discovery, findings: &mut Findings) {
     }
 }
 
-/// One node in several domains: its endpoints are announced there, or nodes of its name live there
-/// on the same machine. Robots whose nodes have the same names and whose domains keep them apart
-/// are a fleet as it should be.
+/// Adds nodes that are in several domains: their endpoints are announced in several, or nodes of
+/// the same name run in several on one machine. Equal names on different machines are normal for a
+/// fleet that is separated by domains.
 fn several_domains(
     name: &NodeName,
     nodes: &[HostedNode<'_>],
@@ -97,10 +97,10 @@ impl HostedNode<'_> {
         Guid::new(self.prefix, EntityId::PARTICIPANT)
     }
 
-    /// Domains of its participant and of the endpoints it has.
+    /// Returns the domains of its participant and of its endpoints.
     fn domains(&self, discovery: &Discovery) -> BTreeSet<DomainId> {
         let guids = self.node.writers.iter().chain(&self.node.readers);
-        // Its own participant's are where the participant is.
+        // Endpoints of its own participant are in the participant's domain.
         let foreign = guids.filter(|guid| guid.prefix != self.prefix);
         let endpoints = foreign.filter_map(|guid| discovery.endpoints().get(guid));
         let mut domains: BTreeSet<_> = endpoints.map(|endpoint| endpoint.domain_id).collect();
@@ -108,7 +108,8 @@ impl HostedNode<'_> {
         domains
     }
 
-    /// Its machine: where it is reached. Host names tell less, for robots of a series share them.
+    /// Returns the machine's addresses. Host names do not suffice, since robots of one series share
+    /// them.
     fn machine(&self) -> Option<BTreeSet<IpAddr>> {
         let addresses = &self.participant.addresses;
         let all = addresses.default.iter().chain(&addresses.metatraffic);
@@ -117,7 +118,7 @@ impl HostedNode<'_> {
     }
 }
 
-/// Nodes that `ros2 node list` hides: those of the command line, which come and go.
+/// Returns whether `ros2 node list` hides the node, such as short-lived command-line tools.
 fn is_hidden(node: &Node) -> bool {
     node.name.split('/').any(|token| token.starts_with('_'))
 }

@@ -1,4 +1,4 @@
-//! SPDP, SEDP and `ros_discovery_info` samples, read for discovery.
+//! Parses SPDP, SEDP and `ros_discovery_info` samples for discovery.
 
 use ros2probe_wire::discovery::{self, Role};
 use ros2probe_wire::entities::ParticipantEntities;
@@ -36,7 +36,7 @@ impl Observer {
         }
     }
 
-    /// Reads what is of use to discovery.
+    /// Parses a sample if it is relevant to discovery.
     fn read(&mut self, found: &Found<'_>, sample: Sample<'_>, vendor: VendorId, origin: &Origin) {
         let writer = found.record.writer();
         let stage = match writer.entity {
@@ -75,8 +75,8 @@ impl Observer {
         }
     }
 
-    /// Announced on `ros_discovery_info`, or not announced yet and of its form: the sample is sent
-    /// once, perhaps before the announcement is understood.
+    /// Returns whether a sample is on `ros_discovery_info`, or on an unannounced topic and of the
+    /// same form. It is sent once, perhaps before its writer's announcement is processed.
     fn may_be_entities(&self, found: &Found<'_>, sample: Sample<'_>) -> bool {
         let writer = found.record.writer();
         if sample.status_info() != StatusInfo::ALIVE {
@@ -167,7 +167,7 @@ impl Observer {
         Ok(())
     }
 
-    /// What is known in favour of a participant of which something is announced.
+    /// Returns the known priority of a participant that is announced.
     pub(super) fn evidence(&self, prefix: GuidPrefix) -> Priority {
         Priority {
             watched: false,
@@ -176,7 +176,7 @@ impl Observer {
         }
     }
 
-    /// A participant that is known is reached where it announces.
+    /// Records the announced addresses of a known participant.
     pub(super) fn announce(&mut self, prefix: GuidPrefix) {
         if let Some(participant) = self.discovery.participants().get(&prefix) {
             let addresses = &participant.addresses;

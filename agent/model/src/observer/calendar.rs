@@ -1,4 +1,4 @@
-//! What leaves the model, in the time of the calendar instead of the model's.
+//! Conversion of the model's output from model time to calendar time.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! What time decides: leases, windows, gaps, expectations and diagnosis.
+//! Decisions that depend on time: leases, windows, gaps, expectations and diagnosis.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::expectation::WatchState;
 use crate::rate::Slot;
 
 impl Observer {
-    /// Says what time it is: ends leases, settles gaps, judges expectations.
+    /// Advances the time: expires leases, settles gaps, evaluates expectations.
     pub(super) fn advance(&mut self, now: Timestamp) {
         let now = self.wall_clock.model_time(now);
         if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
@@ -27,7 +27,7 @@ impl Observer {
         }
     }
 
-    /// Nothing more will come: decides what is still open, without letting time pass.
+    /// Makes all open decisions at the end of the input, without elapsed time.
     pub(super) fn settle(&mut self) {
         let graph = graph!(self);
         self.profiler.settle(self.clock, &mut self.journal, graph);
@@ -39,7 +39,7 @@ impl Observer {
         self.examine(self.clock);
     }
 
-    /// Tells the losses of the last second.
+    /// Reports the losses of the last second.
     fn report_losses(&mut self) {
         let discovery = &self.discovery;
         self.journal.events.end_bursts(|burst| {
@@ -107,7 +107,7 @@ impl Observer {
         }
     }
 
-    /// Judges every watched topic under every entry that covers it.
+    /// Evaluates every watched topic under every entry that covers it.
     pub(super) fn judge(&mut self, now: Timestamp) {
         for id in self.topics.ids() {
             let Some(topic) = self.topics.get(id) else {

@@ -1,4 +1,4 @@
-//! What the watchlist and the sample requests select is measured.
+//! Applies the watchlist and the sample requests: the topics that they select are measured.
 
 use std::sync::Arc;
 
@@ -18,9 +18,9 @@ use crate::watch::{Watch, Watchlist};
 use crate::writer::Traits;
 
 impl Observer {
-    /// Watches these from now on, once [`Self::apply_more_lists`] has come to all topics. What was
-    /// counted of a topic that is no more watched stays, and so does how a topic stands with an
-    /// entry that is in the new list as it was.
+    /// Replaces the watchlist. It takes effect once [`Self::apply_more_lists`] has visited all
+    /// topics. Counts of a topic that is no longer watched stay, as do the states of unchanged
+    /// entries.
     pub(super) fn set_watchlist(&mut self, watchlist: Arc<Watchlist>) {
         let before = std::mem::replace(&mut self.watchlist, watchlist);
         let moved = |watch: &Arc<Watch>| {
@@ -37,7 +37,7 @@ impl Observer {
         self.apply_lists_to_all();
     }
 
-    /// Asks about every topic.
+    /// Applies the lists to every topic again.
     pub(super) fn apply_lists_to_all(&mut self) {
         let is_watched = |id: &TopicId| {
             let topic = self.topics.get(*id);
@@ -45,15 +45,14 @@ impl Observer {
         };
         let (watched, others): (Vec<_>, Vec<_>) =
             self.topics.ids().into_iter().partition(is_watched);
-        // First give places back, then hand them out.
+        // Free measuring slots first, then assign them.
         self.pending_topics = others.into_iter().rev().collect();
         self.pending_topics.extend(watched.into_iter().rev());
         self.apply_more_lists();
     }
 
-    /// Asks the watchlist and the sample requests about further topics, as many as take some
-    /// milliseconds. Until a topic's turn comes, what was decided by the lists before holds.
-    /// Returns whether all topics had their turn.
+    /// Applies the lists to further topics, as many as take a few milliseconds. The previous
+    /// decision holds for a topic until its turn. Returns whether all topics are done.
     pub fn apply_more_lists(&mut self) -> bool {
         if self.has_applied_lists() {
             return true;
@@ -72,13 +71,13 @@ impl Observer {
         self.has_applied_lists()
     }
 
-    /// Whether the lists were asked about all topics since they last changed.
+    /// Returns whether the lists were applied to all topics since they last changed.
     #[must_use]
     pub const fn has_applied_lists(&self) -> bool {
         self.pending_topics.is_empty()
     }
 
-    /// Asks the watchlist and the sample requests about a topic and lets its endpoints follow.
+    /// Applies the lists to a topic and its endpoints.
     pub(super) fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
         let displaced = self.topics.apply_lists(
             id,
@@ -94,7 +93,7 @@ impl Observer {
         self.apply_all(id, now);
     }
 
-    /// Lets the endpoints of a topic follow it.
+    /// Applies the decision about a topic to its endpoints.
     fn apply_all(&mut self, id: TopicId, now: Timestamp) {
         let Some(topic) = self.topics.get(id) else {
             return;
@@ -106,7 +105,7 @@ impl Observer {
         }
     }
 
-    /// Decides about one endpoint of a topic.
+    /// Applies the decision about a topic to one endpoint.
     pub(super) fn apply(&mut self, id: TopicId, guid: Guid, now: Timestamp) {
         let Some(topic) = self.topics.get(id) else {
             return;
@@ -156,7 +155,7 @@ impl Observer {
         }
     }
 
-    /// Measures this writer no more; its topic keeps what it had counted.
+    /// Stops measuring this writer; its topic keeps the counts.
     pub(super) fn retire(&mut self, guid: Guid, now: Timestamp) {
         let graph = graph!(self);
         let Some(retired) = self.profiler.stop(guid, now, &mut self.journal, graph) else {
@@ -168,7 +167,7 @@ impl Observer {
         }
     }
 
-    /// Gives free measuring places, and those of vanished topics, to topics that were kept out.
+    /// Assigns free measuring slots, and those of vanished topics, to rejected topics.
     pub(super) fn promote(&mut self) {
         if !self.topics.has_place(self.settings.topics) {
             return;
@@ -187,7 +186,7 @@ impl Observer {
     }
 }
 
-/// Whether somebody wants its samples whole.
+/// Returns whether a subscription requests the payloads of the topic.
 pub(super) fn wants_bytes(topic: &Topic) -> bool {
     let requested = topic.requested.as_ref();
     requested.is_some_and(|requested| !requested.payloads.is_empty())

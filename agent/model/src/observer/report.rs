@@ -1,5 +1,4 @@
-//! Turns the core's state into a [`Snapshot`]: sorted copies, nothing computed that was not
-//! settled before.
+//! Creates a [`Snapshot`] from the core's state: sorted copies of values that are already settled.
 
 mod deliveries;
 
@@ -98,7 +97,7 @@ fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
     facts
 }
 
-/// Which node an endpoint belongs to.
+/// Returns the node of each endpoint.
 fn nodes_of_endpoints(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
     let mut nodes = HashMap::with_capacity(discovery.endpoints().len());
     for participant in discovery.participants().values() {
@@ -176,7 +175,7 @@ fn topic(
     }
 }
 
-/// All that was counted of each measured topic.
+/// Returns all counts of each measured topic.
 pub(super) fn measured(
     observer: &Observer,
     now: Timestamp,
@@ -195,7 +194,7 @@ pub(super) fn measured(
     })
 }
 
-/// What was counted of writers that have gone and of those beside a topic; `None` while it is not
+/// Returns the counts of vanished writers and of buffer topics; `None` for a topic that is not
 /// measured.
 fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measurement>> {
     let mut sum = topic.retired.clone()?;
@@ -207,7 +206,7 @@ fn apart(observer: &Observer, topic: &Topic, now: Timestamp) -> Option<Box<Measu
     Some(sum)
 }
 
-/// Most topics have one endpoint; collecting would make room for four.
+/// Collects with exact capacity: most topics have one endpoint, and `collect` would allocate four.
 fn fitting<T>(length: usize, items: impl Iterator<Item = T>) -> Vec<T> {
     let mut list = Vec::with_capacity(length);
     list.extend(items);
@@ -255,7 +254,7 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
     facts
 }
 
-/// What a participant says of where it lives, and who holds the socket it sends by.
+/// Combines what a participant announces about its process with the owner of its socket.
 fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
     let said = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
         proxy.and_then(|proxy| text(proxy).clone())
@@ -270,8 +269,8 @@ fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> Pr
     }
 }
 
-/// The vendor; without an announcement the GUID tells where it begins with a known one's mark, as
-/// RTPS 2.5, 9.3.1.5 asks for and Fast DDS and Cyclone DDS 0.10 do.
+/// Returns the vendor. Without an announcement it follows from the first bytes of the GUID, as RTPS
+/// 2.5, 9.3.1.5 requires and Fast DDS and Cyclone DDS 0.10 implement.
 fn vendor(guid: Guid, proxy: Option<&ParticipantProxy>) -> Option<VendorId> {
     let [first, second, ..] = guid.prefix.0;
     let marked = VendorId([first, second]);

@@ -1,4 +1,4 @@
-//! Samples for subscriptions: in order, once, or reported as missing.
+//! Samples for subscriptions: in order, once each, or reported as missing.
 
 use std::sync::Arc;
 
@@ -12,9 +12,8 @@ use crate::selection::SampleRequest;
 use crate::writer::Counted;
 
 impl Observer {
-    /// Gives the samples of these requests, and no others, once [`Self::apply_more_lists`] has come
-    /// to all topics. Their topics are measured meanwhile, whether they are watched or not; what
-    /// was counted stays.
+    /// Replaces the sample requests. They take effect once [`Self::apply_more_lists`] has visited
+    /// all topics. Requested topics are measured even without a watch; existing counts stay.
     pub(super) fn set_sample_requests(&mut self, sample_requests: Arc<Vec<SampleRequest>>) {
         self.sample_requests = sample_requests;
         if self.sample_requests.is_empty() {
@@ -23,7 +22,8 @@ impl Observer {
         self.apply_lists_to_all();
     }
 
-    /// The time up to which all samples were given, or told as missing, that have come by `now`.
+    /// Returns the time up to which all samples have been dispatched or reported as missing at
+    /// `now`.
     #[must_use]
     pub fn dispatched_until(&self, now: Timestamp) -> Timestamp {
         let writers = self.payloads.wanted();
@@ -34,7 +34,7 @@ impl Observer {
         })
     }
 
-    /// Gives a sample, when it is its turn, or remembers that it was of an unknown writer.
+    /// Dispatches a sample in its turn, or remembers its number if the writer is unknown.
     pub(super) fn counted(&mut self, writer: Guid, counted: &Counted) {
         if self.sample_requests.is_empty() {
             return;
@@ -44,7 +44,8 @@ impl Observer {
             if known.is_some_and(|known| known.topic.is_none()) {
                 let sample_requests = self.sample_requests.iter().map(|request| request.id);
                 let number = counted.number;
-                // Those that the profiler gave up since the last second make room.
+                // Unknown writers that the profiler has dropped since the last second free their
+                // entries.
                 if self.payloads.unknown_writers() >= self.settings.unknown_writers {
                     let profiler = &self.profiler;
                     self.payloads.retain_unknown_writers(|writer| {
@@ -64,7 +65,7 @@ impl Observer {
         }
     }
 
-    /// Gives a sample that was counted before its writer was announced, now that it comes again.
+    /// Dispatches a retransmitted sample that was first counted before its writer's announcement.
     pub(super) fn came_again(&mut self, writer: Guid, record: &Record) {
         let Some(sample) = record.sample() else {
             return;
@@ -97,7 +98,7 @@ impl Observer {
         }
     }
 
-    /// Gives the samples of this writer whose turn it is.
+    /// Dispatches the samples of this writer whose turn has come.
     pub(super) fn turn(&mut self, writer: Guid, now: Timestamp) {
         let progress = self.profiler.progress(writer, now, graph!(self));
         if let Some(progress) = progress {
@@ -112,7 +113,7 @@ impl Observer {
         }
     }
 
-    /// Keeps the bytes of a sample that somebody wants and that was not counted yet.
+    /// Keeps the payload of a requested sample that is not counted yet.
     pub(super) fn keep(&mut self, found: &Found<'_>) {
         let writer = found.record.writer();
         if self.payloads.wants_bytes(writer) {
@@ -129,7 +130,7 @@ impl Observer {
         }
     }
 
-    /// Tells the subscriptions which samples will not come.
+    /// Reports missing samples to the subscriptions.
     pub(super) fn report_missing(&mut self) {
         for missing in self.journal.take_missing() {
             self.payloads.missing(&missing);

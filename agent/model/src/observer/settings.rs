@@ -1,11 +1,11 @@
-//! Caps and times of the model.
+//! Capacities and times of the model.
 
 use ros2probe_wire::time::SECOND;
 
 use crate::limits::Limits;
 use crate::payloads;
 
-/// Caps and times.
+/// Capacities and times of the model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Settings {
     /// Participants.
@@ -16,21 +16,21 @@ pub struct Settings {
     pub nodes: usize,
     /// Topics that are measured.
     pub topics: usize,
-    /// Writers that send without a known announcement.
+    /// Active writers whose announcement was missed.
     pub unknown_writers: usize,
-    /// Receivers and destinations of all measured writers; likewise sockets.
+    /// Receivers and destinations of all measured writers; also the cap for sockets.
     pub deliveries: usize,
     /// Entries of the kernel's interest map.
     pub interest: usize,
     /// Bytes for the bitmaps of fragmented samples.
     pub sample_bytes: usize,
-    /// Bytes of samples that are put together for those who want them whole.
+    /// Bytes of samples that are reassembled for subscriptions.
     pub payload_bytes: usize,
-    /// Nanoseconds for which a topic without endpoints is still reported.
+    /// Nanoseconds for which a topic without endpoints stays in snapshots.
     pub topic_grace: u64,
-    /// Nanoseconds after which the bytes of samples come at the latest once they are wanted.
+    /// Longest time in nanoseconds from a request for payloads to the first captured payload.
     pub payload_delay: u64,
-    /// Records say who sent: not so those of a capture file.
+    /// Whether records contain the sender; those of a capture file do not.
     pub directed: bool,
 }
 
@@ -54,7 +54,7 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// With the caps of the configuration.
+    /// Returns the defaults with these limits of the configuration.
     #[must_use]
     pub fn with_limits(self, limits: &Limits) -> Self {
         Self {
@@ -63,7 +63,7 @@ impl Settings {
             topics: limits.topics,
             unknown_writers: limits.unknown_writers,
             deliveries: limits.flows,
-            // The other half is for what waits to be read.
+            // The other half is for messages that wait for subscriptions.
             payload_bytes: limits.payload_bytes / 2,
             ..self
         }

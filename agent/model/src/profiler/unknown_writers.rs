@@ -1,4 +1,4 @@
-//! Writers that send without a known announcement: their cap and eviction.
+//! Writers whose announcement was missed: their cap and eviction.
 
 use std::ops::RangeInclusive;
 
@@ -12,23 +12,23 @@ use crate::journal::Journal;
 use crate::receivers::GraphView;
 use crate::writer::{Traits, Writer};
 
-/// What became of the unknown writers.
+/// Changes of unknown writers.
 #[derive(Debug, Default)]
 pub struct UnknownWriters {
-    /// To be metered from now on.
+    /// Writers to meter from now on.
     pub metered: Vec<Guid>,
-    /// Forgotten.
+    /// Writers that were dropped.
     pub forgotten: Vec<Guid>,
 }
 
 impl Profiler {
-    /// Whether one of these writers sends without being announced.
+    /// Returns whether one of these writers sends without an announcement.
     #[must_use]
     pub fn has_unknown_writer(&self, writers: RangeInclusive<Guid>) -> bool {
         self.unknown_writers.range(writers).next().is_some()
     }
 
-    /// Takes in a record of a writer nobody announced.
+    /// Processes a record of a writer without an announcement.
     pub fn unknown_writer(
         &mut self,
         guid: Guid,
@@ -54,7 +54,7 @@ impl Profiler {
         self.record(guid, record, journal, graph)
     }
 
-    /// Forgets the unknown writer that has been silent longest, if it never was anybody.
+    /// Drops the unknown writer with the longest silence, unless it is established.
     fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
         if now < self.search_after {
             return false;

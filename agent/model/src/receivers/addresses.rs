@@ -1,7 +1,7 @@
-//! Who announces which address.
+//! Addresses that participants announce.
 //!
-//! Bounded twice: of one participant the addresses that were announced last are kept, for who
-//! forges its announcements may name a new one each time; of all together likewise.
+//! Two bounds apply, because a forger may announce a new address each time: one per participant and
+//! one in total. The addresses announced last are kept.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -10,11 +10,11 @@ use ros2probe_wire::GuidPrefix;
 use crate::route::Destination;
 use crate::size::Size;
 
-/// All addresses.
+/// All announced addresses.
 #[derive(Debug)]
 pub(super) struct AnnouncedAddresses {
     announcers: HashMap<Destination, Announcer>,
-    /// By the age of the announcement.
+    /// Addresses by the age of the announcement.
     ages: BTreeMap<u64, Destination>,
     /// The same ages, by participant.
     own: BTreeSet<(GuidPrefix, u64)>,
@@ -28,13 +28,13 @@ pub(super) struct AnnouncedAddresses {
 struct Announcer {
     prefix: GuidPrefix,
     previous: Option<GuidPrefix>,
-    /// Two participants announce it in turn.
+    /// Whether two participants announce the address in turn.
     contested: bool,
     age: u64,
 }
 
 impl AnnouncedAddresses {
-    /// None; at most `limit`, and `each` of one participant.
+    /// Creates an empty table of at most `limit` addresses, `each` per participant.
     pub(super) fn new(limit: usize, each: usize) -> Self {
         Self {
             announcers: HashMap::new(),
@@ -47,7 +47,7 @@ impl AnnouncedAddresses {
         }
     }
 
-    /// This participant announces this address; whether an answer may have changed.
+    /// Records an announced address. Returns whether results may have changed.
     pub(super) fn put(&mut self, prefix: GuidPrefix, destination: Destination) -> bool {
         self.age += 1;
         let before = self.announcers.get(&destination).copied();
@@ -86,7 +86,7 @@ impl AnnouncedAddresses {
         before.is_none_or(|before| before.prefix != prefix)
     }
 
-    /// Forgets those of participants that are no more.
+    /// Removes the addresses of participants for which `is_there` returns false.
     pub(super) fn retain(&mut self, is_there: impl Fn(&GuidPrefix) -> bool) {
         self.announcers
             .retain(|_, announcer| is_there(&announcer.prefix));
@@ -96,15 +96,15 @@ impl AnnouncedAddresses {
             .retain(|_, destination| announcers.contains_key(destination));
     }
 
-    /// The participant that alone announces this address.
+    /// Returns the participant that alone announces this address.
     pub(super) fn owner(&self, destination: &Destination) -> Option<GuidPrefix> {
         let announcer = self.announcers.get(destination)?;
         (!announcer.contested).then_some(announcer.prefix)
     }
 
-    /// Entries and cap of every table.
+    /// Returns the size and cap of each table.
     pub(super) fn sizes(&self) -> [Size; 4] {
-        // A new table does not compile before it has a place here.
+        // The destructuring makes a new table fail to compile until it is listed here.
         let Self {
             announcers,
             ages,
@@ -125,7 +125,7 @@ impl AnnouncedAddresses {
         ]
     }
 
-    /// Entries, cap, and addresses given up because of a cap.
+    /// Returns the number of addresses, their cap, and those dropped because of a cap.
     pub(super) fn size(&self) -> (usize, usize, u64) {
         (self.announcers.len(), self.limit, self.evictions)
     }

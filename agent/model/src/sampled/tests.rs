@@ -66,7 +66,7 @@ fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
         [false, false, true, false]
     );
     view.see(3);
-    // Late, but seen after all.
+    // The sample is late but was seen after all.
     let late = SampledUpdate {
         finished: true,
         ..SampledUpdate::default()
@@ -86,13 +86,13 @@ fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
         [1, 2, 3].map(|number| has(&view, number)),
         [true, false, false]
     );
-    // The next one begins before it is whole.
+    // The next sample begins before this one is whole.
     view.part(3, Seen::Part);
     view.part(2, Seen::Whole);
     assert_eq!([2, 3].map(|number| has(&view, number)), [true, false]);
     view.part(3, Seen::Tail);
     view.see(500);
-    // Too long ago to be waited for; what a GAP passes over is not waited for either.
+    // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
     assert!(has(&view, 300) && !has(&view, 499));
     let now = Timestamp(view.now);
     view.sampled.skip((501, 503), FAR, now, &mut view.sequence);
@@ -117,11 +117,11 @@ fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
     assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 2);
     assert_eq!(view.sampled.exist(6, FAR, now, &mut view.sequence), 0);
     assert_eq!(view.counts(), (1, 3));
-    // 8 was sent, 9 to 11 were not.
+    // Sample 8 was sent, 9 to 11 were not.
     assert_eq!(view.sampled.skip((9, 12), FAR, now, &mut view.sequence), 1);
     assert_eq!(view.counts(), (1, 4));
     let update = view.see(12);
-    // With 6 and 7 and 8, whose size is not known either.
+    // The update includes 6, 7 and 8, whose sizes are not known either.
     assert_eq!((update.samples, update.alike), (1, 4));
     view.see(7);
     assert_eq!(view.counts(), (3, 5));
@@ -166,17 +166,17 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     assert_eq!(settle(&mut view), []);
     view.see(5);
     assert!(view.sampled.unseen_since().is_some());
-    // It may still come until the next look.
+    // The sample may still arrive until the next tick.
     assert_eq!(settle(&mut view), []);
     assert!(view.see(3).finished);
     assert_eq!(settle(&mut view), [(2, 2), (4, 4)]);
     assert_eq!(view.sampled.unseen_since(), None);
     assert!(!view.see(4).finished, "given after it was left out");
-    // A part is nothing, and neither is what a HEARTBEAT says was sent.
+    // Neither a part of a sample nor a HEARTBEAT makes it seen.
     view.part(6, Seen::Part);
     let now = Timestamp(view.now);
     view.sampled.exist(8, FAR, now, &mut view.sequence);
-    // What a GAP says was never sent is not missing.
+    // Numbers skipped by a GAP are not missing.
     view.sampled.skip((9, 200), FAR, now, &mut view.sequence);
     assert_eq!(settle(&mut view), [(6, 8)]);
     assert_eq!(settle(&mut view), []);
@@ -194,7 +194,7 @@ fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
     view.see(1);
     view.see(3);
     view.sampled.end();
-    // It may still come, and is left out when the view begins again.
+    // The sample may still arrive; it is skipped when the view begins again.
     assert_eq!(view.sampled.take_unseen(), []);
     assert!(view.sampled.awaits(2) && !view.sampled.awaits(3));
     let now = Timestamp(view.now);
@@ -213,7 +213,7 @@ fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
     for number in 1..=6 {
         view.see(number);
     }
-    // Each counts alone until the jump is believed; then all that it passed over count, too.
+    // Each counts alone until the jump is confirmed; then the skipped numbers count, too.
     let samples: Vec<_> = (1..=6).map(|n| view.see(1_000_000 + n).samples).collect();
     assert_eq!(samples, [1, 1, 1, 1, 999_995, 1]);
     assert_eq!(view.losses(), []);

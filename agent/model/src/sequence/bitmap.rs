@@ -1,6 +1,6 @@
-//! Bits by sequence number.
+//! A bitmap by sequence number.
 
-/// A ring of bits, a power of two of them, addressed by sequence number.
+/// A ring of bits, addressed by sequence number. Its length is a power of two.
 #[derive(Debug, Default)]
 pub(super) struct Bitmap {
     pub(super) words: Vec<u64>,
@@ -45,7 +45,7 @@ impl Bitmap {
         self.each_word(start, end, |word, mask| *word &= !mask);
     }
 
-    /// Word by word, for a HEARTBEAT may excuse thousands of numbers, and so may the next one.
+    /// Changes whole words, since each HEARTBEAT may excuse thousands of numbers.
     fn each_word(&mut self, start: u64, end: u64, change: impl Fn(&mut u64, u64)) {
         let end = end.min(start.saturating_add(self.len()));
         let mut number = start;

@@ -1,4 +1,4 @@
-//! Which run of numbers is the writer's: the live one, or one that further datagrams confirm.
+//! The writer's run of numbers: the live one, or another that further datagrams confirm.
 
 use ros2probe_wire::Timestamp;
 
@@ -6,9 +6,8 @@ use super::unconfirmed::{CONFIRMATIONS, Run};
 use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled, is_number};
 
 impl Sequence {
-    /// Looks at number and source time of a sample before anything else does: a writer that jumps,
-    /// or begins anew under its old GUID, is recognised here. Numbers up to `reach` ahead are not
-    /// unconfirmed.
+    /// Checks number and source time of a sample before any other processing, to recognise a writer
+    /// that jumps or restarts under its GUID. Numbers up to `reach` ahead belong to the live run.
     pub fn recognise(
         &mut self,
         number: u64,
@@ -46,7 +45,7 @@ impl Sequence {
         RunMembership::Live
     }
 
-    /// Whether a sample of this number and source time does not belong to the live run.
+    /// Returns whether a sample with this number and source time is outside the live run.
     #[must_use]
     pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
         if !self.started() || !is_number(number) {
@@ -58,30 +57,30 @@ impl Sequence {
         let newer = source.is_some_and(|source| {
             self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
         });
-        // A writer that begins anew fills no gaps of the run before.
+        // A restarted writer fills no gaps of its previous run.
         let unconfirmed = self.unconfirmed.as_ref();
         let continues =
             || unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_continued(number, self.next));
-        // What came first may have been forged just as well; what lies less far below it is
-        // history.
+        // The first samples may have been forged as well, so a lower number far away is
+        // unconfirmed. A number closer below is history.
         let is_young = self.followed < CONFIRMATIONS;
         newer && (self.has(number) || continues()) || is_young && self.next - number > FAR
     }
 
-    /// Marks a unconfirmed sample as whole. Returns whether that is new.
+    /// Marks an unconfirmed sample as whole. Returns whether that is new.
     pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
         let unconfirmed = self.unconfirmed.as_mut();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
     }
 
-    /// Whether a unconfirmed sample came whole.
+    /// Returns whether an unconfirmed sample arrived whole.
     #[must_use]
     pub fn has_unconfirmed(&self, number: u64) -> bool {
         let unconfirmed = self.unconfirmed.as_ref();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
     }
 
-    /// Takes in the samples of a run that is believed.
+    /// Records the samples of a confirmed run.
     pub fn accept(&mut self, run: &Run, now: Timestamp, settled: &mut impl FnMut(Settled)) {
         for &(number, is_whole) in &run.numbers {
             self.exists(number, now, settled);
@@ -93,7 +92,7 @@ impl Sequence {
         self.excuse(start, end);
     }
 
-    /// The unconfirmed run is the writer's: the numbers jump there, or begin anew.
+    /// Makes the unconfirmed run live: the numbers jump to it or restart.
     pub(super) fn confirm(&mut self) -> Run {
         let unconfirmed = self.unconfirmed.take();
         let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
@@ -101,7 +100,7 @@ impl Sequence {
             return run;
         };
         let jump = first.checked_sub(self.next);
-        // What was hardly seen before lost nothing that is far from it.
+        // A run of only a few samples has no losses far from it.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,
             false => MAX_JUMP,
@@ -112,7 +111,7 @@ impl Sequence {
         run
     }
 
-    /// The live run went on.
+    /// Records that the live run continued.
     pub(super) fn contradict(&mut self) {
         if let Some(unconfirmed) = &mut self.unconfirmed {
             unconfirmed.contradict();

@@ -1,4 +1,4 @@
-//! HEARTBEAT, GAP and ACKNACK: which numbers exist, and which readers miss (RTPS 2.5, 8.3.8).
+//! HEARTBEAT, GAP and ACKNACK: existing numbers, and those that readers miss (RTPS 2.5, 8.3.8).
 
 use ros2probe_wire::Timestamp;
 
@@ -6,8 +6,8 @@ use super::unconfirmed::Run;
 use super::{FAR, MAX_JUMP, REACH, Sequence, Settled};
 
 impl Sequence {
-    /// HEARTBEAT: the writer has `first..=last`. It will send nothing below `first` again; all up
-    /// to `last` exist.
+    /// Processes a HEARTBEAT: the writer has `first..=last`. It sends nothing below `first` again,
+    /// and all numbers up to `last` exist.
     pub fn heartbeat(
         &mut self,
         first: u64,
@@ -37,8 +37,8 @@ impl Sequence {
         }
     }
 
-    /// Takes in a HEARTBEAT's lastSN, `next - 1`. Returns whether it is believed, and the
-    /// unconfirmed run that it confirms.
+    /// Processes a HEARTBEAT's lastSN, `next - 1`. Returns whether it is confirmed, and the run
+    /// that it confirms.
     pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
         let live = self.next;
         let unconfirmed = self.unconfirmed.as_mut();
@@ -60,15 +60,15 @@ impl Sequence {
         (false, None)
     }
 
-    /// Whether an ACKNACK acknowledges numbers that are not known to exist.
+    /// Returns whether an ACKNACK acknowledges numbers that are not known to exist.
     pub const fn refuses(&mut self, base: u64) -> bool {
         let refuses = self.started() && base.saturating_sub(self.next) > FAR;
         self.jumps += refuses as u64;
         refuses
     }
 
-    /// ACKNACK: the readers have all below `base`, also what was not seen here, except samples that
-    /// the writer had withdrawn before.
+    /// Processes an ACKNACK: the readers have all numbers below `base`, even unseen ones, except
+    /// samples that the writer had withdrawn before.
     pub fn acknowledged(&mut self, base: u64) {
         if self.started() {
             self.excuse(self.available, base);
@@ -76,7 +76,7 @@ impl Sequence {
         }
     }
 
-    /// GAP: `start..base` and some numbers from there on will never come.
+    /// Processes a GAP: `start..base` and some numbers after it will never arrive.
     pub fn gap(
         &mut self,
         start: u64,
@@ -113,7 +113,7 @@ impl Sequence {
         }
     }
 
-    /// ACKNACK: a reader asks for these again.
+    /// Processes an ACKNACK in which a reader requests these numbers again.
     pub fn requested(&mut self, mut set: impl Iterator<Item = u64>) {
         if self.gaps.is_empty() {
             return;
@@ -127,7 +127,7 @@ impl Sequence {
         }
     }
 
-    /// Nothing in `start..end` is a loss.
+    /// Excuses `start..end`, so that no number in it is lost.
     pub fn excuse(&mut self, start: u64, end: u64) {
         let start = start.max(self.floor()).max(self.settled);
         self.excused.set_all(start, end.min(self.next));

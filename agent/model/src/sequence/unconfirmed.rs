@@ -1,46 +1,46 @@
-//! Numbers away from a writer's live run: a jump, a restart, or a forgery.
+//! Numbers outside a writer's live run: a jump, a restart, or a forgery.
 //!
-//! One datagram proves nothing. The run is believed after a handful of datagrams that continue it
-//! while the live run stands still, or after a HEARTBEAT of a later datagram that agrees.
+//! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
+//! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
 
 use ros2probe_wire::Timestamp;
 
 use super::FAR;
 
-/// So many datagrams make a run believed.
+/// Number of datagrams that confirm a run.
 pub(super) const CONFIRMATIONS: u8 = 5;
-/// Numbers remembered of one run: a datagram may bring several.
+/// Largest number of samples remembered per run; a datagram may contain several.
 const KEPT: usize = 32;
-/// Copies of one datagram reach several sockets within this time.
+/// Copies of one datagram arrive at several sockets within this time.
 const COPIES: i64 = 5_000_000;
 
-/// The run, and what HEARTBEAT and GAP say beyond what is believed of them at once.
+/// The run, and unconfirmed claims of HEARTBEATs and GAPs.
 #[derive(Debug, Default)]
 pub(super) struct UnconfirmedRun {
     run: Run,
-    /// Datagrams that continued it since the live run last went on.
+    /// Number of datagrams that continued the run since the live run last did.
     evidence: u8,
-    /// The first and the last of them.
+    /// Times of the first and last of them.
     since: Timestamp,
     latest: Timestamp,
-    /// One past lastSN of a HEARTBEAT, and when it came.
+    /// The number after lastSN of a HEARTBEAT, and its time.
     claim: (u64, Timestamp),
 }
 
-/// Samples that were counted before their numbers were believed.
+/// Samples that were counted before their numbers were confirmed.
 #[derive(Clone, Debug, Default)]
 pub struct Run {
-    /// Numbers, and whether the sample came whole; in ascending order once believed.
+    /// Numbers, and whether each sample is whole; sorted once confirmed.
     pub numbers: Vec<(u64, bool)>,
-    /// What a GAP passed over on the way there.
+    /// Numbers that a GAP skipped before the run.
     pub(super) gap: (u64, u64),
 }
 
 impl UnconfirmedRun {
-    /// Most numbers that there may be.
+    /// Largest number of samples.
     pub(super) const CAP: usize = KEPT;
 
-    /// Numbers of the run.
+    /// Returns the number of samples.
     pub(super) const fn len(&self) -> usize {
         let Self {
             run,
@@ -53,7 +53,7 @@ impl UnconfirmedRun {
         numbers.len()
     }
 
-    /// Takes in the number of a sample. Returns whether it opens a run, and whether it is new.
+    /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
     pub(super) fn note(&mut self, number: u64, now: Timestamp) -> (bool, bool) {
         let numbers = &self.run.numbers;
         if numbers.iter().any(|(known, _)| *known == number) {
@@ -89,7 +89,7 @@ impl UnconfirmedRun {
         !std::mem::replace(is_whole, true)
     }
 
-    /// Whether this number continues a run below `live`.
+    /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: u64, live: u64) -> bool {
         let last = self.run.numbers.last().filter(|_| self.evidence > 0);
         last.is_some_and(|(last, _)| *last < live && last.abs_diff(number) <= FAR)
@@ -103,14 +103,14 @@ impl UnconfirmedRun {
         self.evidence >= CONFIRMATIONS
     }
 
-    /// The live run went on: the evidence counts from zero again.
+    /// Resets the evidence, because the live run continued.
     pub(super) const fn contradict(&mut self) {
         self.evidence = 0;
         self.claim = (0, Timestamp(0));
     }
 
-    /// Whether a HEARTBEAT with lastSN `next - 1` confirms the run. The live run's next number
-    /// is `live`. A run below `live` is not confirmed by a HEARTBEAT that reaches it.
+    /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
+    /// live run's next number. A HEARTBEAT that reaches `live` never confirms a run below it.
     pub(super) fn agrees(&self, next: u64, live: u64, now: Timestamp) -> bool {
         let end = self.end();
         let is_ahead = end > live;
@@ -120,7 +120,7 @@ impl UnconfirmedRun {
             && (is_ahead || next < live)
     }
 
-    /// Whether an earlier HEARTBEAT had the same lastSN, or one at most `reach` lower.
+    /// Returns whether an earlier HEARTBEAT had the same lastSN, or one lower by at most `reach`.
     pub(super) fn is_claimed(&mut self, next: u64, reach: u64, now: Timestamp) -> bool {
         let (claimed, at) = self.claim;
         let is_same = claimed > 0 && (claimed..=claimed.saturating_add(reach)).contains(&next);
@@ -130,12 +130,12 @@ impl UnconfirmedRun {
         is_same && now.nanoseconds_since(at) >= COPIES
     }
 
-    /// Keeps what a GAP passes over.
+    /// Records the numbers that a GAP skips.
     pub(super) const fn pass_over(&mut self, start: u64, end: u64) {
         self.run.gap = (start, end);
     }
 
-    /// The samples that came, in ascending order.
+    /// Returns the samples that arrived, in ascending order.
     pub(super) fn into_run(self) -> Run {
         let mut run = self.run;
         run.numbers.sort_unstable();
@@ -144,13 +144,13 @@ impl UnconfirmedRun {
             .first()
             .is_none_or(|(first, _)| run.gap.1 > *first)
         {
-            // It contradicts the samples that came.
+            // The GAP contradicts the samples that arrived.
             run.gap = (0, 0);
         }
         run
     }
 
-    /// One past its highest number.
+    /// Returns the highest number of the run, plus one.
     fn end(&self) -> u64 {
         let numbers = self.run.numbers.iter();
         numbers.map(|(number, _)| number + 1).max().unwrap_or(0)
@@ -168,7 +168,7 @@ mod tests {
             assert_eq!(unconfirmed.note(number, Timestamp(1)), (number == 1, true));
         }
         assert_eq!(unconfirmed.len(), UnconfirmedRun::CAP);
-        // It counts again.
+        // The evidence counts again.
         assert_eq!(unconfirmed.note(1, Timestamp(1)), (false, true));
         assert_eq!(unconfirmed.note(100, Timestamp(1)), (false, false));
         assert_eq!(unconfirmed.evidence, 1);

@@ -1,4 +1,4 @@
-//! What became of a writer's samples on the way to each of its receivers.
+//! Fate of a writer's samples on the way to each of its receivers.
 
 use std::cmp::Ordering;
 use std::fmt;
@@ -11,51 +11,51 @@ use crate::measurement::Delivered;
 use crate::names::NodeName;
 use crate::route::Direction;
 
-/// One writer's samples to one receiver, or to one destination where they were seen leaving.
+/// Samples from one writer to one receiver, or to one destination for outgoing samples.
 #[derive(Clone, Debug)]
 pub struct DeliveryFacts {
-    /// Whose samples.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// Leaving or arriving.
+    /// Outgoing or incoming.
     pub direction: Direction,
-    /// Where new samples are sent to; retransmissions may come another way.
+    /// Destination of new samples; retransmissions may use another.
     pub destination: SocketAddr,
-    /// The receiver, in a form that stays.
+    /// The receiver, in a stable form.
     pub subscriber: Subscriber,
-    /// The participant that receives, when it is known.
+    /// The receiving participant, if known.
     pub participant: Option<Guid>,
     /// Readers of the topic in that participant, sorted.
     pub readers: Vec<Guid>,
-    /// Their nodes, sorted, each once.
+    /// Nodes of these readers, sorted and without duplicates.
     pub nodes: Vec<NodeName>,
-    /// Cookies of the sockets by which samples came, sorted; empty for a wire source.
+    /// Cookies of the receiving sockets, sorted; empty for a wire source.
     pub sockets: Vec<u64>,
-    /// Process of the receiving (or sending) socket.
+    /// Process that owns the receiving (or sending) socket.
     pub process_id: Option<u32>,
-    /// Its name.
+    /// Name of that process.
     pub process: Option<Arc<str>>,
     /// Control group of that socket, as a path below the root.
     pub cgroup: Option<Arc<str>>,
-    /// First record.
+    /// Time of the first record.
     pub first_seen: Timestamp,
-    /// Last record.
+    /// Time of the last record.
     pub last_seen: Timestamp,
-    /// What became of the samples.
+    /// Fate of the samples.
     pub delivered: Delivered,
 }
 
-/// Who receives, as far as it is known. Printed as `participant GUID`, `process ID`, `socket
-/// COOKIE` or nothing, and in the order of that text.
+/// The receiver, as far as it is known. It is displayed as `participant GUID`, `process ID`,
+/// `socket COOKIE` or empty text, and sorted by that text.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Subscriber {
-    /// Nothing tells receivers of this destination apart.
+    /// Receivers of this destination cannot be distinguished.
     #[default]
     Unknown,
-    /// This participant.
+    /// A participant.
     Participant(Guid),
-    /// The process of this id.
+    /// A process, by its id.
     Process(u32),
-    /// The socket with this cookie.
+    /// A socket, by its cookie.
     Socket(u64),
 }
 
@@ -72,7 +72,7 @@ impl fmt::Display for Subscriber {
 
 impl Ord for Subscriber {
     fn cmp(&self, other: &Self) -> Ordering {
-        // Decimal numbers of different lengths stand in the order of their digits.
+        // Decimal numbers of different lengths are compared digit by digit.
         match (self, other) {
             (Self::Unknown, Self::Unknown) => Ordering::Equal,
             (Self::Participant(one), Self::Participant(other)) => one.cmp(other),
@@ -100,27 +100,27 @@ impl Subscriber {
     }
 }
 
-/// What one reliable reader acknowledged to one writer.
+/// State of acknowledgement between a reliable reader and a writer.
 #[derive(Clone, Debug)]
 pub struct AcknowledgementFacts {
-    /// To whom.
+    /// GUID of the writer.
     pub writer: Guid,
-    /// By whom.
+    /// GUID of the reader.
     pub reader: Guid,
     /// The reader's node.
     pub node: Option<NodeName>,
-    /// All samples up to this one are acknowledged; 0 = none.
+    /// All samples up to this number are acknowledged; 0 for none.
     pub acknowledged: u64,
-    /// Samples that the reader asked for in its last ACKNACK.
+    /// Samples that the reader requested in its last ACKNACK.
     pub missing: u64,
-    /// Samples asked for again since the start, every request counted.
+    /// Samples requested again since the start, counted per request.
     pub requested: u64,
-    /// ACKNACKs seen.
+    /// Number of ACKNACKs.
     pub acknacks: u64,
-    /// Samples that exist and are not acknowledged.
+    /// Samples that exist but are not acknowledged.
     pub lag_samples: u64,
-    /// Age of the oldest of them, seconds; 0 when there is none, `None` when it is too old to know.
+    /// Age in seconds of the oldest such sample; 0 without one, `None` if it is no longer known.
     pub lag_seconds: Option<f64>,
-    /// Last ACKNACK.
+    /// Time of the last ACKNACK.
     pub last_seen: Timestamp,
 }

@@ -1,5 +1,5 @@
-//! What time and discovery do to deliveries: gaps settle, sockets get owners, receivers come and
-//! go.
+//! Effects of time and discovery on deliveries: gaps settle, sockets get owners, receivers appear
+//! and vanish.
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
@@ -10,11 +10,11 @@ use crate::delivery::{Delivery, Receiver, Totals};
 use crate::receivers::{Matched, readers};
 use crate::route::Route;
 
-/// A route by which nothing came for so long is forgotten, unless a reader is known at its end.
+/// A route is dropped after this long without a record, unless it leads to a known reader.
 const FORGET: u64 = 60 * SECOND;
 
 impl Subscribers {
-    /// Settles what has waited long enough and forgets what has been silent for long.
+    /// Settles samples whose waiting time is over, and drops routes that have been silent for long.
     pub fn advance(&mut self, context: &mut WriterContext<'_>) {
         self.refresh(context);
         let now = context.now;
@@ -34,7 +34,7 @@ impl Subscribers {
         }
     }
 
-    /// Settles everything: nothing more will come.
+    /// Settles all samples at the end of the input.
     pub fn settle(&mut self, context: &mut WriterContext<'_>) {
         self.expect(context, true);
         for delivery in &mut self.deliveries {
@@ -46,19 +46,19 @@ impl Subscribers {
         }
     }
 
-    /// Settles everything, gives back the room and tells what was counted.
+    /// Settles all samples, returns the quota, and returns the counts.
     pub fn stop(mut self, context: &mut WriterContext<'_>) -> Totals {
         self.settle(context);
         context.quota.used = context.quota.used.saturating_sub(self.deliveries.len());
         self.totals
     }
 
-    /// When each delivery was last heard of that nobody would miss, for making room.
+    /// Returns the time of the last record of each delivery that can be dropped for a new one.
     pub fn silent_since(&self) -> impl Iterator<Item = Timestamp> + '_ {
         self.deliveries.iter().map(|delivery| delivery.seen().1)
     }
 
-    /// Gives up the deliveries that were last heard of by then, at most `count`; how many.
+    /// Drops at most `count` deliveries whose last record is not after this time; returns how many.
     pub fn give_up(
         &mut self,
         until: Timestamp,
@@ -75,7 +75,7 @@ impl Subscribers {
         count - left
     }
 
-    /// Looks whether what left this host for a receiver on it has arrived.
+    /// Checks whether samples that left this host for a local receiver have arrived.
     fn expect(&mut self, context: &mut WriterContext<'_>, no_more: bool) {
         if !self.totals.seen[1] || !self.totals.seen[0] {
             return;
@@ -130,7 +130,7 @@ impl Subscribers {
         }
     }
 
-    /// What came by this route so far was seen on a wire; from now on it is seen at a socket.
+    /// Begins to observe a route at a socket that was observed on a wire so far.
     pub(super) fn uncover(&mut self, route: Route, context: &mut WriterContext<'_>) {
         self.at_socket = true;
         let destination = route.destination;
@@ -142,7 +142,7 @@ impl Subscribers {
         }
     }
 
-    /// Finds out anew who is where, if anything changed.
+    /// Updates the receivers of all routes if the facts have changed.
     pub(super) fn refresh(&mut self, context: &mut WriterContext<'_>) {
         let (graph, topic) = (context.graph, context.topic());
         if self.generation == graph.receivers.generation() {
@@ -184,7 +184,7 @@ impl Subscribers {
             .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
     }
 
-    /// Puts routes together that turned out to lead to one participant.
+    /// Merges the deliveries of routes that lead to the same participant.
     fn identify(&mut self, context: &mut WriterContext<'_>) {
         let mut index = 0;
         while let Some(delivery) = self.deliveries.get(index) {
@@ -226,7 +226,7 @@ impl Subscribers {
         self.count_open();
     }
 
-    /// Gives up deliveries to which no route leads any more.
+    /// Drops deliveries without a route.
     fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
         let led_to: Vec<_> = self
             .deliveries()
@@ -262,7 +262,7 @@ impl Subscribers {
     }
 }
 
-/// Whether readers are known there and none of them is reliable.
+/// Returns whether the receiver has known readers, all of them best effort.
 pub(super) fn is_best_effort(receiver: Receiver, context: &WriterContext<'_>) -> bool {
     let (Receiver::Participant(prefix), Some(topic)) = (receiver, context.topic()) else {
         return false;

@@ -1,4 +1,4 @@
-//! HEARTBEAT, GAP and ACKNACK handling, and datagrams that the kernel did not reassemble.
+//! HEARTBEAT, GAP and ACKNACK handling, and datagrams that failed IP reassembly.
 
 use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
@@ -10,7 +10,7 @@ use crate::route::Destination;
 use crate::routes::KnownRoute;
 
 impl Subscribers {
-    /// A HEARTBEAT came by this route.
+    /// Processes a HEARTBEAT on this route.
     pub(super) fn heartbeat(
         &mut self,
         index: usize,
@@ -21,7 +21,7 @@ impl Subscribers {
         let Some(known) = self.routes.get(index) else {
             return;
         };
-        // It goes where data goes, unless a reader is known to be there.
+        // Without a known reader, the route must have carried samples.
         let holds = known.has_data || matched == Matched::Yes;
         let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
         let opens =
@@ -39,7 +39,7 @@ impl Subscribers {
         }
     }
 
-    /// A GAP came by this route.
+    /// Processes a GAP on this route.
     pub(super) fn gap(
         &mut self,
         index: usize,
@@ -63,7 +63,7 @@ impl Subscribers {
         }
     }
 
-    /// A reader asks for samples again: what fills its gaps from now on is a retransmission.
+    /// Processes a request of a reader: samples that fill its gaps afterwards are retransmissions.
     pub(super) fn requested(&mut self, acknack: AckNack<'_>) {
         let reader = acknack.record().reader().prefix;
         for delivery in &mut self.deliveries {
@@ -73,8 +73,8 @@ impl Subscribers {
         }
     }
 
-    /// A reader has all below the base of this ACKNACK. A delivery is its participant's: what all
-    /// of its readers have came there, whether it was seen or not.
+    /// Processes an acknowledgement. A delivery belongs to a participant: samples that all of its
+    /// readers have did arrive, even if they were not seen.
     pub(super) fn acknowledged(&mut self, acknack: AckNack<'_>) {
         let prefix = acknack.record().reader().prefix;
         let below = self.acknowledgements.floor(|guid| guid.prefix == prefix);
@@ -90,7 +90,7 @@ impl Subscribers {
         }
     }
 
-    /// The kernel gave up on some IP fragments of a datagram with this.
+    /// Processes a sample in a datagram that failed IP reassembly.
     pub(super) fn not_reassembled(&mut self, sample: Sample<'_>, context: &mut WriterContext<'_>) {
         self.reassembled = true;
         let record = sample.record();

@@ -23,7 +23,7 @@ fn data(number: u64, time: u64, flags: u16) -> Record {
     }
 }
 
-/// `count` of ten fragments.
+/// Returns a record of `count` of ten fragments.
 fn fragments(number: u64, start: u32, count: u32, time: u64, elapsed: u32) -> Record {
     Record {
         kind: kind::DATA_FRAG,
@@ -66,7 +66,7 @@ fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     tracer.take().spans
 }
 
-/// The same, and what time brings.
+/// Returns the spans of these records, including those that time completes.
 fn take_all(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     let mut spans = take(tracer, records, ratio);
     tracer.advance(Timestamp(SECOND));
@@ -88,7 +88,7 @@ fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_rea
             fragments(5, 1, 4, 1_300, 300),
             fragments(5, 9, 2, 1_800, 50),
             fragments(5, 5, 4, 1_900, 40),
-            // Again, to another destination, and a copy that arrives on this host.
+            // The sample leaves for another destination, and a copy arrives on this host.
             fragments(5, 1, 4, 2_000, 10),
             data(5, 2_100, 0),
             acknack(reader(1), 5, 2_200),
@@ -218,7 +218,7 @@ fn nobody_is_asked_about_a_writer_twice() {
     for number in 1..=3 {
         tracer.record(&data(number, number, 0), || {
             asked += 1;
-            // At first discovery does not know it.
+            // Discovery does not know the writer at first.
             (asked > 1).then(|| (description(), 0.0))
         });
     }

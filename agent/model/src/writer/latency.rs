@@ -1,4 +1,4 @@
-//! Latencies of a writer's samples: since they were written, and since their header's stamp.
+//! Latencies of a writer's samples since INFO_TS and since their header's stamp.
 
 use ros2probe_wire::{RtpsTime, Timestamp};
 

@@ -1,4 +1,4 @@
-//! A writer seen in shared memory, where polls miss messages.
+//! Measurement of a writer in shared memory, where polling misses messages.
 
 use ros2probe_wire::record::{Body, Sample, flag};
 use ros2probe_wire::{Record, Timestamp};
@@ -10,7 +10,7 @@ use crate::sampled::{Sampled, SampledUpdate, Seen};
 use crate::samples::Budget;
 
 impl Writer {
-    /// Leaves samples for the journal that were sent and not seen.
+    /// Reports samples to the journal that were sent but not seen.
     pub(super) fn leave_unseen(&mut self, journal: &mut Journal) {
         let unseen = self.sampled.as_mut().map(|sampled| sampled.take_unseen());
         for (first, last) in unseen.into_iter().flatten() {
@@ -23,7 +23,7 @@ impl Writer {
         }
     }
 
-    /// Whether it is of a sample that was under way when the sampled view ended.
+    /// Returns whether the sample was pending when the sampled view ended.
     pub(super) fn is_under_way(&self, sample: Sample<'_>) -> bool {
         let (number, at) = (sample.sequence_number(), record_time(sample.record()));
         self.sampled
@@ -36,7 +36,7 @@ impl Writer {
         sampled.is_some_and(|sampled| sampled.is_current(now))
     }
 
-    /// Takes in a record of a view in which what is missing may have been sent all the same.
+    /// Processes a record of a view in which missing samples may still have been sent.
     pub(super) fn sampled_record(
         &mut self,
         record: &Record,
@@ -72,7 +72,7 @@ impl Writer {
                 sampled.exist(heartbeat.last(), reach, now, sequence)
             }
             Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
-            // The reader has all below.
+            // The reader has all samples below this number.
             Body::AckNack(acknack) => {
                 sampled.exist(acknack.base().saturating_sub(1), reach, now, sequence)
             }
@@ -83,7 +83,7 @@ impl Writer {
         None
     }
 
-    /// What a sample, or a part of one, changes in the sampled view.
+    /// Applies a sample, or a part of one, to the sampled view.
     fn sampled_update(
         &mut self,
         sample: Sample<'_>,
@@ -105,7 +105,7 @@ impl Writer {
         let is_exact = sample.record().flags & flag::EXACT != 0;
         let seen = match is_whole {
             true => Seen::Whole,
-            // What is read in shared memory may come after what is seen in the process.
+            // Polling shared memory may yield a sample after the uprobe did.
             false if sample.is_end() && !is_exact => Seen::Tail,
             false => Seen::Part,
         };
@@ -113,8 +113,7 @@ impl Writer {
         Some(sampled.sample((number, seen, source), reach, now, sequence))
     }
 
-    /// Takes in a part of a sample that was under way when the sampled view ended, by whatever way
-    /// it comes.
+    /// Processes a part of a sample that was pending when the sampled view ended, from any source.
     pub(super) fn catch_up(
         &mut self,
         sample: Sample<'_>,
@@ -140,7 +139,7 @@ impl Writer {
         (now, wall_clock): (Timestamp, Timestamp),
     ) -> Option<Counted> {
         let (number, is_message) = (sample.sequence_number(), sample.is_message());
-        // Those that were not seen are taken for as large as the next one that was.
+        // Unseen samples are assumed to have the size of the next one that is seen.
         let disposals = u64::from(!is_message && update.samples > 0);
         let messages = update.samples - disposals;
         let bytes = u64::from(sample.size());

@@ -5,7 +5,7 @@ use super::*;
 
 const START: u64 = 1_795_143_000 * SECOND;
 
-/// One writer with everything around it, in virtual time.
+/// A writer with its context, in virtual time.
 struct Bench {
     writer: Writer,
     budget: Budget,
@@ -30,7 +30,7 @@ impl Bench {
         self
     }
 
-    /// As [`Self::put`]: what it completed.
+    /// Processes a record as [`Self::put`] does, and returns the completed message.
     fn take(&mut self, record: Record) -> Option<Counted> {
         let record = Record {
             time: self.now,
@@ -92,7 +92,7 @@ fn data(number: u64) -> Record {
     }
 }
 
-/// Of a sample in ten fragments.
+/// Returns a record of a sample in ten fragments.
 fn fragment(number: u64, start: u32) -> Record {
     Record {
         kind: kind::DATA_FRAG,
@@ -367,7 +367,7 @@ fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss(
     assert_eq!((facts.irrelevant, facts.duplicates), (0, 0));
     let sampled = facts.sampled.unwrap();
     assert_eq!((sampled.seen, sampled.span), (4, 9));
-    // Of the intervals only that between 1 and 2 is one.
+    // Only the interval between 1 and 2 counts.
     assert_eq!(facts.interarrival.count(), 1);
 }
 
@@ -395,8 +395,8 @@ fn what_comes_by_the_network_beside_shared_memory_counts_once() {
     }
     let facts = bench.facts();
     assert_eq!((facts.messages, facts.lost), (10, 0));
-    // Shared memory falls silent. What is missing up to the next sample may have gone there; from
-    // then on the network's gaps are losses again.
+    // Shared memory falls silent. Samples missing before the next one may have passed there; after
+    // it, gaps on the network are losses again.
     bench.wait(20_000);
     bench.data(21).data(24).wait(20_000);
     let facts = bench.facts();
@@ -425,11 +425,11 @@ fn seen_in_its_process_a_writer_s_gap_is_a_loss_and_a_copy_is_nothing() {
     let mut bench = Bench::new(Traits::default());
     for number in [1, 2, 3, 5, 6] {
         bench.put(in_its_process(data(number)));
-        // By the network to another host, and read in shared memory.
+        // The sample goes to another host by the network, and is read from shared memory.
         bench.data(number);
         bench.put(in_shared_memory(data(number))).wait(10);
     }
-    // What is only read in shared memory meanwhile is on its way.
+    // A sample that is only read from shared memory is still pending.
     bench.put(in_shared_memory(data(8)));
     let facts = bench.wait(5_000).facts();
     assert_eq!((facts.messages, facts.bytes, facts.lost), (5, 500, 1));
@@ -450,7 +450,7 @@ fn what_passed_before_a_writer_was_seen_in_its_process_counts_by_its_span() {
     let sampled = facts.sampled.unwrap();
     assert_eq!((sampled.seen, sampled.span), (4, 10));
     assert_eq!((facts.messages, facts.lost), (13, 1));
-    // It is no longer seen that way: shared memory is read again.
+    // The uprobe's view ends, and shared memory is polled again.
     bench.wait(20_000);
     for number in [20, 25] {
         bench.put(in_shared_memory(data(number))).wait(10);
@@ -476,7 +476,7 @@ fn when_a_writer_is_no_longer_seen_in_its_process_shared_memory_counts_at_once()
     assert_eq!((sampled.seen, sampled.span), (2, 3));
 }
 
-/// Of a sample in three fragments.
+/// Returns a record of a sample in three fragments.
 fn third(number: u64, start: u32) -> Record {
     Record {
         sample_size: 2500,
@@ -484,14 +484,14 @@ fn third(number: u64, start: u32) -> Record {
     }
 }
 
-/// Records of the samples `1..=4` in three fragments each.
+/// Returns records of the samples `1..=4`, each in three fragments.
 fn thirds() -> Vec<Record> {
     let starts = |number| (1..=3).map(move |start| third(number, start));
     (1..=4).flat_map(starts).collect()
 }
 
-/// Feeds two views' records in every order that mixes them; each sample is to be given once, or
-/// reported as not captured once.
+/// Processes two views' records in every interleaved order. Each sample must be dispatched once or
+/// reported once as not captured.
 fn every_sample_is_given_or_missed(
     before: &[Record],
     after: &[Record],
@@ -501,7 +501,8 @@ fn every_sample_is_given_or_missed(
     let mut fewest = [1; 4];
     let shifts = if mixed { after.len() } else { 0 };
     for shift in 0..=shifts {
-        // The first record is of the first view, the next `shift` of the second one may overtake.
+        // The first record is from the first view; the next `shift` of the second view may overtake
+        // it.
         for at in 1..=before.len() {
             let mut bench = Bench::new(RELIABLE);
             let (early, late) = before.split_at(at);
@@ -510,7 +511,7 @@ fn every_sample_is_given_or_missed(
             let mut put = |bench: &mut Bench, records: &[Record]| {
                 for record in records {
                     bench.now += MILLISECOND;
-                    // A record of which the bytes are not kept cannot complete a sample.
+                    // A record without payload cannot complete a requested sample.
                     let time = bench.now;
                     let has = bench
                         .writer

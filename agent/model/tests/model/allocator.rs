@@ -1,5 +1,5 @@
-//! Counts to the byte what a test holds on the heap. A test binary has one global allocator, so it
-//! counts for each thread, and tests beside each other do not count for one another.
+//! Counts the heap bytes of a test exactly. A test binary has one global allocator, so it counts
+//! per thread, and concurrent tests do not affect each other.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -13,7 +13,7 @@ struct Counting;
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Bytes that this thread has allocated, less those it has freed.
+/// Returns the bytes that this thread has allocated, minus those it has freed.
 pub(crate) fn held() -> usize {
     usize::try_from(HELD.get()).unwrap_or(0)
 }
@@ -22,19 +22,19 @@ fn count(bytes: isize) {
     HELD.set(HELD.get().wrapping_add(bytes));
 }
 
-// SAFETY: the system's allocator does the work. The counter has no destructor and no lazy
-// initialization, so counting allocates nothing.
+// SAFETY: all calls are forwarded to the system's allocator. The counter has no destructor and no
+// lazy initialization, so counting allocates nothing.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count(layout.size().cast_signed());
-        // SAFETY: as the caller warrants.
+        // SAFETY: the caller satisfies the contract of `alloc`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // A thread may free what another one allocated.
+        // A thread may free memory that another one allocated.
         count(-layout.size().cast_signed());
-        // SAFETY: as the caller warrants.
+        // SAFETY: the caller satisfies the contract of `dealloc`.
         unsafe { System.dealloc(pointer, layout) }
     }
 }

@@ -1,5 +1,4 @@
-//! Who forges messages with every field another each time fills every table, and none beyond its
-//! cap.
+//! Forged messages in which every field varies fill every table, but none beyond its cap.
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -22,13 +21,13 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
 const START: u64 = 1_700_000_000_000_000_000;
 const MESSAGES: u64 = 60_000;
-/// Of the history.
+/// Seconds of the history.
 const SECONDS: usize = 20;
 const DISCOVERY_INFO: EntityId = EntityId([0, 0, 2, 3]);
 const ALICE: GuidPrefix = GuidPrefix([1; 12]);
 const SAMPLES: EntityId = EntityId([0, 0, 3, 3]);
 
-/// Repeatable random numbers (xorshift64).
+/// Reproducible random numbers (xorshift64).
 struct Dice(u64);
 
 impl Dice {
@@ -44,7 +43,7 @@ impl Dice {
     }
 
     fn prefix(&mut self) -> GuidPrefix {
-        // Every other one is of a few that are there already.
+        // Half of the numbers repeat a few existing ones.
         let number = match self.pick(2) {
             0 => self.pick(40),
             _ => self.roll(),
@@ -83,7 +82,7 @@ fn words(number: u64) -> [u8; 8] {
     [high, low].concat().try_into().unwrap()
 }
 
-/// HEARTBEAT, GAP or ACKNACK of any numbers.
+/// Returns a HEARTBEAT, GAP or ACKNACK with random numbers.
 fn control(dice: &mut Dice, id: u8) -> Vec<u8> {
     let [_, a, b, c, ..] = dice.roll().to_ne_bytes();
     let reader = EntityId([a, b, c, 4]);
@@ -161,7 +160,7 @@ fn forged(dice: &mut Dice) -> Vec<u8> {
             message.dispose_by_hash(SEDP_WRITERS, dice.number(), guid)
         }
         12 => {
-            // Announcements that never end.
+            // The announcements are never complete.
             let payload = vec![5; 100 + dice.pick(20_000) as usize];
             message.fragment(SEDP_WRITERS, dice.number(), 1, 64, &payload)
         }
@@ -196,13 +195,14 @@ fn somewhere(dice: &mut Dice, time: u64) -> Envelope {
     envelope
 }
 
-/// The largest size of every table, and its cap.
+/// The largest size of each table, and its cap.
 type Largest = BTreeMap<&'static str, (usize, usize)>;
 
-/// One step: the model, random numbers and the time.
+/// One step, given the model, random numbers and the time.
 type Step<'a> = &'a mut dyn FnMut(&mut Observer, &mut Dice, u64);
 
-/// Drives the model, a step every `pause` nanoseconds; the sizes of its tables, and how much the heap grew in the first half and in all.
+/// Runs the model with a step every `pause` nanoseconds. Returns the sizes of its tables, and the
+/// growth of the heap in the first half and in total.
 fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
     let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
     let before = allocator::held();
@@ -228,7 +228,7 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
     (largest, half, whole)
 }
 
-/// Asserts that no table is beyond its cap.
+/// Asserts that no table exceeds its cap.
 fn update(sizes: &[Size], largest: &mut Largest) {
     for size in sizes {
         let seen = largest.entry(size.table).or_insert((0, size.cap));
@@ -237,7 +237,7 @@ fn update(sizes: &[Size], largest: &mut Largest) {
     }
 }
 
-/// Asserts that these tables were at their caps, but for a tenth.
+/// Asserts that these tables were filled to at least nine tenths of their caps.
 fn assert_filled(largest: &Largest, tables: &[&str]) {
     for table in tables {
         let (entries, cap) = largest[table];
@@ -268,7 +268,7 @@ fn readers_of(number: u64) -> GuidPrefix {
     GuidPrefix(prefix)
 }
 
-/// One reliable writer, and 600 participants that read its topic.
+/// Announces one reliable writer, and 600 participants with readers of its topic.
 fn announce_one_writer(observer: &mut Observer) {
     let mut put = |message: Message| {
         let envelope = forge::multicast(START, 0);
@@ -293,8 +293,8 @@ fn announce_one_writer(observer: &mut Observer) {
     }
 }
 
-/// What this host's kernel reports of one writer's samples, with every field another, the numbers
-/// about `newest`.
+/// Returns a kernel record of one writer's samples in which every field varies, with numbers around
+/// `newest`.
 fn forged_record(dice: &mut Dice, newest: u64, now: u64) -> Record {
     const KINDS: [u8; 7] = [
         kind::DATA,
@@ -376,12 +376,12 @@ fn one_writer(observer: &mut Observer, dice: &mut Dice, now: u64) {
     }
 }
 
-/// Crowds of forty participants that fill the tables of endpoints and nodes, newcomers of a topic that
-/// is watched by its exact name, and a watchlist that changes.
+/// Fills the tables of endpoints and nodes with groups of forty participants. Then it adds
+/// newcomers on a topic that is watched by exact name, and changes the watchlist.
 fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
     let step = (now - START) / 1_000_000;
     if step % 4_000 == 1 {
-        // So many that not all topics are matched at once.
+        // With so many globs, the topics are not all matched at once.
         let globs = (0..20).map(|number| format!("/g{number}/**"));
         let names = globs.chain(["/exact".to_owned()]);
         let watches = names.map(|name| Watch::named(&name).unwrap()).collect();
@@ -425,7 +425,7 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
     });
 }
 
-/// The names of all tables in these sources.
+/// Collects the names of all tables in these sources.
 fn tables(directory: &Path, into: &mut BTreeSet<String>) {
     for entry in fs::read_dir(directory).unwrap() {
         let path = entry.unwrap().path();
@@ -484,11 +484,11 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
         &Path::new(env!("CARGO_MANIFEST_DIR")).join("src"),
         &mut listed,
     );
-    // Those two are in front of the model.
+    // These two tables are outside the model.
     listed.retain(|table| !table.starts_with("ahead.") && !table.starts_with("reassembly."));
     let asked: BTreeSet<_> = largest.keys().map(|table| (*table).to_owned()).collect();
     assert_eq!(asked, listed);
-    // Taken after each datagram.
+    // These lists are taken after each datagram.
     for drained in ["discovery.changes", "journal.missing"] {
         largest.remove(drained);
     }

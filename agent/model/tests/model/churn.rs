@@ -1,5 +1,5 @@
-//! Participants come and go for as long as a robot runs: what is kept of those that went must not add
-//! up. Counted to the byte by an allocator that counts.
+//! Participants that come and go for as long as a robot runs leave no growing state behind. A
+//! counting allocator measures the heap exactly.
 
 use crate::allocator;
 use ros2probe_model::input::Input;
@@ -15,7 +15,7 @@ const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
 const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
-/// Alive at a time.
+/// Number of participants alive at a time.
 const ALIVE: u32 = 60;
 
 struct Robot {
@@ -39,8 +39,8 @@ impl Robot {
         GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
     }
 
-    /// One comes, with a name that was never there, and speaks; another goes, every second one by its
-    /// lease.
+    /// Adds a participant with a new name that sends data, and removes another. Every second one is
+    /// removed by its expired lease.
     fn step(&mut self) {
         let number = self.born;
         let prefix = Self::prefix(number);
@@ -64,7 +64,7 @@ impl Robot {
             self.now += SECOND / 60;
             self.put(Message::from(prefix).data(WRITER, sequence, b"\0\x01\0\0\x04\0\0\0abc\0"));
         }
-        // Those that are to stay say so in time.
+        // Participants that stay renew their announcements in time.
         for other in number.saturating_sub(ALIVE)..number {
             if other % 8 == number % 8 {
                 let prefix = Self::prefix(other);
@@ -83,7 +83,7 @@ impl Robot {
         drop((self.observer.drain().events, self.observer.drain().interest));
     }
 
-    /// Bytes held after so many more have come.
+    /// Returns the bytes held after this many more participants.
     fn held_after(&mut self, more: u32) -> usize {
         (0..more).for_each(|_| self.step());
         let snapshot = self.observer.snapshot(Timestamp(self.now));
@@ -96,7 +96,7 @@ impl Robot {
 
 #[test]
 fn thousands_that_came_and_went_leave_nothing_behind() {
-    // So that all tables that keep somebody who went are full soon.
+    // Small limits fill the tables of former participants early.
     let limits = Limits {
         topics: 200,
         ..Limits::default()
@@ -114,6 +114,6 @@ fn thousands_that_came_and_went_leave_nothing_behind() {
     robot.held_after(14_000);
     let held: Vec<_> = (0..4).map(|_| robot.held_after(1_000)).collect();
     let (least, most) = (held.iter().min().unwrap(), held.iter().max().unwrap());
-    // Of 3000 that went since, less than 7 bytes each.
+    // The bound is less than 7 bytes for each of the 3000 that vanished since.
     assert!(most - least < 20_000, "{held:?}");
 }

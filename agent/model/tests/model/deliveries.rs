@@ -1,5 +1,5 @@
-//! Deliveries under forged records and virtual time: what each receiver got, what it lost, and where
-//! that died. Every class by construction, and all of them adding up.
+//! Deliveries under forged records and virtual time: the samples that each receiver got, those it
+//! lost, and the causes. The tests construct every class and check that the sums agree.
 
 mod causes;
 mod control;

@@ -1,4 +1,4 @@
-//! What discovery tells of a graph that cannot work, from forged announcements in virtual time.
+//! Diagnosis of broken graphs, from forged announcements in virtual time.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -17,7 +17,7 @@ const STRING: &str = "std_msgs::msg::dds_::String_";
 const IMAGE: &str = "sensor_msgs::msg::dds_::Image_";
 const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
 
-/// Parameters beside GUID, topic and type.
+/// Parameters in addition to GUID, topic and type.
 type Qos<'a> = &'a [(u16, &'a [u8])];
 
 const RELIABLE: (u16, &[u8]) = (0x1a, &[2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
@@ -26,7 +26,7 @@ const TRANSIENT_LOCAL: (u16, &[u8]) = (0x1d, &[1, 0, 0, 0]);
 const TEN_MILLISECONDS: (u16, &[u8]) = (0x23, &[0, 0, 0, 0, 0x5c, 0x8f, 0xc2, 0x02]);
 const PARTITION_A: (u16, &[u8]) = (0x29, b"\x01\0\0\0\x02\0\0\0a\0\0\0");
 
-/// An observer with virtual time.
+/// An observer in virtual time.
 struct World {
     observer: Observer,
     now: u64,
@@ -46,7 +46,7 @@ impl World {
         }
     }
 
-    /// With participants 1 to `count`, each with an endpoint of its own as ROS's have.
+    /// Returns a world with participants 1 to `count`, each with one endpoint, as in ROS.
     fn with(count: u8) -> Self {
         let mut world = Self::new();
         for number in 1..=count {
@@ -65,7 +65,7 @@ impl World {
     }
 
     fn participant(&mut self, number: u8, addresses: &[SocketAddrV4]) {
-        // Infinite patience: nobody repeats anything here.
+        // The leases are long, because the announcements are not repeated here.
         let payload = forge::participant_at(prefix(number), 1_000_000, None, addresses);
         self.put(Message::from(prefix(number)).data(SPDP, 1, &payload));
         let info = Guid::new(prefix(number), NODES);
@@ -109,7 +109,7 @@ impl World {
         self.observer.snapshot(Timestamp(self.now)).diagnoses
     }
 
-    /// All findings of a kind, after some seconds.
+    /// Returns all findings of a kind after some seconds.
     fn found(&mut self, kind: &str) -> Vec<Diagnosis> {
         self.wait(7000);
         let found = self.diagnoses();
@@ -176,7 +176,7 @@ fn incompatible_pairs_are_named_with_every_policy_and_gone_with_the_cause() {
     );
     assert_eq!(world.found("unheard_publisher"), []);
 
-    // The subscriber asks for less.
+    // The subscriber requests less.
     world.announce(reader(2, 1), "rt/points", STRING, &[BEST_EFFORT]);
     assert_eq!(world.found("qos_incompatible"), []);
     assert_eq!(world.diagnoses().qos_pairs, []);
@@ -302,7 +302,7 @@ fn who_is_alone_is_found_after_some_patience_and_not_where_that_is_normal() {
     ];
     assert_eq!(names(&world.diagnoses()), expected);
 
-    // Somebody comes, and goes again.
+    // A reader appears and vanishes again.
     world.announce(reader(2, 2), "rt/points", STRING, &[]);
     world.wait(1000);
     assert_eq!(names(&world.diagnoses()), expected[1..]);
@@ -317,11 +317,11 @@ fn who_is_alone_is_found_after_some_patience_and_not_where_that_is_normal() {
 fn nobody_is_called_alone_while_a_participant_s_endpoints_are_unknown() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[]);
-    // Announced itself before the agent began to listen to what it has.
+    // The participant announced itself before the agent started to capture its endpoints.
     let payload = forge::participant(prefix(3), 1_000_000, None);
     world.put(Message::from(prefix(3)).data(SPDP, 1, &payload));
     assert_eq!(world.found("unheard_publisher"), []);
-    // Once it is known what it has, that nobody listens is a fact.
+    // Once its endpoints are known, the missing subscriber is a finding.
     world.announce(reader(3, 1), "rt/other", STRING, &[]);
     assert_eq!(world.found("unheard_publisher").len(), 1);
 }
@@ -395,7 +395,7 @@ fn a_flood_is_counted_and_takes_no_time() {
     let mut world = World::with(200);
     for participant in 1..=100 {
         for number in 1..=40 {
-            // Every reader asks for something of its own, and for more than any writer offers.
+            // Every reader requests different values, all above those that the writers offer.
             let deadline = [number, participant, 0, 0, 0, 0, 0, 0];
             let qos: Qos<'_> = &[RELIABLE, (0x23, &deadline)];
             world.announce(reader(participant, number), "rt/flood", STRING, qos);

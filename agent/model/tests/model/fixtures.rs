@@ -1,10 +1,10 @@
-//! Real ROS 2 traffic through the whole core, against what is known to have happened.
+//! Replays real ROS 2 traffic through the whole core and compares it with known facts.
 //!
-//! Each capture is replayed frame by frame in its own time. What the core then says of graph,
-//! quality of service, removal times, counts and losses must equal what an independent decoder
-//! found in the same file (`*.facts.json`), what a real participant believed at the time
-//! (`ev: graph` lines) and what the nodes logged. The captures in `data` stand alone; when the
-//! corpus they were taken from lies beside the repository, all of it is replayed.
+//! Each capture is replayed frame by frame in its own time. The core's graph, quality of service,
+//! removal times, counts and losses must equal three sources. These are an independent decoder of
+//! the same file (`*.facts.json`), the state of a real participant at the time (`ev: graph` lines),
+//! and the nodes' logs. The captures in `data` suffice; if the full corpus lies beside the
+//! repository, all of it is replayed.
 
 mod replayed;
 
@@ -68,8 +68,8 @@ fn check(scenario: &Scenario) {
     counts(&name, &facts, &replayed);
     losses(&name, &facts, &replayed);
     logged_losses(&name, scenario, &replayed);
-    // The captures with the command line begin late and lack all large frames: what the nodes
-    // believed was not to be seen there.
+    // The captures with the command line begin late and lack all large frames, so they do not show
+    // everything that the nodes knew.
     let graphs = if name.contains("cli-observed") {
         Vec::new()
     } else {
@@ -132,7 +132,7 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
 }
 
 fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
-    // An endpoint that was announced and gone between two looks is known from its events only.
+    // An endpoint that appeared and vanished between two snapshots is only known from its events.
     let appeared: BTreeSet<_> = replayed
         .events
         .iter()
@@ -207,7 +207,7 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
     );
 }
 
-/// What was disposed of went at that very datagram.
+/// A disposed entity is removed at the datagram of its disposal.
 fn disposals(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut theirs: BTreeMap<String, f64> = BTreeMap::new();
     for event in &facts.events {
@@ -216,14 +216,14 @@ fn disposals(name: &str, facts: &Facts, replayed: &Replayed) {
     for (guid, at) in &theirs {
         let ended = replayed.ended.get(guid);
         let Some(ended) = ended else {
-            // Disposed of although it was never announced in this capture.
+            // The entity was disposed although it was never announced in this capture.
             assert!(!replayed.was_announced(guid), "{name}: {guid} lives on");
             continue;
         };
         let (ended, event) = (ended.0.seconds(), ended.1);
         match event {
             "disposed" => assert!((ended - at).abs() < ROUNDING, "{name}: {guid} {ended} {at}"),
-            // Its participant went first.
+            // Its participant was removed first.
             _ => assert!(
                 event == "cascaded" && ended < *at,
                 "{name}: {guid} {event} {ended} {at}"
@@ -238,7 +238,7 @@ fn disposals(name: &str, facts: &Facts, replayed: &Replayed) {
     }
 }
 
-/// What said no goodbye went with its lease, counted from its last datagram.
+/// An entity without a disposal is removed when its lease expires after its last datagram.
 fn leases(name: &str, facts: &Facts, replayed: &Replayed) {
     for (guid, participant) in &replayed.participants {
         let Some((ended, event)) = replayed.ended.get(guid) else {
@@ -256,7 +256,7 @@ fn leases(name: &str, facts: &Facts, replayed: &Replayed) {
     }
 }
 
-/// Node names follow `ros_discovery_info`, sample by sample.
+/// Node names follow `ros_discovery_info` sample by sample.
 fn nodes(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut newest: BTreeMap<&str, u64> = BTreeMap::new();
     let mut names: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
@@ -295,7 +295,7 @@ fn nodes(name: &str, facts: &Facts, replayed: &Replayed) {
     }
 }
 
-/// Samples and bytes per topic.
+/// Compares samples and bytes per topic.
 fn counts(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut theirs: BTreeMap<&str, (u64, Option<u64>)> = BTreeMap::new();
     for (guid, writer) in &facts.writers {
@@ -334,14 +334,14 @@ fn counts(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut strangers: BTreeMap<_, _> = strangers
         .map(|each| (each.guid.to_string(), each.measurement.messages))
         .collect();
-    // The independent decoder cannot put cut fragments together; this is the 10 Hz point cloud.
+    // The independent decoder cannot reassemble truncated fragments; this is the 10 Hz point cloud.
     if let Some(cloud) = strangers.remove("0110f04d1e86334b8f3fc2bb.00001403") {
         assert_eq!((name.contains("snap256"), cloud), (true, 29), "{name}");
     }
     assert_eq!(strangers, unknown, "{name}: unknown writers");
 }
 
-/// One interval between each two messages of one writer.
+/// Counts one interval between two consecutive messages of one writer.
 fn intervals(facts: &Facts, topic: &str, ours: &Measurement) -> u64 {
     let writers = facts
         .writers
@@ -350,7 +350,7 @@ fn intervals(facts: &Facts, topic: &str, ours: &Measurement) -> u64 {
     ours.messages - writers.filter(|writer| writer.complete() > 0).count() as u64
 }
 
-/// Exactly these sequence numbers were lost on the wire: missing ones and incomplete ones.
+/// The lost sequence numbers on the wire are exact: missing ones and incomplete ones.
 fn losses(name: &str, facts: &Facts, replayed: &Replayed) {
     let mut theirs: BTreeMap<&str, BTreeSet<u64>> = BTreeMap::new();
     for (guid, writer) in &facts.writers {
@@ -392,7 +392,7 @@ fn losses(name: &str, facts: &Facts, replayed: &Replayed) {
     }
 }
 
-/// Small best-effort messages: the wire's losses are those of the subscriber's log.
+/// For small best-effort messages, the wire's losses equal those of the subscriber's log.
 fn logged_losses(name: &str, scenario: &Scenario, replayed: &Replayed) {
     if !name.contains("loss-small") {
         return;
@@ -402,7 +402,7 @@ fn logged_losses(name: &str, scenario: &Scenario, replayed: &Replayed) {
     }
 }
 
-/// A writer sequence number is the logged sequence + 1.
+/// Compares losses; a writer's sequence number is the logged sequence plus one.
 fn compare_losses(name: &str, received: &truth::Received, replayed: &Replayed) {
     let theirs: BTreeSet<_> = received.lost_between.iter().map(|seq| seq + 1).collect();
     let topic = format!("rt{}", received.topic);
@@ -416,7 +416,7 @@ fn compare_losses(name: &str, received: &truth::Received, replayed: &Replayed) {
     assert_eq!(messages, received.count, "{name}: {topic}");
 }
 
-/// When the graph stood still for a real participant, it was the same here.
+/// Compares the graph at times at which it was stable for a real participant.
 fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
     const SETTLED: u64 = 500_000_000;
     let mut compared = 0;
@@ -425,7 +425,7 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
             continue;
         }
         let at = line.t + SETTLED;
-        // A node knows itself before it has told anybody.
+        // A node knows itself before it announces itself.
         let told = facts
             .ros_discovery_info
             .iter()
@@ -457,7 +457,7 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
     );
 }
 
-/// A node goes here when it goes for the real participant that stayed to the end.
+/// A node is removed when the real participant that stayed to the end removes it.
 fn witnessed_removals(name: &str, scenario: &Scenario, replayed: &Replayed) {
     let Some((_, lines)) = scenario
         .graphs()
@@ -478,7 +478,7 @@ fn witnessed_removals(name: &str, scenario: &Scenario, replayed: &Replayed) {
             });
             let ours = ours.unwrap_or_else(|| panic!("{name}: {node} stays"));
             let late = after.t as f64 / 1e9 - ours.at.seconds();
-            // The witness polls every 50 ms, on a busy machine.
+            // The witness polls every 50 ms, and later on a busy machine.
             assert!(
                 (-0.1..0.5).contains(&late),
                 "{name}: {node} went {late} s apart"

@@ -1,6 +1,6 @@
-//! One forged datagram under a live writer's GUID: what is counted of the real stream stays exact.
+//! A forged datagram with a live writer's GUID does not change the counts of the real stream.
 //!
-//! Each run is held against the same run without the forgery.
+//! Each run is compared with the same run without the forgery.
 
 use std::sync::Arc;
 
@@ -15,7 +15,7 @@ use ros2probe_wire::record::kind;
 
 const HOUR: i64 = 3600;
 
-/// What is compared of two runs.
+/// The compared counts of two runs.
 #[derive(Clone, Debug, PartialEq)]
 struct Counts {
     messages: u64,
@@ -34,9 +34,9 @@ struct Run {
     reliable: bool,
     /// Milliseconds between messages.
     period: u64,
-    /// The first number.
+    /// The first sequence number.
     first: u64,
-    /// Messages before which the forgery comes.
+    /// Numbers of the messages before which the forgery is sent.
     forged_at: u64,
 }
 
@@ -89,12 +89,12 @@ impl Run {
         }
     }
 
-    /// The counts with this forgery are those without, and so many messages more.
+    /// Asserts that the counts with this forgery equal those without, plus `more` messages.
     fn stays_exact(&self, more: u64, forgery: &dyn Fn(&mut Host, Seen)) {
         self.stays_exact_but(more, 0, forgery);
     }
 
-    /// Likewise, where so many latencies are not measured.
+    /// Asserts the same, except that `unmeasured` latencies are missing.
     fn stays_exact_but(&self, more: u64, unmeasured: u64, forgery: &dyn Fn(&mut Host, Seen)) {
         let honest = self.counts(&|_, _| {});
         assert_eq!((honest.messages, honest.delivered), (990, 990));
@@ -114,7 +114,7 @@ fn streams() -> impl Iterator<Item = Run> {
         .map(|(reliable, period)| Run::new(reliable, period))
 }
 
-/// INFO_TS so many seconds from now.
+/// Returns the record with an INFO_TS this many seconds from now.
 fn stamped(record: Record, seconds: i64) -> Record {
     let now = record.source_timestamp >> 32;
     Record {
@@ -217,7 +217,7 @@ fn one_acknack_far_ahead_acknowledges_nothing() {
         .collect();
     assert_eq!(bases, [399]);
     run.stays_exact(0, &|host, bob| {
-        // 486 is missing and undecided.
+        // Sample 486 is missing and undecided.
         host.acknack(bob, 1 << 40);
     });
 }
@@ -253,7 +253,7 @@ fn a_forgery_that_comes_before_the_stream_hides_none_of_it() {
                 forged_at: 0,
                 ..Run::new(run.reliable, run.period)
             };
-            // Of the messages that come before it is clear which run is the writer's.
+            // The messages before it establish the writer's run.
             run.stays_exact_but(1, 4, &|host, bob| {
                 host.put(stamped(host.record(bob, kind::DATA, number), 3000));
                 host.wait(10);
@@ -346,7 +346,7 @@ fn a_writer_that_really_jumps_loses_what_it_jumped_over() {
         assert_eq!(facts.sequence_jumps, 1);
         let delivered = host.deliveries()[0].delivered;
         assert_eq!((delivered.messages, delivered.lost()), (200, lost));
-        // What came before it was believed is not counted again.
+        // Messages from before the confirmation are not counted again.
         for record in &records[100..106] {
             host.put(Record {
                 time: host.now,
@@ -490,7 +490,7 @@ fn a_doubted_message_is_given_once_and_holds_no_other_up() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(48))]
 
-    /// Whatever one forged record says, the real stream's losses and messages stay.
+    /// No single forged record changes the losses and messages of the real stream.
     #[test]
     fn no_single_record_changes_what_is_counted_of_a_real_stream(
         reliable: bool,

@@ -1,9 +1,9 @@
-//! The model's list of types that begin with a header, compared with their definitions.
+//! Compares the model's list of types that begin with a header with their definitions.
 
 use ros2probe_message::{Dialect, Element, Library, Sources};
 use ros2probe_model::header::begins_with_header;
 
-/// The types that come with the program; a unit test there finds every one of them in this list.
+/// Uses the definitions built into the program; a unit test there finds each of them in this list.
 #[test]
 fn types_that_begin_with_a_header_are_those_that_latency_is_measured_of() {
     let listed = include_str!("../../../testing/data/message/type_hashes.txt");

@@ -1,4 +1,4 @@
-//! The model under forged and captured traffic, in virtual time.
+//! Tests of the model with forged and captured traffic, in virtual time.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

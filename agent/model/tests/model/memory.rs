@@ -1,6 +1,6 @@
-//! What deliveries, all entries and recordings take, against the table of limits: resident memory of a
-//! process in which nothing else happens, as nextest runs each test. `cargo test` needs the filter
-//! `memory::`.
+//! Compares the memory of deliveries, all other entries and recordings with the table of limits.
+//! The tests measure the resident memory of an otherwise idle process; nextest runs each test in
+//! one. `cargo test` requires the filter `memory::`.
 
 use std::fs;
 use std::sync::{Arc, Mutex};
@@ -19,10 +19,10 @@ use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
-/// Held while memory is measured: tests may run beside each other in one process.
+/// Locked while memory is measured, because tests may run concurrently in one process.
 static ALONE: Mutex<()> = Mutex::new(());
 
-/// Bytes of this process in memory.
+/// Returns the resident memory of this process in bytes.
 fn resident() -> usize {
     let status = fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find(|line| line.starts_with("VmRSS:"));
@@ -45,7 +45,7 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     }
     let before = allocator::held();
     for world in &mut worlds {
-        // Busy for longer than a gap stays open, then idle.
+        // The writer is busy for longer than a gap stays open, then idle.
         for number in 2..=150 {
             (1..=DELIVERIES).for_each(|socket| world.data(at(socket), number));
             world.wait(100);
@@ -58,13 +58,14 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     println!("{each} bytes a delivery");
 }
 
-/// GUID prefix of a participant by its number.
+/// Returns the GUID prefix of a participant by its number.
 fn prefix(number: usize) -> GuidPrefix {
     let [a, b, c, d] = u32::try_from(number).unwrap().to_be_bytes();
     GuidPrefix([1, 0x10, 0, 0, 0, 0, 0, 0, a, b, c, d])
 }
 
-/// Participants and endpoints at their caps, with names of usual length. Returns the writers.
+/// Announces participants and endpoints up to their caps, with names of usual length. Returns the
+/// writers.
 fn announce_all(observer: &mut Observer, limits: &Limits, now: u64) -> Vec<Guid> {
     let mut put = |message: Message| {
         observer.input(Input::Datagram {
@@ -99,7 +100,8 @@ fn announce_all(observer: &mut Observer, limits: &Limits, now: u64) -> Vec<Guid>
     writers
 }
 
-/// Each writer sends 100 samples, ten a second, to a socket of its own. Returns the time after them.
+/// Sends 100 samples from each writer, ten per second, to separate sockets. Returns the time after
+/// them.
 fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64 {
     for number in 1..=100 {
         for (place, writer) in writers.iter().enumerate() {
@@ -125,9 +127,9 @@ fn send_from_all(observer: &mut Observer, writers: &[Guid], mut now: u64) -> u64
     now
 }
 
-/// What the table of limits takes for granted, on a robot on which participants, endpoints, topics,
-/// unknown writers and flows are all at their caps, each with names of usual length: with what is
-/// shown of it and the one before, while a page is written.
+/// Checks the table of limits for a robot at the caps of participants, endpoints, topics, unknown
+/// writers and flows, with names of usual length. Two snapshots exist, and a metrics page is being
+/// written.
 #[test]
 fn entries_take_no_more_than_the_table_of_limits_says() {
     let _alone = ALONE.lock().unwrap();
@@ -197,7 +199,8 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
     );
 }
 
-/// Topics as many as may be measured, messages smaller and larger than a chunk, compressed and not.
+/// Records as many topics as may be measured, with messages below and above a chunk's size,
+/// compressed and not.
 #[test]
 fn a_recording_takes_no_more_than_the_table_of_limits_says() {
     const BAGS: usize = 4;

@@ -1,5 +1,5 @@
-//! The core under forged traffic and virtual time: what discovery, interest and measurement must
-//! do, each named after what went wrong in observers before.
+//! Tests discovery, interest and measurement with forged traffic in virtual time. Each test is
+//! named after an earlier defect.
 
 mod announcements;
 mod clock;
@@ -36,11 +36,11 @@ const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 
-/// An observer with virtual time.
+/// An observer in virtual time.
 struct World {
     observer: Observer,
     now: u64,
-    /// Domain whose multicast port everything goes to.
+    /// Domain whose multicast port receives everything.
     domain_id: u16,
 }
 
@@ -98,7 +98,7 @@ impl World {
         self.put(message.data(guid.entity, number, &[0, 1, 0, 0, 9, 9, 9, 9]));
     }
 
-    /// 100 samples a second.
+    /// Sends 100 samples per second.
     fn stream(&mut self, guid: Guid, numbers: std::ops::RangeInclusive<u64>) {
         for number in numbers {
             self.sample(guid, number);
@@ -130,7 +130,7 @@ impl World {
         counts.map(|count| count.count).sum()
     }
 
-    /// What was noticed since the last call, and when, counted from the start.
+    /// Returns the events since the last call, with their times since the start.
     fn events(&mut self) -> Vec<(u64, EventKind)> {
         let events = self.observer.drain().events.events.into_iter();
         let told = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
@@ -166,7 +166,7 @@ fn bob(entity: EntityId) -> Guid {
     Guid::new(BOB, entity)
 }
 
-/// Random bytes that are the same every time.
+/// Reproducible random bytes.
 struct Dice(u64);
 
 impl Dice {

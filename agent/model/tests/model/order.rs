@@ -1,5 +1,5 @@
-//! Samples one by one in the order of a reliable subscriber: what waits for a repair, for how long,
-//! and what never waits. Virtual time and forged records.
+//! Samples in the order of a reliable subscriber: which ones wait for a retransmission, and for how
+//! long. Uses virtual time and forged records.
 
 use std::sync::Arc;
 
@@ -29,7 +29,7 @@ fn sample_requests(host: &mut Host, ids: &[u64], depth: Depth) {
         .input(Input::SampleRequests(Arc::new(sample_requests.collect())));
 }
 
-/// A host with a reader of Bob's that acknowledges.
+/// Returns a host with a reader of Bob's that acknowledges.
 fn listening() -> (Host, Seen) {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
@@ -38,7 +38,7 @@ fn listening() -> (Host, Seen) {
     (host, bob)
 }
 
-/// Numbers and milliseconds since the start of the samples that were given, in their order.
+/// Returns the numbers of the dispatched samples in order, with milliseconds since the start.
 fn given(host: &mut Host) -> Vec<(u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
@@ -56,7 +56,7 @@ fn numbers(host: &mut Host) -> Vec<u64> {
     given(host).into_iter().map(|(number, _)| number).collect()
 }
 
-/// Reason, first and last number of what is missed.
+/// Returns reason, first and last number of missing samples.
 fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
@@ -111,7 +111,7 @@ fn a_hole_ends_when_its_writer_leaves_it_out_or_withdraws_it_and_when_readers_ac
     host.acknack(bob, 8);
     assert_eq!(given(&mut host), [(7, 30)]);
     host.wait(12_000);
-    // 6 came by a way that is not seen; only what was withdrawn is lost.
+    // Sample 6 used an unobserved transport; only the withdrawn one is lost.
     assert_eq!(missed(&mut host), [(MissedReason::Lost, 4, 4)]);
 }
 
@@ -125,7 +125,7 @@ fn a_hole_that_nothing_explains_is_waited_for_a_while_and_its_late_repair_is_giv
     assert_eq!(numbers(&mut host), [1]);
     host.wait(200);
     assert_eq!(numbers(&mut host), [3, 4]);
-    // What follows does not wait for the same hole again.
+    // Later samples do not wait for the same gap again.
     host.data(bob, 5);
     assert_eq!(numbers(&mut host), [5]);
     host.data(bob, 7);
@@ -166,7 +166,7 @@ fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
     host.data(bob, 5);
     host.wait(4_100);
     assert_eq!(numbers(&mut host), [5]);
-    // Its ACKNACKs go where they are not seen.
+    // Its ACKNACKs use a path that is not observed.
     host.data(bob, 7);
     assert_eq!(numbers(&mut host), [7]);
     host.acknack(bob, 8);
@@ -208,7 +208,7 @@ fn what_waits_for_a_writer_is_given_once_it_is_believed_to_begin_anew() {
         host.data(bob, number);
         host.wait(1);
     }
-    // The first four may be forged: they hold nothing up, and end no wait.
+    // The first four may be forged: they delay no other sample and end no wait.
     let expected = [1, 2, 1, 2, 3, 4, 4, 5, 6, 7, 8, 5, 6];
     assert_eq!(numbers(&mut host), expected);
 }
@@ -281,7 +281,7 @@ proptest! {
 
 const DORA: GuidPrefix = GuidPrefix(*b"\x01\x10dora-sends");
 
-/// A host on which Dora's writer sends before it is announced, and Bob's reader.
+/// A host on which Dora's writer sends before its announcement, with Bob's reader.
 struct Unannounced {
     host: Host,
     bob: Seen,
@@ -319,7 +319,8 @@ impl Unannounced {
         self.host.put(record);
     }
 
-    /// Numbers of the samples that are given, each with its bytes if those are wanted.
+    /// Returns the numbers of the dispatched samples, after checking their payloads against
+    /// `depth`.
     fn given(&mut self, depth: Depth) -> Vec<u64> {
         let mut numbers = Vec::new();
         for given in self.host.observer.drain().samples {
@@ -347,7 +348,7 @@ fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
         dora.announce(true);
         dora.acknack(1);
         dora.data(5);
-        // The subscriber gets those first.
+        // The subscriber gets the earlier samples first.
         assert!(dora.given(depth).is_empty());
         for number in [1, 2, 3, 4, 2, 5] {
             dora.data(number);

@@ -1,5 +1,5 @@
-//! An agent that is started anew on a running robot: what it knew comes along, and stays only if
-//! it is still true.
+//! Restart of the agent on a running robot: saved state is restored, and stays only if it is still
+//! valid.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -47,7 +47,7 @@ fn spdp(prefix: GuidPrefix) -> Message {
     Message::from(prefix).data(SPDP, 1, &payload)
 }
 
-/// A robot of two participants, told in full to an agent.
+/// Announces a robot of two participants to an agent.
 fn robot(observer: &mut Observer) {
     robot_at(observer, START);
 }
@@ -81,7 +81,8 @@ fn robot_at(observer: &mut Observer, start: u64) {
     observer.input(Input::Time(Timestamp(start + SECOND)));
 }
 
-/// What is shown of the robot, without when it was seen and without the mark.
+/// Returns the displayed state of the robot, without times and without the mark of restored
+/// entries.
 fn shown(observer: &Observer, at: u64) -> String {
     let Snapshot {
         mut participants,
@@ -183,7 +184,7 @@ fn who_is_heard_within_a_lease_stays_and_who_is_not_goes() {
 
 #[test]
 fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
-    // A Raspberry Pi has none that runs without power, and the agent is there before NTP.
+    // A Raspberry Pi has no battery-backed clock, and the agent starts before NTP.
     for start in [1, SECOND, 30 * SECOND] {
         let mut observer = agent(Settings::default());
         robot_at(&mut observer, start);
@@ -197,7 +198,7 @@ fn a_robot_whose_clock_begins_in_1970_is_seen_and_forgotten_like_any_other() {
         assert_eq!(count(&observer, start + 9 * SECOND), (2, 2), "{start}");
         observer.input(Input::Time(Timestamp(start + 11 * SECOND)));
         assert_eq!(count(&observer, start + 11 * SECOND), (0, 0), "{start}");
-        // Started again before the clock was set.
+        // The agent restarts before the clock is set.
         let mut after = restarted(&memory, start);
         after.input(Input::Time(Timestamp(start + 9 * SECOND)));
         assert_eq!(count(&after, start + 9 * SECOND), (2, 2), "{start}");
@@ -284,7 +285,7 @@ fn what_is_known_has_another_revision_only_when_something_is_new() {
 }
 
 proptest! {
-    /// One character of the file is another, and it is still JSON of the right shape.
+    /// Changes one character of the file so that it is still JSON of the right shape.
     #[test]
     fn a_memory_with_a_wrong_character_is_taken_over_in_part_or_not(
         place in any::<prop::sample::Index>(),

@@ -1,5 +1,5 @@
-//! Tables that forgeries have filled: a real newcomer that is worth more finds room, what was there
-//! before stays, and no flood makes a packet expensive.
+//! Tables filled by forgeries: a real newcomer of higher priority is admitted, existing entries
+//! stay, and no flood makes a packet expensive.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -21,7 +21,7 @@ const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
-/// Of each participant's announcement.
+/// Lease of each participant's announcement.
 const LEASE: u32 = 10_000;
 
 struct World {
@@ -83,7 +83,7 @@ impl World {
         self.put(Message::from(guid.prefix).data(guid.entity, number, &payload));
     }
 
-    /// A packet that this participant's socket on this host sends.
+    /// Sends a packet of this participant from its socket on this host.
     fn leaves(&mut self, prefix: GuidPrefix, socket: u64) {
         self.observer.input(Input::Socket(SocketFacts {
             cookie: socket,
@@ -102,7 +102,7 @@ impl World {
         self.observer.input(Input::Record(&record));
     }
 
-    /// Forged participants that repeat themselves until each is as good as a real one.
+    /// Announces forged participants repeatedly until they count as established.
     fn crowd(&mut self, count: u32) {
         for _ in 0..4 {
             (0..count).for_each(|number| self.spdp(forged(number)));
@@ -129,7 +129,7 @@ impl World {
         Some(self.topic(name)?.measurement?.messages)
     }
 
-    /// Entries and evictions.
+    /// Returns the entries and evictions of a table.
     fn table(&self, name: &str) -> (u64, u64) {
         let mut tables = self.snapshot().tables.into_iter();
         let table = tables.find(|table| table.table == name).unwrap();
@@ -167,7 +167,7 @@ fn a_newcomer_on_a_topic_watched_by_name_is_counted_among_1000_forged_participan
     (1..=20).for_each(|number| world.sample(writer(ALICE), number));
     assert_eq!(world.messages("/points"), Some(20));
     let (size, evictions) = world.table("participants");
-    // Refused at first, then in the place of another.
+    // The newcomer is refused at first, then replaces another entry.
     assert_eq!((size, evictions), (1000, 2));
 }
 
@@ -176,7 +176,7 @@ fn a_newcomer_of_which_a_flood_hid_the_announcement_is_counted_from_its_next_one
     let mut world = World::new(&["/points"], &Limits::default());
     world.crowd(1000);
     world.spdp(ALICE);
-    // More than are remembered of those that are refused.
+    // These are more than the table of refused participants holds.
     (5000..9000).for_each(|number| world.spdp(forged(number)));
     world.sedp(writer(ALICE), "rt/points");
     assert!(!world.knows(ALICE));
@@ -197,7 +197,7 @@ fn a_newcomer_with_a_socket_on_this_host_is_seen_among_1000_forged_participants(
     assert!(!world.knows(ALICE));
     world.leaves(ALICE, 77);
     assert!(world.knows(ALICE));
-    // Its packet may be seen before its announcement.
+    // Its packet may precede its announcement.
     world.leaves(BOB, 78);
     world.spdp(BOB);
     assert!(world.knows(BOB));
@@ -221,7 +221,7 @@ fn a_socket_of_this_host_that_sends_for_many_participants_speaks_for_eight_of_th
             .count()
     };
     assert_eq!(known(&world), 8);
-    // From then on for none, and another socket is as good as ever.
+    // From then on the socket is evidence for no participant, but another socket still is.
     world.leaves(ALICE, 78);
     world.spdp(ALICE);
     assert!(world.knows(ALICE));
@@ -237,7 +237,7 @@ fn a_newcomer_that_sends_user_data_is_seen_among_1000_forged_participants() {
     (1..=3).for_each(|number| world.sample(writer(ALICE), number));
     assert!(world.knows(ALICE));
     assert!(world.messages("/chatter") >= Some(2));
-    // It may send before it is announced.
+    // It may send before its announcement.
     world.sample(writer(BOB), 1);
     world.spdp(BOB);
     assert!(world.knows(BOB));
@@ -264,7 +264,7 @@ fn an_endpoint_on_a_topic_watched_by_name_finds_room_among_1200_forged_ones() {
     (1..=20).for_each(|number| world.sample(writer(ALICE), number));
     assert_eq!(world.messages("/points"), Some(20));
     assert_eq!(world.table("endpoints"), (1200, 1));
-    // One that is worth no more than those which are there waits, and comes with its user data.
+    // A newcomer of equal priority waits, and is admitted once it sends user data.
     world.sedp(Guid::new(ALICE, entity(9, 3)), "rt/other");
     assert!(world.topic("/other").is_some(), "its participant sends");
     world.spdp(BOB);
@@ -328,7 +328,7 @@ fn a_topic_watched_by_name_is_measured_among_as_many_as_may_be() {
     world.sedp(writer(ALICE), "rt/points");
     (1..=5).for_each(|number| world.sample(writer(ALICE), number));
     assert_eq!(world.messages("/points"), Some(5));
-    // The latest one makes room: those before a flood stay.
+    // The latest topic makes room, so topics from before a flood stay.
     let measured = |world: &World| {
         let names = ["/crowd_0", "/crowd_1", "/crowd_2", "/crowd_3", "/crowd_4"];
         let topics = names.map(|name| world.topic(name).unwrap());
@@ -336,7 +336,7 @@ fn a_topic_watched_by_name_is_measured_among_as_many_as_may_be() {
     };
     assert_eq!(measured(&world), [true, true, true, false, false]);
     assert_eq!(world.snapshot().topics_measured, 4);
-    // So it is for a topic that is watched by name later on, and no topic takes it away.
+    // A topic that is watched by name later displaces another one, and no topic displaces it.
     world.observer.input(Input::Watchlist(Arc::new(watchlist(&[
         "/**", "/points", "/crowd_8",
     ]))));
@@ -372,7 +372,7 @@ fn a_topic_watched_by_name_stays_measured_when_its_publisher_is_gone_and_a_crowd
     assert_eq!(world.snapshot().topics_measured, 4);
 }
 
-/// What a flood may know: names of topics that are watched. Every packet under another GUID.
+/// Sends a flood that names watched topics, each packet with another GUID.
 fn flood(world: &mut World, rounds: std::ops::Range<u32>, with_data: bool) {
     for number in rounds {
         let prefix = forged(1_000_000 + number);
@@ -390,7 +390,7 @@ fn flood(world: &mut World, rounds: std::ops::Range<u32>, with_data: bool) {
 #[test]
 fn a_flood_of_watched_names_displaces_neither_local_participants_nor_those_that_send() {
     let mut world = World::new(&["/points"], &Limits::default());
-    // Alice publishes what is watched, Bob lives here, Carol sends, Dave is silent.
+    // Alice publishes a watched topic, Bob runs on this host, Carol sends, Dave is silent.
     let dave = GuidPrefix(*b"\x01\x10daves-host");
     let robot = [ALICE, BOB, CAROL, dave];
     for turn in 1..=4 {
@@ -421,7 +421,7 @@ fn a_flood_of_watched_names_displaces_neither_local_participants_nor_those_that_
     assert_eq!(own.unwrap().measurement.as_ref().unwrap().messages, 20);
     assert!(world.topic("/other").is_some() && world.topic("/points_of_interest").is_some());
     assert_eq!(world.table("participants").0, 1000);
-    // And one with a socket on this host comes in.
+    // A participant with a socket on this host is admitted, too.
     let erin = GuidPrefix(*b"\x01\x10erins-host");
     world.spdp(erin);
     world.sedp(writer(erin), "rt/points");
@@ -440,7 +440,7 @@ fn forgeries_that_fall_silent_make_room_for_silent_newcomers_as_before() {
     world.wait(6000);
     world.spdp(ALICE);
     assert!(world.knows(ALICE));
-    // One that has a socket here stays, however silent it is.
+    // A participant with a socket on this host stays, however long it is silent.
     let mut world = World::new(
         &["/points"],
         &Limits {

@@ -1,5 +1,5 @@
-//! A table of the model that no `sizes` lists fails here: whatever holds a collection, or a struct
-//! that does, names it in a `sizes` by taking the struct apart field by field.
+//! Every table of the model is listed in a `sizes` function. A struct with a collection, or with a
+//! field that has one, must be destructured there field by field.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -17,8 +17,8 @@ const COLLECTIONS: [&str; 9] = [
     "String",
 ];
 
-/// Files whose structs are made for one answer and not kept by the model, and the watchlist, which the
-/// model is given and `limits.watches` bounds.
+/// Files whose structs are created for one answer, and the watchlist, which `limits.watches`
+/// bounds.
 const ANSWERS: [&str; 9] = [
     "input.rs",
     "snapshot.rs",
@@ -30,9 +30,9 @@ const ANSWERS: [&str; 9] = [
     "selection.rs",
     "watch.rs",
 ];
-/// Likewise single structs: what is handed out, what lasts for one look, lengths.
+/// Further structs that are returned, live during one examination, or only contain lengths.
 const ANSWER: [&str; 5] = ["Taken", "Findings", "UnknownWriters", "SpanStage", "Past"];
-/// What others hold and the model only shares.
+/// Types that the model shares with an owner elsewhere.
 const SHARED: [&str; 2] = ["Arc<", "&'"];
 
 #[derive(Debug)]
@@ -55,7 +55,7 @@ fn sources(directory: &Path, into: &mut Vec<PathBuf>) {
     }
 }
 
-/// The file as far as it is no test, without comments.
+/// Returns the source without tests and comments.
 fn text(path: &Path) -> String {
     let text = fs::read_to_string(path).unwrap();
     let text = text.split("#[cfg(test)]").next().unwrap();
@@ -98,7 +98,7 @@ fn words(kind: &str) -> impl Iterator<Item = &str> {
     kind.split(|c: char| !c.is_alphanumeric() && c != '_')
 }
 
-/// Whether this is, or contains, something that grows.
+/// Returns whether this type is, or contains, a collection that grows.
 fn grows(kind: &str, file: &str, growing: &BTreeSet<(String, String)>, all: &[Struct]) -> bool {
     if SHARED.iter().any(|shared| kind.contains(shared)) {
         return false;
@@ -117,10 +117,10 @@ fn grows(kind: &str, file: &str, growing: &BTreeSet<(String, String)>, all: &[St
     })
 }
 
-/// The fields with which this struct is taken apart somewhere in a function about sizes.
+/// Returns the fields of the pattern that destructures this struct in a function about sizes.
 fn taken_apart(each: &Struct, texts: &BTreeMap<String, String>) -> Option<String> {
     let own = texts[&each.file].split("\nimpl").skip(1);
-    // Behind generic parameters.
+    // The name follows the generic parameters.
     let own = own.map(|part| match part.starts_with('<') {
         true => part.split_once("> ").map_or(part, |(_, rest)| rest),
         false => part.trim_start(),

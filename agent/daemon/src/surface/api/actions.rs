@@ -1,4 +1,4 @@
-//! `/actions`: each put together from its three services and two topics.
+//! `/actions`: each action combines its three services and two topics.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -51,7 +51,8 @@ async fn list(
     Ok(Json(answer).into_response())
 }
 
-/// The parts of actions by domain and name. Parts are hidden; an action is so when its own name is.
+/// Groups the topics of actions by domain and name. These topics are hidden; an action is hidden if
+/// its own name is.
 pub(super) fn actions(
     snapshot: &Snapshot,
     scope: Scope,
@@ -69,14 +70,14 @@ pub(super) fn actions(
     actions
 }
 
-/// Both ends of an action.
+/// Returns the servers and clients of an action.
 pub(super) fn parties<'a>(parts: &[&'a TopicFacts]) -> Parties<'a> {
     let mut parties = Parties::default();
     parts.iter().for_each(|part| parties.add(part));
     parties
 }
 
-/// `None` without any endpoint.
+/// Returns `None` for an action without endpoints.
 fn view<'a>(
     domain_id: u32,
     name: String,

@@ -1,4 +1,4 @@
-//! The body of a request: a JSON object, or nothing where everything has a default.
+//! Request bodies: a JSON object, or an empty body if every field has a default.
 
 use axum::body::Bytes;
 use axum::extract::rejection::BytesRejection;
@@ -10,7 +10,7 @@ use serde::de::{DeserializeOwned, IgnoredAny};
 use super::problem::{Code, Problem};
 use super::security::too_large;
 
-/// What a client wants; the defaults where there is no body.
+/// A parsed body; the defaults if the body is empty.
 pub(super) struct Body<T>(pub(super) T);
 
 impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Body<T> {
@@ -42,7 +42,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Body<T> {
             };
             Problem::new(code, format!("the body: {error}"))
         };
-        // serde would take a list for an object.
+        // serde would accept an array as an object.
         if !body.trim_ascii_start().starts_with(b"{") {
             serde_json::from_slice::<IgnoredAny>(&body).map_err(problem)?;
             let detail = "the body must be a JSON object";

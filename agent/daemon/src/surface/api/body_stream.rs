@@ -26,7 +26,7 @@ pub(super) fn stream_of<S: Pieces>(
 
 /// Appends a line of JSON to `lines`.
 pub(super) fn write_line(lines: &mut Vec<u8>, line: &impl Serialize) {
-    // Plain numbers and strings into memory: nothing that could fail.
+    // Serializing plain numbers and strings into memory cannot fail.
     let _ = serde_json::to_writer(&mut *lines, line);
     lines.push(b'\n');
 }

@@ -1,7 +1,7 @@
-//! `/recordings/{name}/files`: the files of a bag, to be taken away from the robot.
+//! `/recordings/{name}/files`: downloads of a bag's files.
 //!
-//! A file is named as the listing names it: a plain file of the recording's own directory. Nothing
-//! is followed out of it.
+//! Only files in the listing are served: plain files in the recording's own directory. Links are
+//! not followed.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
@@ -24,9 +24,9 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::recordings::find;
 use ros2probe_api::recordings::{RecordingFile, RecordingFiles};
 
-/// Files of one bag that are listed.
+/// Largest number of files listed per bag.
 const MAX_FILES: usize = 10_000;
-/// Bytes that are read at once.
+/// Bytes read at once.
 const PIECE: usize = 64 << 10;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -40,10 +40,10 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     get,
     path = "/recordings/{name}/files",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 200, description = "Its files.", body = RecordingFiles),
-        (status = 404, description = "No such name.",
+        (status = 200, description = "The files of the recording.", body = RecordingFiles),
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -59,7 +59,8 @@ async fn list(
 
 /// A file of a recording
 ///
-/// As long as it is when it is asked for: one that is being written goes on.
+/// The answer has the file's length at the time of the request; later data of a growing file is not
+/// included.
 #[utoipa::path(
     get,
     path = "/recordings/{name}/files/{file}",
@@ -69,9 +70,9 @@ async fn list(
         ("file" = String, Path, description = "Name of the file."),
     ),
     responses(
-        (status = 200, description = "Its bytes.", body = Vec<u8>,
+        (status = 200, description = "The content of the file.", body = Vec<u8>,
             content_type = "application/octet-stream"),
-        (status = 404, description = "No such name.",
+        (status = 404, description = "The recording or the file does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -81,7 +82,7 @@ async fn download(
 ) -> Result<Response, Problem> {
     let recording = find(&context, &name)?;
     let opened = spawn_blocking(move || {
-        // Only what the listing has: no path leads out of the directory.
+        // Only listed files are served, so no path leads out of the directory.
         let files = files(&recording.directory);
         let found = files.into_iter().find(|each| each.file == file)?;
         let open = File::open(recording.directory.join(&found.file)).ok()?;
@@ -100,7 +101,7 @@ async fn download(
         Some(
             match read.unwrap_or_else(|error| Err(io::Error::other(error))) {
                 Ok((piece, rest)) => (Ok(piece), Some(rest)),
-                // The client sees that bytes are missing.
+                // The connection breaks, so the client notices the missing bytes.
                 Err(error) => (Err(error), None),
             },
         )
@@ -118,7 +119,7 @@ async fn download(
     Ok((headers, Body::from_stream(pieces)).into_response())
 }
 
-/// The next bytes of a file, and what is left of it.
+/// Reads the next bytes of a file. Returns them with the rest to read.
 fn piece(mut file: File, left: u64) -> io::Result<(Bytes, (File, u64))> {
     let mut piece = Vec::with_capacity(PIECE);
     let most = left.min(PIECE as u64);
@@ -129,12 +130,12 @@ fn piece(mut file: File, left: u64) -> io::Result<(Bytes, (File, u64))> {
     Ok((piece.into(), (file, left - read)))
 }
 
-/// Plain files of a directory, whose names can stand in a header.
+/// Returns the plain files of a directory whose names are valid in a header.
 fn files(directory: &FilePath) -> Vec<RecordingFile> {
     let entries = fs::read_dir(directory).into_iter().flatten();
     let files = entries.filter_map(|entry| {
         let entry = entry.ok()?;
-        // Of the entry itself: no link is followed.
+        // The metadata are those of the entry itself, so links are not followed.
         let metadata = entry.metadata().ok().filter(fs::Metadata::is_file)?;
         let file = entry.file_name().into_string().ok()?;
         let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);

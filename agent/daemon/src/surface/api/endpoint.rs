@@ -1,4 +1,4 @@
-//! Writers and readers as answers show them, with what they offer or ask for.
+//! Writers and readers in answers, with the QoS that they offer or request.
 
 use std::borrow::Cow;
 
@@ -9,7 +9,7 @@ use ros2probe_model::snapshot::{EndpointFacts, ProcessFacts};
 use ros2probe_wire::Duration;
 use ros2probe_wire::rtps::VendorId;
 
-/// One writer or reader.
+/// Returns the answer's form of a writer or reader.
 pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpoint<'a> {
     let qos = &facts.qos;
     let participant = index.participant(facts.guid);
@@ -37,7 +37,7 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
     }
 }
 
-/// Where something lives, as far as it is known.
+/// Returns the known host and process of a participant.
 pub(super) fn process(facts: &ProcessFacts) -> Process<'_> {
     Process {
         host: facts.host.as_deref().map(Cow::Borrowed),
@@ -47,7 +47,7 @@ pub(super) fn process(facts: &ProcessFacts) -> Process<'_> {
     }
 }
 
-/// A vendor in words, or its two bytes in hex.
+/// Returns the name of a vendor, or its two bytes in hexadecimal.
 pub(super) fn vendor(vendor: VendorId) -> Cow<'static, str> {
     match vendor.name() {
         Some(name) => Cow::Borrowed(name),
@@ -55,7 +55,7 @@ pub(super) fn vendor(vendor: VendorId) -> Cow<'static, str> {
     }
 }
 
-/// A duration in seconds; `None` if it never ends.
+/// Returns a duration in seconds, or `None` if it is infinite.
 #[expect(clippy::cast_precision_loss, reason = "microseconds survive")]
 pub(super) fn seconds(duration: Duration) -> Option<f64> {
     duration
@@ -63,7 +63,7 @@ pub(super) fn seconds(duration: Duration) -> Option<f64> {
         .map(|nanoseconds| nanoseconds as f64 / 1e9)
 }
 
-/// Texts of the snapshot, borrowed.
+/// Returns borrowed texts of the snapshot.
 pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
     texts
         .iter()
@@ -71,7 +71,7 @@ pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
         .collect()
 }
 
-/// Each as it is printed.
+/// Returns each value as displayed text.
 pub(super) fn printed<T: ToString>(values: &[T]) -> Vec<String> {
     values.iter().map(ToString::to_string).collect()
 }

@@ -1,8 +1,8 @@
-//! `GET /events`: what happens, as server-sent events (WHATWG HTML, 9.2).
+//! `GET /events`: events as server-sent events (WHATWG HTML, 9.2).
 //!
-//! Each stream has its own place in the log of events and reads as fast as its client does; it
-//! delays no other. `lagged` reports what is overwritten before a slow client came to it. Streams
-//! are limited in number and end when the agent ends.
+//! Each stream has its own position in the event log and is read at its client's speed without
+//! delaying others. `lagged` reports events that were overwritten before a slow client read them.
+//! The number of streams is limited, and all end when the agent stops.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -34,55 +34,56 @@ use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
 use ros2probe_wire::DomainId;
 
-/// Streams at once, of all listeners: fewer than connections, so that requests find one.
+/// Slots for streams of all listeners: fewer than connections, so that other requests still get
+/// one.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);
 const MAX_STREAMS: usize = 16;
-/// Pause after which a stream says that it is alive.
+/// Silence after which a stream sends a comment.
 const BEAT: Duration = Duration::from_secs(15);
-/// After how long a client that was cut off should come again.
+/// Time after which a disconnected client should reconnect.
 const RETRY: Duration = Duration::from_secs(2);
-/// Events made into text at once.
+/// Largest number of events formatted at once.
 const BATCH: usize = 64;
-/// Names or topics in one filter.
+/// Largest number of names or topics per filter.
 const MAX_FILTERS: usize = 32;
-/// Characters of a filter by name, and by topic.
+/// Largest number of characters in a filter by name, and by topic.
 const MAX_NAMES: usize = 1_024;
 const MAX_TOPICS: usize = 4_096;
-/// Stands for the place in front of the oldest event that is kept.
+/// Id of the position before the oldest event in the log.
 const OLDEST: &str = "0";
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 struct Selection {
-    /// Events behind this id; `0` = all that are kept. Without it, and without the header
-    /// `Last-Event-ID`, which goes first: those that are still to come.
+    /// Events after this id; `0` for all events in the log. The header `Last-Event-ID` takes
+    /// precedence. Without both, only future events are sent.
     #[param(pattern = r"^(0|[0-9a-f]{1,16}-[0-9]{1,19})$", example = "0")]
     after: Option<String>,
-    /// Only events of these names, separated by commas; `*` at the end of one stands for any rest.
+    /// Event names to include, separated by commas; a final `*` matches any ending.
     #[param(max_length = 1024, example = "ros2.message.lost,ros2.topic.*")]
     name: Option<String>,
-    /// Only events about these topics, separated by commas: ROS names or globs as in a watch.
+    /// Topics whose events to include, separated by commas: ROS names or globs as in a watch.
     #[param(max_length = 4096, example = "/points")]
     topic: Option<String>,
-    /// Whether to wait for what is to come; `false` ends the stream behind the latest event.
+    /// Whether to wait for future events; `false` ends the stream after the latest event.
     follow: Option<bool>,
 }
 
-/// What one client wants to see.
+/// The events that one client selects.
 #[derive(Debug, Default)]
 struct Filter {
     names: Vec<String>,
     topics: Option<Watchlist>,
 }
 
-/// One client's stream.
+/// The stream of one client.
 struct Stream {
     log: Arc<EventLog>,
     stop: CancellationToken,
     filter: Filter,
     follow: bool,
-    /// The number of the last event that was looked at.
+    /// Number of the last event that was processed.
     place: u64,
     waiting: VecDeque<Event>,
     _permit: SemaphorePermit<'static>,
@@ -92,13 +93,14 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(events))
 }
 
-/// What happens, as it happens
+/// Events as they occur
 ///
-/// Server-sent events: each message has the event's name as `event`, its id as `id` and an `Event`
-/// as `data`. A client that comes again with the last id gets what it missed, as far as it is kept
-/// (the last 4096 events). What it does not get is told by a message `lagged` whose data have `missed`,
-/// a number or null, and `reason`: `overwritten` before it could be sent, or `restarted`, for an id
-/// of an earlier run of the agent. Comments keep the stream alive.
+/// Each server-sent event has the event's name as `event`, its id as `id` and an `Event` as `data`.
+/// A client that reconnects with the last id receives the events in between, if the log still has
+/// them (the last 4096 events). Otherwise it receives an event named `lagged`. Its data contain
+/// `missed`, a number or null, and `reason`. `overwritten`: the log dropped the events before they
+/// were sent. `restarted`: the id belongs to an earlier run of the agent. Comments keep the
+/// connection alive.
 #[utoipa::path(
     get,
     path = "/events",
@@ -111,7 +113,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses(
         (status = 200, description = "Events, until the client disconnects or the agent stops.",
             body = answers::Event<'static>, content_type = "text/event-stream"),
-        (status = 422, description = "No such event name or topic, or an invalid id.",
+        (status = 422, description = "An event name, topic or id is invalid.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 503, description = "Too many streams, or the agent is shutting down.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -127,7 +129,7 @@ async fn events(
     let last_event_id = last_event_id
         .transpose()
         .map_err(|_| no_id("Last-Event-ID"))?;
-    // A client that has received nothing yet sends an empty one.
+    // A client that has not received an event yet sends an empty header.
     let last_event_id = last_event_id.filter(|id| !id.is_empty());
     let log = Arc::clone(&context.events);
     let (place, restarted) = match last_event_id.or(selection.after.as_deref()) {
@@ -182,7 +184,7 @@ impl Pieces for Stream {
                 () = self.log.wait(self.place) => {}
                 () = self.stop.cancelled() => return None,
                 () = sleep(BEAT) => {
-                    // Also tells how far a filter has looked.
+                    // The id also states how far a filter has read.
                     let beat = Event::default().comment("").id(self.log.id(self.place));
                     return Some(beat);
                 }
@@ -192,8 +194,8 @@ impl Pieces for Stream {
 }
 
 impl Stream {
-    /// The first message tells the place, so that a client that is cut off before the first event
-    /// comes back to it.
+    /// Queues a first message with the position, so that a client that disconnects before the first
+    /// event can resume there.
     fn begin(&mut self, restarted: bool) {
         let greeting = Event::default().comment("ros2probe").retry(RETRY);
         self.waiting.push_back(greeting.id(self.log.id(self.place)));
@@ -201,7 +203,7 @@ impl Stream {
             self.lag(None, "restarted");
         }
     }
-    /// Takes the next events into `waiting`; whether there were any.
+    /// Moves the next events into `waiting`; returns whether there were any.
     fn read(&mut self) -> bool {
         let batch = self.log.read(self.place, BATCH);
         if batch.lagged > 0 {
@@ -234,12 +236,12 @@ impl Stream {
 
     fn text(&self, record: &Record) -> String {
         let view = event(&self.log, record);
-        // Written to memory, which does not fail.
+        // Serializing into memory cannot fail.
         serde_json::to_string(&view).unwrap_or_default()
     }
 }
 
-/// An event, as an answer shows it.
+/// Returns the answer's form of an event.
 pub(super) fn event<'a>(log: &EventLog, record: &'a Record) -> answers::Event<'a> {
     let attributes = record.attributes.iter();
     let attributes = attributes.map(|(name, value)| {
@@ -393,7 +395,7 @@ mod tests {
         while stream.next().await.is_some() {
             count += 1;
         }
-        // The greeting, `lagged` and the event.
+        // The messages are the greeting, `lagged` and the event.
         assert_eq!(count, 3);
     }
 }

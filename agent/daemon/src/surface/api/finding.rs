@@ -1,4 +1,4 @@
-//! What is wrong with the graph, as answers show it.
+//! Problems of the graph in answers.
 
 use std::borrow::Cow;
 
@@ -6,7 +6,7 @@ use super::endpoint::{printed, texts};
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
 use ros2probe_model::diagnosis;
 
-/// One finding.
+/// Returns the answer's form of a problem.
 pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
     let known = match finding {
         diagnosis::Diagnosis::QosIncompatible {

@@ -1,4 +1,4 @@
-//! `/graph`: who is joined to whom, as vertices and edges to be drawn.
+//! `/graph`: nodes, topics, services and actions as vertices and edges.
 
 use std::collections::BTreeMap;
 
@@ -21,7 +21,7 @@ use ros2probe_api::graph::{Edge, EdgeKind, Graph, Vertex, VertexKind};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_model::topic_kind::TopicKind;
 
-/// What is drawn so far.
+/// The graph under construction.
 #[derive(Debug, Default)]
 struct Drawing {
     vertices: BTreeMap<String, (VertexKind, u32, String)>,
@@ -94,7 +94,7 @@ impl Drawing {
         id
     }
 
-    /// A node, or the participant where there is none.
+    /// Adds a node, or its participant if the node is unknown. Returns the id.
     fn party(&mut self, domain_id: u32, (node, participant): (Option<&str>, Guid)) -> String {
         match node {
             Some(node) => self.vertex(VertexKind::Node, domain_id, node),
@@ -127,7 +127,7 @@ impl Drawing {
         }
     }
 
-    /// A service or action, unless it has no endpoint.
+    /// Adds a service or action that has endpoints.
     fn joint(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
         if parties.is_empty() {
             return;

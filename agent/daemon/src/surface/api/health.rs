@@ -1,4 +1,4 @@
-//! `GET /health`: whether the agent sees the robot, and how well.
+//! `GET /health`: whether the agent observes the robot, and how completely.
 
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
@@ -16,19 +16,19 @@ use crate::surface::otlp::Host;
 use crate::surface::process::Process;
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
 
-/// Read once: a robot is not renamed while its agent runs.
+/// Read once, because the host's name rarely changes while the agent runs.
 pub(super) static HOST: LazyLock<Option<String>> = LazyLock::new(|| Host::read().name);
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(health))
 }
 
-/// Whether the agent sees the robot
+/// Whether the agent observes the robot
 #[utoipa::path(
     get,
     path = "/health",
     tag = "agent",
-    responses((status = 200, description = "How it is, also when it is not well.", body = Health))
+    responses((status = 200, description = "The state of the agent, even if it is not ready.", body = Health))
 )]
 async fn health(State(context): State<Context>) -> Json<Health> {
     let state = context.latest.state();

@@ -1,4 +1,4 @@
-//! `/topics/{topic}/history`: what was measured of a topic in each of the last seconds, as columns.
+//! `/topics/{topic}/history`: measurements of the last seconds as columns.
 
 use axum::Json;
 use axum::response::{IntoResponse, Response};
@@ -12,19 +12,20 @@ use ros2probe_api::topics::History;
 
 /// The last minutes of a topic
 ///
-/// As many seconds as `page.history_s` says, the oldest first. A topic has a history while it is
-/// measured. A name with encoded slashes (`/topics/%2Fcamera%2Fimage/history`) is the topic's for
-/// certain; `/topics/camera/history` is the topic `/camera/history` where there is one.
+/// The answer covers as many seconds as `page.history_s`, the oldest first. A topic has a history
+/// while it is measured. A path such as `/topics/camera/history` means the topic `/camera/history`
+/// if that exists. With encoded slashes (`/topics/%2Fcamera%2Fimage/history`), the path is
+/// unambiguous.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/history",
     tag = "graph",
     params(TopicParameter, Domain),
     responses(
-        (status = 200, description = "Its last minutes.", body = History),
-        (status = 404, description = "No such topic.",
+        (status = 200, description = "The last minutes of the topic.", body = History),
+        (status = 404, description = "The topic does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It is in several domains.",
+        (status = 409, description = "The name exists in several domains; add `domain_id`.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -46,7 +47,7 @@ pub(super) async fn show(
     let seconds = past.topic(topic.domain_id, &topic.dds_name);
     for (at, reading) in seconds.into_iter().flatten() {
         let row = reading.as_ref().map(|reading| &reading.row);
-        // What came before its first row says nothing.
+        // Seconds before the topic's first row are omitted.
         if row.is_none() && view.times.is_empty() {
             continue;
         }
@@ -71,7 +72,7 @@ pub(super) async fn show(
     Ok(Json(view).into_response())
 }
 
-/// The digits that a percentile has.
+/// Rounds to the precision of a stored percentile.
 pub(super) fn short(value: f32) -> f64 {
     let value = f64::from(value);
     if value <= 0.0 || !value.is_finite() {
@@ -86,7 +87,7 @@ pub(super) fn short(value: f32) -> f64 {
     (value * scale).round() / scale
 }
 
-/// Three digits behind the point.
+/// Rounds to three decimal places.
 pub(super) fn thousandths(value: f64) -> f64 {
     (value * 1e3).round() / 1e3
 }

@@ -1,4 +1,4 @@
-//! Who is who in one snapshot: built once for an answer, asked for every line of it.
+//! Lookup tables of one snapshot, built once per answer.
 
 use std::collections::HashMap;
 
@@ -9,10 +9,10 @@ use ros2probe_model::snapshot::{
     EndpointFacts, ParticipantFacts, Snapshot, TopicFacts, WatchFacts, WatchedTopicFacts,
 };
 
-/// A watchlist entry and how a topic stands with it.
+/// A watchlist entry and the state of a topic under it.
 pub(super) type Standing<'a> = (&'a WatchFacts, &'a WatchedTopicFacts);
 
-/// What an answer looks up.
+/// The lookup tables of an answer.
 #[derive(Debug)]
 pub(super) struct Index<'a> {
     participants: HashMap<GuidPrefix, &'a ParticipantFacts>,
@@ -20,7 +20,7 @@ pub(super) struct Index<'a> {
     watches: HashMap<(DomainId, &'a str), Vec<Standing<'a>>>,
 }
 
-/// Endpoints and their topics, by GUID.
+/// Endpoints with their topics, by GUID.
 #[derive(Debug)]
 pub(super) struct Ends<'a>(HashMap<Guid, (&'a TopicFacts, &'a EndpointFacts)>);
 
@@ -52,7 +52,7 @@ impl<'a> Index<'a> {
         self.participants.get(&guid.prefix).copied()
     }
 
-    /// What is wrong with a topic.
+    /// Returns the problems of a topic.
     pub(super) fn findings(&self, topic: &'a TopicFacts) -> &[&'a Diagnosis] {
         let found = self
             .findings
@@ -60,8 +60,8 @@ impl<'a> Index<'a> {
         found.map_or(&[], Vec::as_slice)
     }
 
-    /// Entries that cover a topic. A service's requests and replies bear the service's name: they
-    /// are covered only when they are measured.
+    /// Returns the entries that cover a topic. Request and reply topics share the service's name
+    /// and are covered only if they are measured.
     pub(super) fn watches(&self, topic: &'a TopicFacts) -> &[Standing<'a>] {
         if topic.measurement.is_none() {
             return &[];

@@ -1,4 +1,4 @@
-//! Numbers of a topic, a writer or a way to a receiver, as answers show them.
+//! Counts and times of topics, writers and deliveries in answers.
 
 use ros2probe_api::measurement::{
     Breakdown, Bucket, Delivered, Distribution, Measurement, Sampled,
@@ -6,7 +6,7 @@ use ros2probe_api::measurement::{
 use ros2probe_model::histogram::Histogram;
 use ros2probe_model::snapshot;
 
-/// The buckets of a histogram; none while it is empty.
+/// Returns the buckets of a histogram; empty if the histogram is.
 pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
     let buckets = values.buckets().filter(|_| values.count() > 0);
     let bucket = |(upper, count): (f64, u64)| Bucket {
@@ -16,7 +16,7 @@ pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
     buckets.map(bucket).collect()
 }
 
-/// What was counted of a topic or writer.
+/// Returns the answer's form of a measurement.
 #[expect(
     clippy::cast_precision_loss,
     reason = "a ratio of counts far below 2^52"
@@ -51,7 +51,7 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
     }
 }
 
-/// What became of messages on their way.
+/// Returns the answer's form of a delivery's counts.
 pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
     Delivered {
         messages: facts.messages,
@@ -68,7 +68,7 @@ pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
     }
 }
 
-/// Where messages spent their time on this host.
+/// Returns the answer's form of the stages' times.
 pub(super) fn breakdown(facts: &snapshot::Breakdown) -> Breakdown {
     Breakdown {
         send_delay: distribution(&facts.send_delay),
@@ -78,7 +78,7 @@ pub(super) fn breakdown(facts: &snapshot::Breakdown) -> Breakdown {
     }
 }
 
-/// `None` while there is no value.
+/// Returns the distribution, or `None` if the histogram is empty.
 #[expect(
     clippy::cast_precision_loss,
     reason = "a mean of counts far below 2^52"

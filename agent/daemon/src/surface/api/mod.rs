@@ -1,7 +1,7 @@
-//! The control API: REST over a loopback address and a unix socket, described by its OpenAPI
-//! document. It reads snapshots and changes what is watched; it never makes the capture wait.
+//! The control API: REST over a loopback address and a unix socket, described by an OpenAPI
+//! document. It reads snapshots and changes the watches; the capture never waits for it.
 //!
-//! A module for each noun gives its routes; what every request has to pass is in `security`.
+//! Each noun has a module with its routes; `security` holds the checks of every request.
 
 mod actions;
 mod body;
@@ -72,49 +72,49 @@ use ros2probe_message::Library;
 use security::{Door, Needs};
 pub use server::{OpenError, Server};
 
-/// How long a reader waits for a snapshot that knows what was asked for just before.
+/// Longest time that a request waits for a snapshot that includes earlier requests.
 const TIMEOUT: Duration = Duration::from_millis(600);
 
-/// What the routes work on.
+/// State that the routes share.
 #[derive(Clone)]
 pub struct Context {
     /// The latest snapshot.
     pub latest: Arc<SnapshotCell>,
-    /// What happened lately.
+    /// The event log.
     pub events: Arc<EventLog>,
-    /// The caps, and what reached them.
+    /// The limits and their use.
     pub limits: Arc<LimitFigures>,
-    /// What recordings have done.
+    /// Counters of recordings.
     pub recording_figures: Arc<RecordingFigures>,
-    /// What is watched.
+    /// The watches.
     pub watches: Arc<Watches>,
-    /// Who gets messages one by one.
+    /// The subscriptions.
     pub subscriptions: Arc<Subscriptions>,
     /// Bags that the agent writes.
     pub recordings: Arc<Recordings>,
     /// The last seconds of some topics.
     pub snapshots: Arc<Snapshots>,
-    /// What streams of the page have in common.
+    /// State that all streams of the web page share.
     pub live: Arc<Live>,
-    /// Definitions of messages.
+    /// Message definitions.
     pub library: Arc<Library>,
-    /// The page for browsers.
+    /// The web page.
     pub page: Arc<Page>,
-    /// Has the configuration read again.
+    /// Reloads the configuration.
     pub reloader: Reloader,
-    /// Ends streams when the agent ends.
+    /// Ends the streams when the agent stops.
     pub stop: CancellationToken,
 }
 
 impl Context {
-    /// What is known at this moment, or a little earlier where the capture has no time.
+    /// Returns the current state, or a slightly older one if the capture is busy.
     async fn state(&self) -> Arc<State> {
         self.latest.refresh(TIMEOUT).await;
         self.latest.state()
     }
 }
 
-/// The routes of all nouns and what the document says of them.
+/// Returns the routes of all nouns with their part of the document.
 fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
     let turns = |views: OpenApiRouter<Context>| match context {
         Some(context) => views.layer(middleware::from_fn_with_state(context.clone(), take_turns)),
@@ -140,7 +140,7 @@ fn nouns(context: Option<&Context>) -> OpenApiRouter<Context> {
         .merge(openapi::routes())
 }
 
-/// What tells all there is of something.
+/// Returns the routes of large answers.
 fn views() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
         .merge(topics::routes())
@@ -152,14 +152,15 @@ fn views() -> OpenApiRouter<Context> {
         .merge(names::routes())
 }
 
-/// Views that are being made and read.
+/// Large answers that are being created and read.
 static VIEWS: LargeResponses = LargeResponses::new();
 
-/// Marks a response that is a stream: it is passed on as it comes, and takes no turn of a view.
+/// Marks a streamed response, which is sent as it is produced and takes no permit of a large
+/// answer.
 #[derive(Clone, Copy, Debug)]
 struct Streamed;
 
-/// Few views at a time: see [`super::large`].
+/// Limits the number of large answers; see [`super::large_responses`].
 async fn take_turns(Extract(context): Extract<Context>, request: Request, next: Next) -> Response {
     let Some(turn) = VIEWS.turn().await else {
         context.limits.reached(Limit::ApiClients, 1);
@@ -180,7 +181,7 @@ async fn take_turns(Extract(context): Extract<Context>, request: Request, next: 
     }
 }
 
-/// What answers behind `door`.
+/// Returns the routes behind `door`.
 fn router(context: &Context, door: Arc<Door>) -> Router {
     let (router, _) = nouns(Some(context)).split_for_parts();
     let files = (door.is_for_browsers() && context.page.is_served()).then(|| {

@@ -1,5 +1,5 @@
-//! `/names`: what there is, by name, type and number, without a word on each endpoint: a graph of
-//! a thousand topics in a tenth of what `/topics` says of it.
+//! `/names`: names, types and numbers of endpoints, without details of each. The answer has about a
+//! tenth of the size of `/topics`.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -85,7 +85,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
     }
 }
 
-/// What `ros2` takes for a topic, while it has an endpoint.
+/// Returns the topic if it has endpoints and `ros2` lists it as a topic.
 fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
     let is_topic = facts.kind.is_ros_topic();
     let (publishers, subscriptions) = (facts.publishers.len(), facts.subscriptions.len());
@@ -99,7 +99,7 @@ fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
     })
 }
 
-/// `None` without any endpoint.
+/// Returns `None` for a service without endpoints.
 fn service<'a>(domain_id: u32, name: &'a str, halves: &Halves<'a>) -> Option<ServiceName<'a>> {
     let ends = |topic: Option<&TopicFacts>| {
         topic.map_or((0, 0), |topic| {

@@ -1,11 +1,11 @@
-//! Names that somebody may have meant who asked for one that does not exist.
+//! Suggestions for names that do not exist.
 
-/// Names that are suggested at most.
+/// Largest number of suggestions.
 const SUGGESTIONS: usize = 3;
-/// Names that are compared at most: a hint is not worth more.
+/// Largest number of names compared.
 const COMPARED: usize = 2000;
 
-/// " Did you mean ...?", or nothing.
+/// Returns " Did you mean ...?", or an empty string without a similar name.
 pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> String {
     let near = nearest(wanted, names);
     if near.is_empty() {
@@ -14,11 +14,11 @@ pub(super) fn hint<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> St
     format!("; did you mean {}?", near.join(" or "))
 }
 
-/// The nearest first.
+/// Returns the most similar names, the nearest first.
 fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
     let limit = (wanted.len() / 4).clamp(2, 6);
     let near = names.take(COMPARED).filter_map(|name| {
-        // The namespace forgotten, or one too many.
+        // The namespace is missing, or is one too many.
         let is_end = name.ends_with(wanted) || wanted.ends_with(name);
         let steps = distance(wanted.as_bytes(), name.as_bytes(), limit);
         let steps = if is_end && name.len() > 1 {
@@ -35,7 +35,7 @@ fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Vec<&'a st
     near.into_iter().map(|(_, name)| name).collect()
 }
 
-/// How many bytes have to be added, taken away or replaced, if at most `limit`.
+/// Returns the edit distance in bytes, or `None` if it exceeds `limit`.
 fn distance(one: &[u8], other: &[u8], limit: usize) -> Option<usize> {
     if one.len().abs_diff(other.len()) > limit {
         return None;

@@ -1,4 +1,5 @@
-//! `/nodes`: ROS nodes with all they publish, subscribe, serve and call, as `ros2 node info` says.
+//! `/nodes`: ROS nodes with their publishers, subscriptions, services and actions, as `ros2 node
+//! info` prints them.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -72,9 +73,9 @@ async fn list(
     params(NodeParameter, Scope),
     responses(
         (status = 200, description = "The node.", body = Node<'static>),
-        (status = 404, description = "No such node.",
+        (status = 404, description = "The node does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It is in several domains.",
+        (status = 409, description = "The name exists in several domains; add `domain_id`.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -101,7 +102,7 @@ async fn show(
     Ok(Json(answers.node(nodes)).into_response())
 }
 
-/// The node in a path, for the document.
+/// The path parameter, for the document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
@@ -111,7 +112,7 @@ struct NodeParameter {
     node: String,
 }
 
-/// Nodes of one name in one domain, together.
+/// Groups the nodes by domain and name.
 fn nodes(snapshot: &Snapshot) -> impl Iterator<Item = &[NodeFacts]> {
     snapshot.nodes.chunk_by(|one, other| {
         (one.domain_id, one.name.as_str()) == (other.domain_id, other.name.as_str())
@@ -122,7 +123,7 @@ fn is_hidden(name: &str) -> bool {
     name.split('/').any(|token| token.starts_with('_'))
 }
 
-/// What answers are made of.
+/// Input of the answers.
 struct NodeAnswers<'a> {
     snapshot: &'a Snapshot,
     index: Index<'a>,
@@ -152,7 +153,7 @@ impl<'a> NodeAnswers<'a> {
             let Some((topic, endpoint)) = self.ends.endpoint(*guid) else {
                 continue;
             };
-            // Not the topic's types: nodes of another type may be on it.
+            // The type is the endpoint's, since other nodes may use another type on the topic.
             let message_type = endpoint.message_type.as_str();
             let side = Side::of(topic, is_writer);
             if let (Some(side), Some((name, _))) = (side, action(topic)) {

@@ -1,5 +1,5 @@
-//! The OpenAPI document: made of what the routes say of themselves, completed with what holds for
-//! all of them. It is checked in as `config/openapi.json`; a test compares.
+//! The OpenAPI document: derived from the routes, then completed with their common parts. A test
+//! compares it with `config/openapi.json`.
 
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
@@ -20,7 +20,7 @@ use utoipa_axum::routes;
 use super::problem::{MEDIA_TYPE, ProblemBody};
 use super::{Context, nouns};
 
-/// Answers that any request may get, whatever it asks for.
+/// Answers that any request may receive.
 const COMMON: [(&str, &str); 6] = [
     ("400", "The request cannot be read."),
     ("401", "The listener wants a bearer token."),
@@ -37,21 +37,21 @@ const COMMON: [(&str, &str); 6] = [
 #[openapi(
     info(
         title = "ros2probe",
-        description = "Control API of the ros2probe agent on one robot: what is watched, and what is known.",
+        description = "Control API of the ros2probe agent on one robot: watches, measurements and recordings.",
         license(name = "Apache-2.0 OR MIT", identifier = "Apache-2.0 OR MIT")
     ),
-    // Answered by the route of topics, whose names may have any number of slashes.
+    // The route of topics also serves these paths, because names may contain slashes.
     paths(
         super::history::show,
         super::messages::definition,
         super::messages::follow
     ),
-    // The schema of a type parameter is not collected by itself.
+    // utoipa does not collect the schema of a type parameter.
     components(schemas(ProblemBody, super::messages::MessageLine)),
     tags(
         (name = "watch", description = "Watches, changed while the agent runs."),
-        (name = "events", description = "Events, as they happen."),
-        (name = "samples", description = "Messages of topics, one by one, as they come."),
+        (name = "events", description = "Events as they occur."),
+        (name = "samples", description = "Messages of topics as they arrive."),
         (name = "recordings", description = "Bags that the agent writes."),
         (name = "graph", description = "The robot's graph and measurements."),
         (name = "agent", description = "The agent itself."),
@@ -59,7 +59,7 @@ const COMMON: [(&str, &str); 6] = [
 )]
 struct Head;
 
-/// What the document begins with.
+/// Returns the metadata of the document.
 pub(super) fn head() -> utoipa::openapi::OpenApi {
     Head::openapi()
 }
@@ -68,14 +68,14 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(openapi))
 }
 
-/// The whole document.
+/// Returns the complete document.
 #[must_use]
 pub fn document() -> utoipa::openapi::OpenApi {
     let mut document = nouns(None).into_openapi();
     let paths = std::mem::take(&mut document.paths.paths);
     for (path, mut item) in paths {
         operations(&mut item).for_each(complete);
-        // The router's mark for a parameter that may hold slashes.
+        // The router marks parameters that may contain slashes with `*`.
         document.paths.paths.insert(path.replace("{*", "{"), item);
     }
     let bodies = request_bodies(&document);
@@ -102,7 +102,7 @@ fn operations(item: &mut PathItem) -> impl Iterator<Item = &mut Operation> {
 }
 
 fn complete(operation: &mut Operation) {
-    // No request needs one.
+    // All request bodies are optional.
     if let Some(RefOr::T(body)) = &mut operation.request_body {
         body.required = Some(Required::False);
     }
@@ -119,7 +119,7 @@ fn complete(operation: &mut Operation) {
     }
 }
 
-/// Schemas of what clients send.
+/// Returns the names of the schemas that clients send.
 fn request_bodies(document: &utoipa::openapi::OpenApi) -> BTreeSet<String> {
     let mut names = BTreeSet::new();
     let bodies = serde_json::to_value(&document.paths).unwrap_or_default();
@@ -144,8 +144,8 @@ fn request_bodies(document: &utoipa::openapi::OpenApi) -> BTreeSet<String> {
     names
 }
 
-/// Sorts the properties. A client reads an answer's field that an older agent does not send as its
-/// default; the document is about this agent, which sends all of them.
+/// Sorts the properties of a schema. Clients tolerate missing fields of older agents; the document
+/// describes this agent, which sends all of them.
 fn complete_schema(schema: &mut RefOr<Schema>, is_answer: bool) {
     let items = match schema {
         RefOr::T(Schema::Object(object)) => {
@@ -167,7 +167,7 @@ fn complete_schema(schema: &mut RefOr<Schema>, is_answer: bool) {
     }
 }
 
-/// Makes properties with a default required, unless it is null.
+/// Makes properties with a default required, unless the default is null.
 fn require_all(object: &mut Object) {
     let defaults = object.properties.values_mut().map(take_default);
     let defaults: Vec<_> = defaults.collect();

@@ -1,5 +1,4 @@
-//! What requests say beside their bodies: a topic in the path, and the query. What cannot be read
-//! is a problem like any other.
+//! Path and query parameters. An invalid parameter is answered with problem details.
 
 use axum::extract::rejection::{PathRejection, QueryRejection};
 use axum::extract::{FromRequestParts, Path, Query};
@@ -9,12 +8,12 @@ use serde::de::DeserializeOwned;
 
 use super::problem::{Code, Problem};
 
-/// `{*topic}` at the end of a path: a ROS name with its leading slash, which the path leaves out,
-/// though a client that encodes the whole name may send it (`%2Fpoints`).
+/// `{*topic}` at the end of a path: a ROS name, whose leading slash the path may omit. A client
+/// that encodes the whole name sends it (`%2Fpoints`).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Name(pub(super) String);
 
-/// The query, with no parameter that is unknown.
+/// The query; unknown parameters are rejected.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Parameters<T>(pub(super) T);
 
@@ -50,10 +49,10 @@ impl<T> From<Query<T>> for Parameters<T> {
 }
 
 impl<T: DeserializeOwned> Parameters<T> {
-    /// Those of an address, where a route reads its query in more than one way.
+    /// Parses the query of an address, for routes with several forms of query.
     ///
     /// # Errors
-    /// A parameter is unknown, or its value is none.
+    /// Fails if a parameter is unknown or has an invalid value.
     pub(super) fn of(uri: &Uri) -> Result<Self, Problem> {
         let query = Query::<T>::try_from_uri(uri);
         query.map(Self::from).map_err(|error| problem(&error))

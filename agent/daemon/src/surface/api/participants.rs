@@ -1,4 +1,5 @@
-//! `/participants`: DDS participants, where they live, and who sends without having been announced.
+//! `/participants`: DDS participants with their processes, and active writers whose announcement
+//! was missed.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -19,7 +20,7 @@ use super::scope::Domain;
 use ros2probe_api::participants::{Participant, ParticipantList, UnknownWriter};
 use ros2probe_model::snapshot::{ParticipantFacts, Snapshot, UnknownWriterFacts};
 
-/// What participants have.
+/// Nodes, writers and readers of each participant.
 type Counts<'a> = HashMap<GuidPrefix, (Vec<Cow<'a, str>>, usize, usize)>;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {

@@ -1,4 +1,4 @@
-//! Who serves and who calls: the ends of services and actions, as their topics show them.
+//! Servers and clients of services and actions, derived from the endpoints of their topics.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -11,16 +11,16 @@ use ros2probe_api::services::Party;
 use ros2probe_model::snapshot::TopicFacts;
 use ros2probe_model::topic_kind::TopicKind;
 
-/// Which end of a service or action.
+/// A side of a service or action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Side {
-    /// Serves.
+    /// The server.
     Server,
-    /// Calls.
+    /// The client.
     Client,
 }
 
-/// Both ends, each party once.
+/// Servers and clients, without duplicates.
 #[derive(Debug, Default)]
 pub(super) struct Parties<'a> {
     pub(super) servers: Endpoints<'a>,
@@ -31,7 +31,8 @@ pub(super) struct Parties<'a> {
 type Endpoints<'a> = BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>;
 
 impl Side {
-    /// Of a writer or reader of this topic: a server reads requests and writes all else.
+    /// Returns the side of a writer or reader of this topic: a server reads requests and writes all
+    /// other topics.
     pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
         match (topic.kind, is_writer) {
             (TopicKind::ServiceRequest, false) | (TopicKind::ServiceReply, true) => {
@@ -40,7 +41,7 @@ impl Side {
             (TopicKind::ServiceRequest, true) | (TopicKind::ServiceReply, false) => {
                 Some(Self::Client)
             }
-            // A reader of feedback may be a client, or a tool.
+            // A reader of feedback may be a client or a tool.
             (TopicKind::ActionFeedback | TopicKind::ActionStatus, true) => Some(Self::Server),
             _ => None,
         }
@@ -48,7 +49,7 @@ impl Side {
 }
 
 impl<'a> Parties<'a> {
-    /// With the ends of one more topic.
+    /// Adds the endpoints of a topic.
     pub(super) fn add(&mut self, topic: &'a TopicFacts) {
         for (endpoints, is_writer) in [(&topic.publishers, true), (&topic.subscriptions, false)] {
             let parties = match Side::of(topic, is_writer) {
@@ -68,7 +69,7 @@ impl<'a> Parties<'a> {
         self.servers.is_empty() && self.clients.is_empty()
     }
 
-    /// Servers and clients, by node and participant.
+    /// Returns servers and clients, sorted by node and participant.
     pub(super) fn views(self) -> [Vec<Party<'a>>; 2] {
         [self.servers, self.clients].map(|parties| {
             let views = parties
@@ -86,14 +87,14 @@ impl<'a> Parties<'a> {
     }
 }
 
-/// The service of a topic's type: `pkg/srv/Add` of `pkg/srv/Add_Request`.
+/// Returns the service of a topic's type: `pkg/srv/Add` for `pkg/srv/Add_Request`.
 pub(super) fn service_type(message_type: &str) -> &str {
     let ends = ["_Request", "_Response"];
     let mut stems = ends.iter().filter_map(|end| message_type.strip_suffix(end));
     stems.next().unwrap_or(message_type)
 }
 
-/// The action that a topic or service is a part of.
+/// Returns the action that a topic or service belongs to.
 pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     match topic.kind {
         TopicKind::Topic | TopicKind::ServiceEvent | TopicKind::Discovery | TopicKind::Dds => None,
@@ -101,7 +102,8 @@ pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     }
 }
 
-/// The action's type from that of a part; `None` for parts whose type says nothing of it.
+/// Returns the action's type from the type of one of its topics, or `None` if that does not contain
+/// it.
 pub(super) fn action_type(message_type: &str) -> Option<&str> {
     const ENDS: [&str; 5] = [
         "_FeedbackMessage",

@@ -1,6 +1,6 @@
-//! The API within one process: requests come through pipes in memory instead of sockets.
+//! The API within one process: requests use pipes in memory instead of sockets.
 //!
-//! The process itself holds the other ends, so only the protection from floods remains.
+//! Only the process itself can send requests, so only the rate limit remains of the checks.
 
 use std::io;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use super::security::{Door, Granted, Kind};
 use super::{Context, router};
 use crate::config::Access;
 
-/// Pipes as they are opened.
+/// The stream of opened pipes.
 #[derive(Debug)]
 struct Pipes(mpsc::UnboundedReceiver<DuplexStream>);
 
@@ -24,7 +24,7 @@ impl Listener for Pipes {
     async fn accept(&mut self) -> (DuplexStream, ()) {
         match self.0.recv().await {
             Some(pipe) => (pipe, ()),
-            // No further request can come; the server ends with its runtime.
+            // No further pipe can be opened; the server ends with its runtime.
             None => std::future::pending().await,
         }
     }
@@ -34,10 +34,10 @@ impl Listener for Pipes {
     }
 }
 
-/// Answers on every pipe.
+/// Serves every pipe.
 ///
 /// # Errors
-/// Never: pipes do not fail to be accepted.
+/// Never fails, because accepting a pipe cannot fail.
 pub async fn serve(
     pipes: mpsc::UnboundedReceiver<DuplexStream>,
     context: Context,

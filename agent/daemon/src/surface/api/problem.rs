@@ -1,5 +1,4 @@
-//! What a refused request is answered with: problem details (RFC 9457), each kind with a stable
-//! code. Every code there is stands in [`Code`].
+//! Refusals of requests: problem details (RFC 9457), each kind with a stable code of [`Code`].
 
 use std::borrow::Cow;
 
@@ -9,7 +8,7 @@ use axum::response::{IntoResponse, Response};
 use ros2probe_api::problem::URN;
 pub use ros2probe_api::problem::{Code, MEDIA_TYPE, Problem as ProblemBody};
 
-/// Why a request was refused.
+/// A refusal of a request.
 #[derive(Clone, Debug)]
 pub struct Problem {
     code: Code,
@@ -18,7 +17,7 @@ pub struct Problem {
 }
 
 impl Problem {
-    /// Of this kind; `detail` says what is wrong with this request.
+    /// Creates a problem of this kind; `detail` describes it for this request.
     #[must_use]
     pub fn new(code: Code, detail: impl Into<Cow<'static, str>>) -> Self {
         Self {
@@ -28,13 +27,13 @@ impl Problem {
         }
     }
 
-    /// Its kind.
+    /// Returns the kind.
     #[must_use]
     pub const fn code(&self) -> Code {
         self.code
     }
 
-    /// With the mistakes of a configuration.
+    /// Returns the problem with the errors of a configuration.
     #[must_use]
     pub fn with_mistakes(self, mistakes: Vec<String>) -> Self {
         Self { mistakes, ..self }

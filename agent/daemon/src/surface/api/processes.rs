@@ -1,8 +1,7 @@
-//! `/processes`: CPU time and memory of the processes whose participants are known, read when they
-//! are asked for and at no other time.
+//! `/processes`: CPU time and memory of the processes of known participants, read at each request.
 //!
-//! A process id counts only where the kernel has named the process that holds a participant's
-//! socket: an id that a participant announces may belong to another host or namespace.
+//! Only processes are read that the kernel reports as owner of a participant's socket. A process id
+//! that a participant announces may belong to another host or namespace.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -19,7 +18,7 @@ use crate::surface::process::Usage;
 use ros2probe_api::participants::{ProcessList, ProcessUsage};
 use ros2probe_model::snapshot::Snapshot;
 
-/// Processes that are read for one answer.
+/// Largest number of processes per answer.
 const MAX_PROCESSES: usize = 512;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -40,12 +39,12 @@ async fn list(State(context): State<Context>) -> Result<Json<ProcessList>, Probl
         .map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))
 }
 
-/// Processes that hold a participant's socket on this host, and what discovery calls them.
+/// Returns the processes that own a participant's socket on this host, with their announced names.
 fn local(snapshot: &Snapshot) -> BTreeMap<u32, Option<Arc<str>>> {
     let mut ids = BTreeMap::new();
     for participant in &snapshot.participants {
         let process = &participant.process;
-        // Only the kernel knows the control group.
+        // A control group comes from the kernel only, so its presence shows the source of the id.
         if let (Some(id), Some(_)) = (process.id, &process.cgroup) {
             ids.insert(id, process.name.clone());
         }
@@ -125,7 +124,7 @@ mod tests {
             process.memory_bytes > 100_000 && process.threads >= 1,
             "{process:?}"
         );
-        // CPU time counts in ticks of 10 ms, and a busy machine gives them late.
+        // CPU time has a resolution of 10 ms, and a busy machine updates it late.
         let later = (0_u64..)
             .map(|_| {
                 (0..10_000_000).for_each(|step| {
@@ -140,7 +139,7 @@ mod tests {
 
     #[test]
     fn so_many_processes_are_read_for_one_answer() {
-        // No process has an id of these.
+        // No process has such an id.
         let first = 1 << 30;
         let participants = (first..).take(MAX_PROCESSES + 9);
         let snapshot = Snapshot {

@@ -1,7 +1,6 @@
-//! Why a topic is silent or cannot be seen: every reason that is known, in words and as a code.
+//! Reasons why a topic is silent or not measured, in words and as codes.
 //!
-//! Reasons come from facts that other answers show too; nothing is guessed from a missing number
-//! alone.
+//! Reasons follow from facts that other answers show, too; a missing number alone is no reason.
 
 use super::index::Index;
 use crate::agent_facts::SourceKind;
@@ -11,21 +10,21 @@ use ros2probe_api::topics::{Reason, ReasonCode};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts, Transport};
 
-/// What reasons are looked for in, besides the topic.
+/// Facts beyond the topic on which reasons depend.
 #[derive(Debug)]
 pub(super) struct Circumstances<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) index: Index<'a>,
     pub(super) watchlist: &'a Watchlist,
     pub(super) source: SourceKind,
-    /// The agent looks at shared memory too.
+    /// Whether the agent samples shared memory.
     pub(super) looks_at_memory: bool,
-    /// Why the agent sees nothing.
+    /// Why the agent is not ready.
     pub(super) unready: Option<String>,
 }
 
 impl<'a> Circumstances<'a> {
-    /// Every reason there is; none for a topic whose messages are counted.
+    /// Returns all reasons; empty for a topic whose messages are counted.
     pub(super) fn reasons(&self, topic: &'a TopicFacts) -> Vec<Reason> {
         let mut reasons = Vec::new();
         let mut say = |code, detail: String| {
@@ -88,7 +87,7 @@ impl<'a> Circumstances<'a> {
         reasons
     }
 
-    /// Why no publisher has a subscriber that matches, if so.
+    /// Returns why no publisher has a matching subscriber, or `None` if one has.
     fn unmatched(&self, topic: &'a TopicFacts) -> Option<String> {
         let findings = self.index.findings(topic);
         let is_unheard = |publisher: &EndpointFacts| {
@@ -148,7 +147,7 @@ impl<'a> Circumstances<'a> {
         (ReasonCode::NotWatched, detail)
     }
 
-    /// How messages pass, if no pair of publisher and subscriber uses the network.
+    /// Returns the transport if no pair of publisher and subscriber uses the network.
     fn off_network(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
         let passages = topic.transports.iter();
         let most = passages.clone().max_by_key(|count| count.pairs)?;
@@ -184,7 +183,8 @@ impl<'a> Circumstances<'a> {
         })
     }
 
-    /// Whether none of its participants has a socket on this host, as far as sockets are seen.
+    /// Returns whether no participant of the topic has a socket on this host, as far as sockets are
+    /// known.
     fn is_elsewhere(&self, topic: &'a TopicFacts) -> bool {
         let mut all = topic.publishers.iter().chain(&topic.subscriptions);
         self.source == SourceKind::Host

@@ -1,7 +1,7 @@
-//! `/recordings`: bags that the agent writes, begun, paused and ended by clients.
+//! `/recordings`: bags that the agent writes, controlled by clients.
 //!
-//! They lie below the directory that the configuration names; a name is a file name and nothing
-//! else. `rp bag record` writes bags elsewhere.
+//! Recordings are stored in the configured directory; a name must be a plain file name. `rp bag
+//! record` writes bags elsewhere.
 
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};
@@ -23,9 +23,9 @@ use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, R
 use ros2probe_bag::{Form, Options, Storage};
 use ros2probe_wire::DomainId;
 
-/// How long an answer waits for a bag to be completed.
+/// Longest time that an answer waits for a bag to be completed.
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// Longest time of one file, a year.
+/// Longest duration of one file, a year.
 const MAX_DURATION: u64 = 31_536_000;
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -56,24 +56,25 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     })
 }
 
-/// Begin a recording
+/// Start a recording
 ///
-/// Nothing is subscribed to: messages are copied as they pass. What is sent from the answer on is in the bag.
+/// The agent subscribes to nothing: it copies messages as they pass. Messages sent after the answer
+/// are in the bag.
 #[utoipa::path(
     post,
     path = "/recordings",
     tag = "recordings",
     request_body = RecordingRequest,
     responses(
-        (status = 201, description = "It is under way.", body = answers::Recording,
+        (status = 201, description = "The recording has started.", body = answers::Recording,
             headers(("location" = String, description = "Path of the recording."))),
-        (status = 409, description = "There is one of that name, or there are too many.",
+        (status = 409, description = "A recording of this name exists, or the limit of recordings is reached.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 415, description = "The content type is not JSON.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 422, description = "The request cannot be satisfied.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 507, description = "The storage does not take it.",
+        (status = 507, description = "The bag cannot be written to the storage.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -82,13 +83,13 @@ async fn begin(
     Body(request): Body<RecordingRequest>,
 ) -> Result<Response, Problem> {
     let wanted = wanted(request)?;
-    // What is known at this moment goes into the bag's list of topics.
+    // The known topics are entered into the bag's list of topics.
     context.state().await;
     let recordings = Arc::clone(&context.recordings);
     let begun = tokio::task::spawn_blocking(move || recordings.begin(wanted)).await;
     let begun = begun.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
     let recording = begun.map_err(|refusal| problem(&refusal))?;
-    // From the next snapshot on the kernel's filter knows what is wanted.
+    // From the next snapshot on, the kernel's filter captures the requested topics.
     context.state().await;
     let location = format!("/recordings/{}", recording.name);
     let answer = Json(view(&recording));
@@ -100,10 +101,10 @@ async fn begin(
     get,
     path = "/recordings/{name}",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 200, description = "How it goes.", body = answers::Recording),
-        (status = 404, description = "No such name.",
+        (status = 200, description = "The state of the recording.", body = answers::Recording),
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -117,16 +118,16 @@ async fn show(
 
 /// End a recording
 ///
-/// The bag is complete when this answers, and stays where it is.
+/// The answer follows once the bag is complete. The bag is kept.
 #[utoipa::path(
     delete,
     path = "/recordings/{name}",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 200, description = "It has ended; its report.", body = answers::Recording),
-        (status = 202, description = "It is ending; the storage is slow.", body = answers::Recording),
-        (status = 404, description = "No such name.",
+        (status = 200, description = "The recording has ended, with its report.", body = answers::Recording),
+        (status = 202, description = "The recording is still ending, because the storage is slow.", body = answers::Recording),
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -144,16 +145,16 @@ async fn end(
     Ok((status, Json(view(&recording))).into_response())
 }
 
-/// Let messages go by
+/// Pause a recording
 #[utoipa::path(
     post,
     path = "/recordings/{name}/pause",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 202, description = "It will be paused within a tenth of a second.",
+        (status = 202, description = "The recording pauses within a tenth of a second.",
             body = answers::Recording),
-        (status = 404, description = "No such name.",
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -164,16 +165,16 @@ async fn pause(
     order(&context, &name, Command::Pause)
 }
 
-/// Take messages again
+/// Resume a recording
 #[utoipa::path(
     post,
     path = "/recordings/{name}/resume",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 202, description = "It will go on within a tenth of a second.",
+        (status = 202, description = "The recording resumes within a tenth of a second.",
             body = answers::Recording),
-        (status = 404, description = "No such name.",
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -184,15 +185,15 @@ async fn resume(
     order(&context, &name, Command::Resume)
 }
 
-/// Go on in a new file
+/// Continue a recording in a new file
 #[utoipa::path(
     post,
     path = "/recordings/{name}/split",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the recording.")),
     responses(
-        (status = 202, description = "It will within a tenth of a second.", body = answers::Recording),
-        (status = 404, description = "No such name.",
+        (status = 202, description = "The new file begins within a tenth of a second.", body = answers::Recording),
+        (status = 404, description = "The recording does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]

@@ -1,4 +1,4 @@
-//! `POST /-/reload`: has the configuration read again, the same way as SIGHUP.
+//! `POST /-/reload`: reloads the configuration, as SIGHUP does.
 
 use axum::Json;
 use axum::extract::State;
@@ -11,27 +11,27 @@ use ros2probe_api::health::Reloaded;
 
 use super::problem::{Code, Problem, ProblemBody};
 
-/// Requests reloads of the owner of the configuration.
+/// Sends reload requests to the owner of the configuration.
 #[derive(Clone, Debug)]
 pub struct Reloader(mpsc::Sender<Answer>);
 
-/// What was asked.
+/// Receives reload requests.
 #[derive(Debug)]
 pub struct Reloads(mpsc::Receiver<Answer>);
 
-/// Where the outcome goes.
+/// Receives the result of a reload.
 pub type Answer = oneshot::Sender<Result<Reloaded, NotReloaded>>;
 
-/// The configuration stays what it was.
+/// Why the configuration is unchanged.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum NotReloaded {
-    /// There is no file.
+    /// The agent runs without a configuration file.
     NoFile,
-    /// The file has mistakes, or cannot be read.
+    /// The file cannot be read or has errors.
     Mistakes(Vec<String>),
 }
 
-/// Both ends.
+/// Creates both ends.
 #[must_use]
 pub fn channel() -> (Reloader, Reloads) {
     let (ask, asked) = mpsc::channel(1);
@@ -39,7 +39,7 @@ pub fn channel() -> (Reloader, Reloads) {
 }
 
 impl Reloads {
-    /// Waits for a request; `None` once none can come.
+    /// Waits for a request; returns `None` once no further one can arrive.
     pub async fn next(&mut self) -> Option<Answer> {
         self.0.recv().await
     }
@@ -49,19 +49,19 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(reload))
 }
 
-/// Read the configuration file again
+/// Reload the configuration file
 ///
-/// As `systemctl reload` does: mistakes change nothing and are answered, all of them. Watches that
-/// clients have added stay.
+/// This has the effect of `systemctl reload`. If the file has errors, the configuration stays
+/// unchanged and the answer lists all errors. Watches of clients stay.
 #[utoipa::path(
     post,
     path = "/-/reload",
     tag = "agent",
     responses(
-        (status = 200, description = "The configuration was taken over.", body = Reloaded),
+        (status = 200, description = "The configuration is applied.", body = Reloaded),
         (status = 409, description = "The agent runs without a configuration file.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 422, description = "The file has mistakes, which `mistakes` lists.",
+        (status = 422, description = "The file has errors; `mistakes` lists them.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]

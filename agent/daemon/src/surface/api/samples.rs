@@ -1,7 +1,7 @@
-//! `GET /samples`: the messages of topics as they come, one by one, for as long as the client
-//! stays. The topics are measured meanwhile, whether they are watched or not.
+//! `GET /samples`: messages of topics as they arrive, as long as the client is connected. The
+//! topics are measured while the stream is open.
 //!
-//! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
+//! Each stream is a subscription with a bounded queue. A client that reads slowly misses messages
 //! and receives their number; a replay waits for it. It delays no other client.
 
 use std::collections::HashSet;
@@ -34,61 +34,62 @@ use crate::subscriptions::{
 use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::snapshot::Snapshot;
 
-/// Names and globs in one request, and how many characters they and a regular expression have.
+/// Largest number of names and globs per request, and of characters in them and in a regular
+/// expression.
 const MAX_PATTERNS: usize = 256;
 const MAX_LIST: usize = 16_384;
 const MAX_REGEX: usize = 4_096;
-/// Writers that are introduced to one client.
+/// Largest number of writers whose QoS is sent to one client.
 const WRITERS: usize = 65_536;
-/// Lines made into one piece of the answer.
+/// Size of a piece of the answer, in bytes.
 const BATCH_BYTES: usize = 16 * 1024;
-/// Room for arrivals, a few thousand; and for messages with their bytes.
+/// Default queue sizes: for a few thousand arrivals, and for messages with payloads.
 const ARRIVALS_BYTES: usize = 1 << 20;
 const PAYLOADS_BYTES: usize = 16 << 20;
 const LEAST_BYTES: usize = 64 << 10;
-/// How long a stream waits with its first line for the capture to know what is wanted.
+/// Longest time that the first line waits for the capture to apply the subscription.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 #[derive(Clone, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 struct Wanted {
-    /// Topics, separated by commas: ROS names, globs as in a watch, or exact DDS names. Also those
-    /// that appear later.
+    /// Topics, separated by commas: ROS names, globs as in a watch, or exact DDS names. Topics that
+    /// appear later are included.
     #[param(max_length = 16384, example = "/points,/robot1/**")]
     topic: Option<String>,
-    /// Topics in whose names this regular expression is found.
+    /// A regular expression; topics are included if it matches a part of their name.
     #[param(max_length = 4096)]
     regex: Option<String>,
-    /// Every topic that `ros2 topic list` shows.
+    /// Whether to include every topic that `ros2 topic list` shows.
     all: bool,
-    /// Except these: as `topic`.
+    /// Topics to exclude, in the form of `topic`.
     #[param(max_length = 16384)]
     exclude: Option<String>,
-    /// Except those in whose names this regular expression is found.
+    /// A regular expression; topics are excluded if it matches a part of their name.
     #[param(max_length = 4096)]
     exclude_regex: Option<String>,
-    /// Whether globs, `regex` and `all` find hidden topics, too. A name finds them anyway.
+    /// Whether globs, `regex` and `all` include hidden topics. An exact name always does.
     hidden: bool,
-    /// Only of this domain.
+    /// Domain id of the topics; by default every domain.
     #[param(maximum = 232)]
     domain_id: Option<u32>,
-    /// Whether the bytes of the messages are wanted.
+    /// Whether to send the payloads of the messages.
     payload: bool,
-    /// Bytes that may wait for this client, as far as `limits.payload_bytes` allows for all streams
-    /// together, 64 KiB at least. Then the oldest message of the topic that holds most of them is
-    /// dropped.
+    /// Size of the queue for this client in bytes, at least 64 KiB; `limits.payload_bytes` bounds
+    /// the queues of all streams together. A full queue drops the oldest message of the topic with
+    /// the most bytes in it.
     queue_bytes: Option<usize>,
 }
 
-/// One client's stream.
+/// The stream of one client.
 struct Stream {
     subscription: Subscription,
     stop: CancellationToken,
-    /// Payload that goes out next, behind its line.
+    /// Payload to send next, after its line.
     payload: Option<Bytes>,
     first: Option<Line>,
-    /// Writers of which it was told what they announced.
+    /// Writers whose QoS has been sent.
     introduced: HashSet<Guid>,
     ended: bool,
 }
@@ -97,14 +98,15 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(samples))
 }
 
-/// The messages of topics, as they come
+/// Messages of topics, as they arrive
 ///
-/// Each line is a JSON object with one key: first `open`, with the topics that are known and
-/// wanted; then `sample` for each message, once, however often it is seen; `clock` at least ten times
-/// a second, when everything up to a time has been told; `missed` for messages that will not be told,
-/// with the reason; `end` when nothing will follow. With `payload=true`, as many raw bytes as
-/// `payload_bytes` says follow a sample's line: the serialized message with its encapsulation. The topics are
-/// measured as long as the stream is open, and are not listed as watches.
+/// Each line is a JSON object with one key. The first line is `open`, with the selected topics that
+/// are known. `sample` is a message; each message has one line, even if it was captured several
+/// times. `clock` follows at least ten times per second and states up to which time the stream is
+/// complete. `missed` reports messages that are missing from the stream, with the reason. `end` is
+/// the last line. With `payload=true`, a sample's line is followed by `payload_bytes` raw bytes:
+/// the serialized message with its encapsulation. The topics are measured while the stream is open,
+/// but are not listed as watches.
 #[utoipa::path(
     get,
     path = "/samples",
@@ -116,7 +118,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
             content((Line = "application/x-ndjson"), (Line = "application/vnd.ros2probe.samples"))),
         (status = 422, description = "No topic requested, or an invalid topic name.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 503, description = "There are too many subscriptions already, or patterns of all of them.",
+        (status = 503, description = "The limit of subscriptions is reached, or their patterns are too many.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -184,7 +186,7 @@ async fn samples(
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// The next piece of the answer: some lines, or the payload behind the last one.
+    /// Returns the next piece of the answer: some lines, or the payload of the last one.
     async fn next(&mut self) -> Option<Bytes> {
         if let Some(payload) = self.payload.take() {
             return Some(payload);
@@ -211,7 +213,7 @@ impl Pieces for Stream {
 }
 
 impl Stream {
-    /// The line for it; with what the writer announced where it is the writer's first.
+    /// Returns the line of an item; the first of each writer contains the writer's QoS.
     fn line(&mut self, item: &Item) -> Line {
         let mut line = line(item);
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
@@ -236,7 +238,7 @@ impl Stream {
 }
 
 fn write(lines: &mut Vec<u8>, line: &Line) {
-    // Plain numbers and strings into memory: nothing that could fail.
+    // Serializing plain numbers and strings into memory cannot fail.
     let _ = serde_json::to_writer(&mut *lines, line);
     lines.push(b'\n');
 }
@@ -277,7 +279,7 @@ fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Pro
     })
 }
 
-/// The topics that are wanted and known, no more than can be measured.
+/// Returns the selected topics that are known, at most as many as can be measured.
 fn topics(
     snapshot: &Snapshot,
     selection: &Selection,

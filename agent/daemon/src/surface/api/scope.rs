@@ -1,4 +1,4 @@
-//! What a listing is about: the query that all of them share, and how names are told apart.
+//! Scope of a listing: the query that all listings share, and the choice among equal names.
 
 use ros2probe_wire::DomainId;
 use serde::Deserialize;
@@ -8,32 +8,32 @@ use super::problem::{Code, Problem};
 
 const _: () = assert!(ros2probe_api::MAX_DOMAIN_ID == DomainId::MAX.0);
 
-/// What a listing covers.
+/// The scope of a listing.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Scope {
-    /// Only this domain; every domain when left out.
+    /// Domain id; by default every domain.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
-    /// Also what `ros2` hides: names with a token that begins with `_`, and the plumbing below
-    /// services and discovery.
+    /// Whether to include names that `ros2` hides: those with a token that begins with `_`, and
+    /// topics of services and discovery.
     pub(super) hidden: Option<bool>,
 }
 
-/// The domain of one thing.
+/// The domain of one entity.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Domain {
-    /// Its domain; may be left out where the name is in one domain only.
+    /// Domain id; required only if the name exists in several domains.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
 }
 
 impl Scope {
     /// # Errors
-    /// There is no such domain.
+    /// Fails if the domain id is invalid.
     pub(super) fn checked(self) -> Result<Self, Problem> {
         check(self.domain_id)?;
         Ok(self)
@@ -49,13 +49,13 @@ impl Scope {
 }
 
 impl Domain {
-    /// This one, or any.
+    /// Selects this domain, or any.
     pub(super) const fn of(domain_id: Option<u32>) -> Self {
         Self { domain_id }
     }
 
     /// # Errors
-    /// There is no such domain.
+    /// Fails if the domain id is invalid.
     pub(super) fn checked(self) -> Result<Self, Problem> {
         check(self.domain_id)?;
         Ok(self)
@@ -79,10 +79,11 @@ fn check(domain_id: Option<u32>) -> Result<(), Problem> {
     }
 }
 
-/// The one of `found` that is meant, each with its domain.
+/// Returns the only entity among `found`, which are paired with their domains.
 ///
 /// # Errors
-/// There is none, which `missing` says better, or there are several.
+/// Returns the problem `missing` if there is no entity, or one that lists the domains if there are
+/// several.
 pub(super) fn only<T>(
     found: Vec<(DomainId, T)>,
     what: &str,

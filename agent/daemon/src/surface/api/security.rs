@@ -1,9 +1,9 @@
-//! What every request has to pass before a route sees it: sent to this agent's own name, by no
-//! foreign web page, with the token where one is asked for, not too fast, not too large. What it
-//! may then do depends on the listener: see [`Access`].
+//! Checks of every request before its route: the `Host` header, the origin of a web page, the
+//! token, the rate and the size. The rights of a request then depend on its listener; see
+//! [`Access`].
 //!
-//! Host and Origin are looked at because a browser on this host can be made to send requests to
-//! loopback by any web page it shows (CSRF), also under a name of the page's own (DNS rebinding).
+//! Host and Origin matter because a web page can make a browser on this host send requests to
+//! loopback (CSRF). It can do so under a name of its own, too (DNS rebinding).
 
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
@@ -22,45 +22,45 @@ use super::problem::{Code, Problem};
 use crate::config::Access;
 use crate::surface::authority;
 
-/// More than any request needs.
+/// Largest size of a request body in bytes, above any valid request.
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// Requests a second that a door answers for long, and how many at once: of clients that may come
-/// in, and as many of those that may not.
+/// Sustained number of requests per second and size of a burst. Authorized clients have one such
+/// limit per door, other clients another.
 const RATE: f64 = 500.0;
 const BURST: f64 = 1_000.0;
-/// A shorter token can be guessed; a longer file is no token.
+/// Valid length of a token: shorter ones can be guessed, and a longer file is no token.
 const TOKEN_BYTES: std::ops::RangeInclusive<usize> = 16..=4096;
 
 const SEC_FETCH_SITE: HeaderName = HeaderName::from_static("sec-fetch-site");
 const SEC_FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
-/// What clients have to know.
+/// A token that clients must send.
 #[derive(Clone)]
 pub(super) struct Token(Arc<[u8]>);
 
-/// Why there is no token.
+/// Why the token cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenError {
     /// The file cannot be read.
     #[error("cannot read the token in {} (`api.token_file`)", path.display())]
     Read {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// It holds something else.
+    /// The file does not contain a valid token.
     #[error(
         "{} (`api.token_file`) must hold one line of {} to {} printable characters without blanks, \
          as `openssl rand -hex 32` prints", path.display(), TOKEN_BYTES.start(), TOKEN_BYTES.end()
     )]
     Unfit {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
     },
 }
 
-/// One of the API's listeners, as far as it matters who may pass.
+/// The access rules of one of the API's listeners.
 #[derive(Debug)]
 pub(super) struct Door {
     kind: Kind,
@@ -70,33 +70,33 @@ pub(super) struct Door {
     outsiders: Mutex<Bucket>,
 }
 
-/// How far the listener of a request lets it go.
+/// The rights that a listener grants to a request.
 #[derive(Clone, Debug)]
 pub(super) struct Granted {
     access: Access,
-    /// The agent's unix socket, which grants everything.
+    /// The agent's unix socket, which grants all rights.
     socket: Option<Arc<Path>>,
 }
 
-/// What the routes of a noun take, for reading and for changing something.
+/// The rights that the routes of a noun need, for reading and for changes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Needs {
     pub(super) read: Access,
     pub(super) change: Access,
 }
 
-/// Who can knock.
+/// The clients that can connect.
 #[derive(Debug)]
 pub(super) enum Kind {
-    /// Who may open the unix socket's file.
+    /// Processes with permission to open the unix socket.
     Socket,
-    /// Everybody on this host, with the token if there is one.
+    /// Processes on this host, with the token if one is configured.
     Loopback(Option<Token>),
-    /// Everybody who has the token.
+    /// Hosts in the network, with the token.
     Network(Token),
 }
 
-/// Requests that may still come in now.
+/// A token bucket: the remaining number of requests.
 #[derive(Debug)]
 struct Bucket {
     left: f64,
@@ -104,7 +104,7 @@ struct Bucket {
 }
 
 impl Token {
-    /// Reads it from a file.
+    /// Loads the token from a file.
     pub(super) fn load(path: &Path) -> Result<Self, TokenError> {
         let mut bytes = Vec::new();
         let limit = *TOKEN_BYTES.end() as u64 + 2;
@@ -122,7 +122,7 @@ impl Token {
         Ok(Self(token.into()))
     }
 
-    /// Takes the same time for every wrong token of the right length.
+    /// Compares in constant time for tokens of the right length.
     fn is(&self, offered: &[u8]) -> bool {
         self.0.ct_eq(offered).into()
     }
@@ -151,31 +151,31 @@ impl Door {
         }
     }
 
-    /// The same, which knows the tokens of pages.
+    /// Returns the door with the tokens of web pages.
     pub(super) fn with(self, page: page::Shared) -> Self {
         Self { page, ..self }
     }
 
-    /// Browsers can come here.
+    /// Returns whether browsers can connect.
     pub(super) const fn is_for_browsers(&self) -> bool {
         matches!(self.kind, Kind::Loopback(_) | Kind::Network(_))
     }
 
-    /// How far the request may go.
+    /// Checks a request and returns its rights.
     fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<Granted, Problem> {
         let granted = self.pass(self.admit(headers), now)?;
         small(headers)?;
         Ok(granted)
     }
 
-    /// Whether a file of the page is sent, which needs no token: a browser asks for it before
-    /// anybody can have one.
+    /// Checks a request for a file of the page. It needs no token, because a browser requests the
+    /// page before it can have one.
     fn let_in_for_files(&self, headers: &HeaderMap, now: Instant) -> Result<(), Problem> {
         let host = match self.kind {
             Kind::Loopback(_) => own_host(headers),
             Kind::Socket | Kind::Network(_) => Ok(()),
         };
-        // A link may lead here from anywhere.
+        // A link to the page may be on any web page.
         let is_link = headers
             .get(SEC_FETCH_MODE)
             .is_some_and(|mode| mode.as_bytes() == b"navigate");
@@ -186,8 +186,8 @@ impl Door {
         self.pass(admitted, now)
     }
 
-    /// Each class of clients has its own rate: requests without the token take nothing from those
-    /// with it.
+    /// Applies the rate limit. Authorized and other clients have separate limits, so the latter
+    /// cannot exhaust the former.
     fn pass<T>(&self, admitted: Result<T, Problem>, now: Instant) -> Result<T, Problem> {
         let bucket = match &admitted {
             Ok(_) => &self.clients,
@@ -223,7 +223,7 @@ impl Door {
 }
 
 impl Kind {
-    /// How far clients go, with `loopback` for those of which only the host is known.
+    /// Returns the rights of clients; `loopback` for those identified only by this host.
     pub(super) const fn access(&self, loopback: Access) -> Access {
         match self {
             Self::Loopback(None) => loopback,
@@ -241,7 +241,7 @@ impl Granted {
         self.access
     }
 
-    /// As far as there is.
+    /// Returns all rights.
     fn everything(&self) -> Self {
         Self {
             access: Access::All,
@@ -249,7 +249,7 @@ impl Granted {
         }
     }
 
-    /// Returns a problem that names the way to `needed` where the listener does not grant it.
+    /// Fails with a problem that names the way to `needed` if the listener does not grant it.
     pub(super) fn require(&self, needed: Access) -> Result<(), Problem> {
         if needed <= self.access {
             return Ok(());
@@ -286,7 +286,7 @@ impl Bucket {
     }
 }
 
-/// Answers what may not come in; such a client keeps no connection.
+/// Answers refused requests and closes their connections.
 pub(super) async fn guard(
     State(door): State<Arc<Door>>,
     mut request: Request,
@@ -301,7 +301,7 @@ pub(super) async fn guard(
     }
 }
 
-/// The same for files of the page.
+/// Answers refused requests for files of the page.
 pub(super) async fn guard_files(
     State(door): State<Arc<Door>>,
     request: Request,
@@ -318,7 +318,7 @@ fn turned_away(problem: Problem) -> Response {
     (close, problem).into_response()
 }
 
-/// Answers what the listener does not grant.
+/// Answers requests that exceed the listener's rights.
 pub(super) async fn within(
     State(needs): State<Needs>,
     Extension(granted): Extension<Granted>,
@@ -345,8 +345,8 @@ fn own_host(headers: &HeaderMap) -> Result<(), Problem> {
     })
 }
 
-/// Only browsers send these headers: the page must have come from this listener itself. Each of
-/// several counts.
+/// Checks the headers that only browsers send: the page must come from this listener. All values of
+/// a repeated header are checked.
 fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
     let text = |value: &HeaderValue| value.to_str().unwrap_or_default().to_owned();
     let cross = headers
@@ -379,7 +379,7 @@ fn authorized(headers: &HeaderMap, token: &Token) -> Result<(), Problem> {
     Err(Problem::new(Code::Unauthorized, "the token is wrong"))
 }
 
-/// The token that a request has.
+/// Returns the token of a request.
 fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
     let credentials = headers.get(AUTHORIZATION)?.as_bytes();
     let (scheme, offered) = credentials.split_at_checked(7)?;
@@ -388,7 +388,7 @@ fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
         .then(|| offered.trim_ascii())
 }
 
-/// A body without a length is bounded while it is read.
+/// Checks the declared length of the body. A body without a length is bounded while it is read.
 fn small(headers: &HeaderMap) -> Result<(), Problem> {
     let length = headers
         .get(CONTENT_LENGTH)
@@ -400,7 +400,7 @@ fn small(headers: &HeaderMap) -> Result<(), Problem> {
     Ok(())
 }
 
-/// The body has more than [`MAX_BODY`] bytes.
+/// Returns the problem of a body larger than [`MAX_BODY`].
 pub(super) fn too_large() -> Problem {
     Problem::new(
         Code::BodyTooLarge,

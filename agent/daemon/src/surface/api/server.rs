@@ -1,7 +1,7 @@
-//! The API's listeners: bound before privileges are given up, answered until the agent ends.
+//! The API's listeners: bound before privileges are dropped, and served until the agent stops.
 //!
-//! Each has its own limit of connections and of requests. Who may use the unix socket is decided by
-//! the mode and group of its file, which goes when the agent ends.
+//! Each listener has its own limits of connections and requests. Mode and group of the unix
+//! socket's file decide which users may connect; the file is removed when the agent stops.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io;
@@ -22,57 +22,57 @@ use crate::surface::limited_listener::{LimitedListener, Refusal};
 use crate::surface::listen::listen;
 use crate::surface::serving::{self, Plain};
 
-/// Owner and group.
+/// Read and write permission for owner and group.
 const SOCKET_MODE: u32 = 0o660;
-/// The group that may use the socket of an agent that was started by root.
+/// Group that may use the socket of an agent started as root.
 const GROUP: &str = "ros2probe";
 
 /// Why the API cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum OpenError {
-    /// The token cannot be had.
+    /// The token cannot be loaded.
     #[error(transparent)]
     Token(#[from] TokenError),
-    /// Everybody could change what is watched.
+    /// Without a token, any host could change the watches.
     #[error(
         "{address} can be reached from elsewhere: serving the control API there needs \
          `api.token_file`"
     )]
     Unprotected {
-        /// Where.
+        /// The address.
         address: SocketAddr,
     },
-    /// The address is taken or not this host's.
+    /// The address is in use or does not belong to this host.
     #[error("cannot listen on {address}: change `api.listen` in the configuration or pass `--api`")]
     Address {
-        /// Where.
+        /// The address.
         address: SocketAddr,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// Another agent answers there.
+    /// Another agent serves the socket.
     #[error("another agent serves the socket {}: change `api.socket`", path.display())]
     InUse {
-        /// Where.
+        /// Path of the socket.
         path: PathBuf,
     },
-    /// Something is there that is not to be replaced.
+    /// A file exists at the path that is not a socket.
     #[error("{} exists and is not a socket: change `api.socket`", path.display())]
     NoSocket {
-        /// Where.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// The directory is missing or not to be written.
+    /// The directory is missing or not writable.
     #[error("cannot serve the socket {}: change `api.socket`", path.display())]
     Socket {
-        /// Where.
+        /// Path of the socket.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: io::Error,
     },
 }
 
-/// Bound listeners that do not answer yet.
+/// Bound listeners that are not served yet.
 #[derive(Debug, Default)]
 pub struct Server {
     token: Option<Token>,
@@ -81,27 +81,27 @@ pub struct Server {
     sockets: Vec<Socket>,
 }
 
-/// A unix socket and the file it is found by.
+/// A unix socket and its file.
 #[derive(Debug)]
 struct Socket {
     listener: UnixListener,
     file: SocketFile,
 }
 
-/// Removes the socket's file with its value.
+/// Removes the socket's file when dropped.
 #[derive(Debug)]
 struct SocketFile {
     path: PathBuf,
-    /// Keeps other agents from taking the socket for a stale one.
+    /// Prevents other agents from treating the socket as stale.
     _lock: File,
 }
 
 impl Server {
-    /// Nothing bound yet; clients on the network need the token in this file, those on loopback
-    /// may go as far as `loopback` without it.
+    /// Creates a server without listeners. Clients in the network need the token in this file;
+    /// those on loopback have the rights `loopback` without it.
     ///
     /// # Errors
-    /// The file holds no token.
+    /// Fails if the file does not contain a valid token.
     pub fn new(token: Option<&Path>, loopback: Access) -> Result<Self, OpenError> {
         Ok(Self {
             token: token.map(Token::load).transpose()?,
@@ -110,10 +110,10 @@ impl Server {
         })
     }
 
-    /// Listens on an address. Without a token only on loopback.
+    /// Binds an address. Without a token, it must be a loopback address.
     ///
     /// # Errors
-    /// The address needs a token, is taken, or not this host's.
+    /// Fails if the address needs a token, is in use, or does not belong to this host.
     pub fn bind(&mut self, address: SocketAddr) -> Result<(), OpenError> {
         if !address.ip().is_loopback() && self.token.is_none() {
             return Err(OpenError::Unprotected { address });
@@ -123,10 +123,10 @@ impl Server {
         Ok(())
     }
 
-    /// Listens on a unix socket; a stale file of an agent that was killed is replaced.
+    /// Binds a unix socket, replacing the stale file of an agent that was killed.
     ///
     /// # Errors
-    /// Another agent serves it, something else is there, or the directory cannot be used.
+    /// Fails if another agent serves it, the path is not a socket, or the directory cannot be used.
     pub fn bind_socket(&mut self, path: &Path) -> Result<(), OpenError> {
         let failed = |source| OpenError::Socket {
             path: path.to_path_buf(),
@@ -159,13 +159,14 @@ impl Server {
         Ok(())
     }
 
-    /// Nothing is bound.
+    /// Returns whether no listener is bound.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.addresses.is_empty() && self.sockets.is_empty()
     }
 
-    /// Where it listens, with the port the kernel chose when it was 0.
+    /// Returns the addresses and paths of all listeners, with the port that the kernel chose for
+    /// port 0.
     pub fn doors(&self) -> impl Iterator<Item = String> {
         let addresses = self.addresses.iter().map(TcpListener::local_addr);
         let sockets = self.sockets.iter();
@@ -174,16 +175,16 @@ impl Server {
         addresses.chain(sockets)
     }
 
-    /// The addresses among them.
+    /// Returns the addresses of the listeners.
     pub fn addresses(&self) -> impl Iterator<Item = SocketAddr> {
         let addresses = self.addresses.iter().map(TcpListener::local_addr);
         addresses.filter_map(Result::ok)
     }
 
-    /// Answers on all of them until `context` says stop, then finishes the answers that have begun.
+    /// Serves all listeners until `context` stops, then completes the answers in progress.
     ///
     /// # Errors
-    /// When the runtime cannot take a listener over.
+    /// Fails if the runtime cannot take over a listener.
     pub fn serve(self, context: &Context, tasks: &mut JoinSet<io::Result<()>>) -> io::Result<()> {
         let socket = self.sockets.first();
         let socket = socket.map(|socket| Arc::from(socket.file.path.as_path()));
@@ -215,7 +216,7 @@ impl Server {
 
 impl Drop for SocketFile {
     fn drop(&mut self) {
-        // What cannot be removed is stale for the next agent, which replaces it.
+        // If the file cannot be removed, the next agent replaces it as stale.
         let _ = fs::remove_file(&self.path);
     }
 }
@@ -233,20 +234,20 @@ where
     Ok(())
 }
 
-/// The answer to a client beyond the limit of connections.
+/// Returns the answer to a client beyond the limit of connections.
 fn full(connections: usize) -> Refusal {
     let detail =
         format!("{connections} connections are open, which is the limit (limits.api_clients)");
     let problem = ProblemBody::from(Problem::new(Code::TooManyClients, detail));
-    // A problem always is JSON.
+    // A problem can always be serialized.
     Refusal::new(
         MEDIA_TYPE,
         &serde_json::to_string(&problem).unwrap_or_default(),
     )
 }
 
-/// The lock lies beside the socket and outlives the agent: a file that is removed would be a lock
-/// for one and none for the other.
+/// Locks a file beside the socket. It is never removed, because agents could otherwise lock
+/// different files.
 fn lock(path: &Path) -> Result<File, OpenError> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");
@@ -266,8 +267,9 @@ fn lock(path: &Path) -> Result<File, OpenError> {
     }
 }
 
-/// An agent that runs as root lets the group in where there is one; started by the service manager
-/// it has that group anyway. Where this is not possible, the socket stays the agent's own.
+/// Gives the socket to the group if the agent runs as root and the group exists. Under the service
+/// manager, the agent has that group already. Otherwise the socket stays with the agent's own
+/// group.
 fn give_to_group(path: &Path) {
     let groups = fs::read_to_string("/etc/group").unwrap_or_default();
     let group = groups.lines().find_map(|line| {
@@ -320,7 +322,7 @@ mod tests {
     fn a_stale_socket_is_replaced_and_one_in_use_or_another_file_is_not() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("api.sock");
-        // Left by an agent that was killed.
+        // This file is left over, as from an agent that was killed.
         drop(UnixListener::bind(&path).unwrap());
         let mut server = Server::new(None, Access::Watch).unwrap();
         server.bind_socket(&path).unwrap();

@@ -1,4 +1,4 @@
-//! `/services`: each put together from its topics of requests and replies.
+//! `/services`: each service combines its request and reply topics.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, BTreeSet};
@@ -22,7 +22,7 @@ use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::DomainId;
 
-/// A service's topics, as far as they are there.
+/// The known topics of a service.
 #[derive(Debug, Default)]
 pub(super) struct Halves<'a> {
     pub(super) requests: Option<&'a TopicFacts>,
@@ -59,7 +59,7 @@ async fn list(
     Ok(Json(answer).into_response())
 }
 
-/// Services by domain and name.
+/// Groups services by domain and name.
 pub(super) fn services(
     snapshot: &Snapshot,
     scope: Scope,
@@ -93,13 +93,13 @@ impl<'a> Halves<'a> {
     }
 }
 
-/// Types, each once.
+/// Returns the types, sorted and without duplicates.
 pub(super) fn sorted<'a>(types: impl Iterator<Item = &'a str>) -> Vec<Cow<'a, str>> {
     let types: BTreeSet<_> = types.collect();
     types.into_iter().map(Cow::Borrowed).collect()
 }
 
-/// `None` without any endpoint.
+/// Returns `None` for a service without endpoints.
 fn view<'a>(
     domain_id: u32,
     name: &'a str,

@@ -1,4 +1,4 @@
-//! `/snapshots`: the last seconds of topics, written when a client asks for it.
+//! `/snapshots`: the last seconds of topics, written to a bag on request.
 
 use axum::Json;
 use axum::extract::{Path, State};
@@ -23,7 +23,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     get,
     path = "/snapshots",
     tag = "recordings",
-    responses((status = 200, description = "Those of the configuration.", body = SnapshotList))
+    responses((status = 200, description = "The snapshots of the configuration.", body = SnapshotList))
 )]
 async fn list(State(context): State<Context>) -> Json<SnapshotList> {
     let figures = context.recording_figures.snapshots();
@@ -55,19 +55,19 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
     })
 }
 
-/// Write what a snapshot keeps
+/// Write a snapshot to a bag
 ///
-/// What was in memory is in a bag when this answers; memory begins anew.
+/// The answer follows once the messages in memory are in a bag. The snapshot then begins anew.
 #[utoipa::path(
     post,
     path = "/snapshots/{name}",
     tag = "recordings",
-    params(("name" = String, Path, description = "Its name.")),
+    params(("name" = String, Path, description = "Name of the snapshot.")),
     responses(
         (status = 201, description = "The bag.", body = WrittenSnapshot),
         (status = 404, description = "The configuration has no snapshot of that name.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 507, description = "It could not be written, and is still in memory.",
+        (status = 507, description = "The bag could not be written; the messages stay in memory.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]

@@ -1,4 +1,4 @@
-//! `/topics`: what is known of topics, and why nothing is known where it is nothing.
+//! `/topics`: topics with their measurements, and the reasons for missing ones.
 
 use std::borrow::Cow;
 use std::time::Instant;
@@ -44,7 +44,8 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 
 /// All topics
 ///
-/// Also those that are not watched: with types, endpoints, quality of service and what is wrong.
+/// The list includes topics that are not watched, with types, endpoints, quality of service and
+/// problems.
 #[utoipa::path(
     get,
     path = "/topics",
@@ -72,7 +73,8 @@ async fn list(
 
 /// One topic
 ///
-/// By its ROS name, or by its DDS name where it follows no ROS convention (`rq/addRequest`).
+/// The path contains the ROS name, or the DDS name if the topic follows no ROS convention
+/// (`rq/addRequest`).
 #[utoipa::path(
     get,
     path = "/topics/{*topic}",
@@ -80,9 +82,9 @@ async fn list(
     params(TopicParameter, Domain),
     responses(
         (status = 200, description = "The topic.", body = TopicDetails<'static>),
-        (status = 404, description = "No such topic.",
+        (status = 404, description = "The topic does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It is in several domains.",
+        (status = 409, description = "The name exists in several domains; add `domain_id`.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -115,10 +117,10 @@ async fn show(
     Ok(Json(answers.details(topic)).into_response())
 }
 
-/// The one topic of this name.
+/// Returns the topic of this name.
 ///
 /// # Errors
-/// There is none, or there are several.
+/// Fails if the topic does not exist, or exists in several domains.
 pub(super) fn find<'a>(
     snapshot: &'a Snapshot,
     name: &str,
@@ -138,14 +140,14 @@ pub(super) fn find<'a>(
     only(found, name, missing)
 }
 
-/// What is asked for of a topic, besides the topic itself.
+/// A part of a topic that has its own path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Aspect {
-    /// Its last minutes.
+    /// The history.
     History,
-    /// What its type consists of.
+    /// The definition of its type.
     Definition,
-    /// What its messages say.
+    /// The decoded messages.
     Messages,
 }
 
@@ -157,8 +159,8 @@ impl Aspect {
     ];
 }
 
-/// The topic and what is asked for of it. Names may end so, too: a topic of the whole name goes
-/// first, unless slashes of the name are encoded.
+/// Returns the topic and the requested part of it. A topic's own name may end like a part; an
+/// existing topic of the whole name takes precedence, unless the name's slashes are encoded.
 fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, Aspect)> {
     let (topic, aspect) = Aspect::ALL
         .into_iter()
@@ -171,13 +173,13 @@ fn aspect<'a>(context: &Context, uri: &Uri, name: &'a str) -> Option<(&'a str, A
     let is_another = || {
         let state = context.latest.state();
         let mut topics = state.known().topics.iter();
-        // With its last slash encoded it is the name of a topic.
+        // If the last slash is encoded, the path is the name of a topic.
         !path.contains('/') || topics.any(|topic| is_called(topic, name))
     };
     (is_sure || !is_another()).then_some((topic, aspect))
 }
 
-/// The topic in a path, for the document.
+/// The path parameter, for the document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
@@ -187,17 +189,18 @@ pub(super) struct TopicParameter {
     topic: String,
 }
 
-/// By the ROS name of a topic; services and what is not ROS by their DDS names.
+/// Returns whether the name is the topic's ROS name. Topics of services, and topics without a ROS
+/// name, are identified by their DDS names.
 fn is_called(topic: &TopicFacts, name: &str) -> bool {
     let is_ros_topic = topic.kind.is_ros_topic();
     is_ros_topic && topic.name == name || name.strip_prefix('/') == Some(topic.dds_name.as_str())
 }
 
-/// What answers are made of.
+/// Input of the answers.
 struct TopicAnswers<'a> {
     in_force: &'a InForce,
     snapshot: &'a Snapshot,
-    /// Every message into shared memory is seen.
+    /// Whether uprobes observe every message to shared memory.
     is_exact: bool,
     circumstances: Circumstances<'a>,
 }
@@ -256,7 +259,7 @@ impl<'a> TopicAnswers<'a> {
         }
     }
 
-    /// How messages of this topic in shared memory are seen just now.
+    /// Returns how messages of this topic in shared memory are observed at present.
     fn view(&self, facts: &TopicFacts) -> &'static str {
         if self.is_exact {
             "exact"

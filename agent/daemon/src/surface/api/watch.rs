@@ -1,7 +1,7 @@
-//! `/watch`: what is measured, listed, added and removed while the agent runs.
+//! `/watch`: lists, adds and removes watches while the agent runs.
 //!
-//! A watch is known by its topic, a name or a glob as in the configuration file, and its domain.
-//! POST adds and never changes what is there; PUT adds or replaces.
+//! A watch is identified by its domain and its topic, a name or a glob as in the configuration
+//! file. POST adds without changing an existing watch; PUT adds or replaces.
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -34,13 +34,13 @@ use ros2probe_wire::DomainId;
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 struct Domain {
-    /// The watch for this domain; the one for every domain when left out.
+    /// Domain id of the watch; by default the watch for every domain.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
 }
 
 impl Domain {
-    /// Refuses a domain that cannot be.
+    /// Fails if the domain id is invalid.
     fn checked(self) -> Result<Self, Problem> {
         match self.domain_id {
             Some(domain_id) if domain_id > DomainId::MAX.0 => {
@@ -86,7 +86,7 @@ async fn list(State(context): State<Context>) -> Json<WatchList> {
     params(TopicParameter, Domain),
     responses(
         (status = 200, description = "The watch.", body = answers::Watch),
-        (status = 404, description = "It is not watched.",
+        (status = 404, description = "The watch does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -104,7 +104,7 @@ async fn show(
 
 /// Watch a topic
 ///
-/// The topic need not exist yet. The body may be left out. Asking again for the same is no mistake.
+/// The topic need not exist yet. The body is optional. Repeating the same request is no error.
 #[utoipa::path(
     post,
     path = "/watch/{*topic}",
@@ -112,10 +112,10 @@ async fn show(
     params(TopicParameter, Domain),
     request_body = WatchRequest,
     responses(
-        (status = 200, description = "It is watched just so already.", body = answers::Watch),
-        (status = 201, description = "It is watched from now on.", body = answers::Watch,
+        (status = 200, description = "The watch exists with the same settings.", body = answers::Watch),
+        (status = 201, description = "The watch is added.", body = answers::Watch,
             headers(("location" = String, description = "Path of the watch."))),
-        (status = 409, description = "It is watched with other settings, or the limit of watches \
+        (status = 409, description = "The watch exists with other settings, or the limit of watches \
             is reached.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 415, description = "The content type is not JSON.",
@@ -135,7 +135,7 @@ async fn add(
     answer(&context, &watch, done)
 }
 
-/// Watch a topic with these settings, whatever they were
+/// Add or replace a watch
 #[utoipa::path(
     put,
     path = "/watch/{*topic}",
@@ -143,10 +143,10 @@ async fn add(
     params(TopicParameter, Domain),
     request_body = WatchRequest,
     responses(
-        (status = 200, description = "It is watched just so.", body = answers::Watch),
-        (status = 201, description = "It is watched from now on.", body = answers::Watch,
+        (status = 200, description = "The watch exists with these settings.", body = answers::Watch),
+        (status = 201, description = "The watch is added.", body = answers::Watch,
             headers(("location" = String, description = "Path of the watch."))),
-        (status = 409, description = "The configuration lists it with other settings, or the \
+        (status = 409, description = "The configuration lists the watch with other settings, or the \
             limit of watches is reached.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 415, description = "The content type is not JSON.",
@@ -166,19 +166,20 @@ async fn replace(
     answer(&context, &watch, done)
 }
 
-/// Watch a topic no longer
+/// Remove a watch
 ///
-/// Only what clients have added: what the configuration lists goes with the configuration.
+/// Only watches of clients can be removed; those of the configuration are removed with their entry
+/// there.
 #[utoipa::path(
     delete,
     path = "/watch/{*topic}",
     tag = "watch",
     params(TopicParameter, Domain),
     responses(
-        (status = 204, description = "It is watched no longer."),
-        (status = 404, description = "It was not watched.",
+        (status = 204, description = "The watch is removed."),
+        (status = 404, description = "The watch does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "The configuration or the command line lists it.",
+        (status = 409, description = "The configuration or the command line lists the watch.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -193,7 +194,7 @@ async fn remove(
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// The topic in a path, for the document.
+/// The path parameter, for the document.
 #[derive(IntoParams)]
 #[into_params(parameter_in = Path)]
 #[expect(dead_code, reason = "read by the document's generator alone")]
@@ -207,7 +208,7 @@ struct TopicParameter {
     topic: String,
 }
 
-/// What is asked for, checked.
+/// Returns the requested watch after validation.
 fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch, Problem> {
     let invalid = |detail: String| Err(Problem::new(Code::InvalidRequest, detail));
     if let Err(error) = check_pattern(&topic) {
@@ -259,7 +260,7 @@ fn answer(
     let done =
         done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
-    // Gone again already: another client removes while this one adds.
+    // Another client has removed the watch already.
     let entry = in_force
         .find(&watch.pattern, watch.domain_id.map(|id| id.0))
         .cloned();
@@ -268,7 +269,7 @@ fn answer(
         origin: watches::Origin::Api,
     });
     let state = context.latest.state();
-    // A new watch is in no snapshot yet: an entry of its name is of an earlier one.
+    // A new watch is in no snapshot yet; an entry of that name belongs to an earlier watch.
     let snapshot = state.snapshot.as_ref().filter(|_| done == Done::Unchanged);
     let body = Json(view(&entry, snapshot));
     Ok(match done {
@@ -280,7 +281,7 @@ fn answer(
     })
 }
 
-/// Names and globs have no character that a path would not.
+/// Returns the path of a watch; names and globs contain no characters that a path excludes.
 fn location(watch: &Watch) -> String {
     match watch.domain_id {
         None => format!("/watch{}", watch.pattern),

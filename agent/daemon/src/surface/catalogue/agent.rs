@@ -1,4 +1,4 @@
-//! What the agent says of itself (`ros2probe_*`, `process_*`): what it drops, cannot read or cannot hold.
+//! Metrics of the agent itself (`ros2probe_*`, `process_*`): drops, decode errors, limits.
 
 use super::Metric;
 
@@ -334,7 +334,7 @@ pub(in crate::surface) const LOG_LINES_LOST: Metric = Metric::counter(
     "Log lines lost because standard error was full, closed or not read.",
 );
 
-// The process, under the names every exporter uses.
+// Metrics of the process, under the names that all exporters use.
 pub(in crate::surface) const PROCESS_CPU: Metric = Metric::counter(
     "process_cpu_seconds_total",
     &[],

@@ -1,9 +1,10 @@
-//! What became of messages on their way to each receiver: sums per topic, always, and series per
-//! delivery where a watch asks for them.
+//! Metrics of deliveries to receivers: sums per topic in any case, and series per delivery if a
+//! watch requests them.
 
 use super::{Metric, TOPIC};
 
-/// What is sent; received series bear the same, so that PromQL can subtract them across hosts.
+/// Labels of sent samples; received series have the same, so that PromQL can subtract them across
+/// hosts.
 const DESTINATION: &[&str] = &["domain_id", "topic", "writer", "destination"];
 const SUBSCRIBER: &[&str] = &["domain_id", "topic", "writer", "destination", "subscriber"];
 const SUBSCRIBER_CAUSE: &[&str] = &[

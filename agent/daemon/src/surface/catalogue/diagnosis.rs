@@ -1,4 +1,4 @@
-//! What is wrong with the graph: a series lives as long as its finding.
+//! Metrics of problems in the graph: a series exists as long as its problem.
 
 use super::{Metric, TOPIC};
 

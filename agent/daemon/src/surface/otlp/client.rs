@@ -1,7 +1,8 @@
-//! One signal's connection to the receiver: gRPC, one request at a time, tried again as OTLP says.
+//! The connection of one signal to the receiver: gRPC, one request at a time, retried as OTLP
+//! specifies.
 //!
-//! Requests come encoded and stay so: trying again copies nothing, and one client serves all
-//! signals, whose answers have the same form.
+//! Requests stay encoded: retries copy nothing, and one client serves all signals, whose answers
+//! have the same form.
 
 use std::collections::VecDeque;
 use std::hash::{BuildHasher as _, Hasher as _};
@@ -20,34 +21,35 @@ use tonic::{Code, Status};
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::settings::{SettingsError, Target};
 
-/// Pauses between tries, before what the receiver asks for and before chance takes up to half.
+/// Pauses between retries, unless the receiver requests another; random jitter shortens them by up
+/// to half.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// The longest pause that a receiver may ask for.
+/// Longest pause that a receiver can request.
 const LONGEST_ASKED: Duration = Duration::from_mins(5);
-/// A connection that answers no ping for so long is opened anew.
+/// A connection that does not answer a ping within this time is reopened.
 const PING: Duration = Duration::from_secs(30);
 
-/// A part of what is to be sent, encoded.
+/// An encoded part of the data to send.
 #[derive(Clone, Debug)]
 pub(super) struct Request {
     pub(super) body: Bytes,
-    /// Points, records or spans in it.
+    /// Number of points, records or spans in it.
     pub(super) items: u64,
 }
 
-/// The connection; opened when needed, and again after it broke.
+/// The connection; opened at the first request, and again after a failure.
 pub(super) struct Client {
     signal: Signal,
     grpc: Grpc<Channel>,
     target: Target,
     exports: Arc<Exports>,
-    /// Whether the last request got through; `None` before the first.
+    /// Whether the last request succeeded; `None` before the first.
     works: Option<bool>,
 }
 
 impl Client {
-    /// Opens nothing yet; inside a runtime only.
+    /// Creates a client without a connection; requires a runtime.
     pub(super) fn new(
         signal: Signal,
         target: Target,
@@ -76,8 +78,8 @@ impl Client {
         })
     }
 
-    /// Sends what is in `queue` and takes out what is settled: delivered, or refused for good.
-    /// Tries again without end; who calls sets one.
+    /// Sends the requests in `queue` and removes those that are delivered or finally refused.
+    /// Retries without limit; the caller sets one.
     pub(super) async fn deliver(&mut self, queue: &mut VecDeque<Request>) {
         let mut pause = FIRST_PAUSE;
         while let Some(request) = queue.front() {
@@ -104,7 +106,7 @@ impl Client {
         }
     }
 
-    /// Sends what is in `queue`, each request once, until one does not get through.
+    /// Sends the requests in `queue` once each, until one fails.
     pub(super) async fn deliver_once(&mut self, queue: &mut VecDeque<Request>) {
         while let Some(request) = queue.front() {
             match self.send(request.body.clone()).await {
@@ -118,15 +120,15 @@ impl Client {
         }
     }
 
-    /// Counts what is given up.
+    /// Counts items that are dropped.
     pub(super) fn drop(&self, reason: Reason, items: u64) {
         if items > 0 {
             self.exports.count_dropped(self.signal, reason, items);
         }
     }
 
-    /// What was under way is given up for something newer. A receiver that never answers may never be
-    /// waited for any longer.
+    /// Drops the pending request in favour of newer data, so that a receiver that never answers is
+    /// not waited for.
     pub(super) fn overtaken(&mut self) {
         self.failed(&Status::deadline_exceeded(
             "no answer before there was more",
@@ -138,7 +140,7 @@ impl Client {
         self.exports.count_request(self.signal, outcome);
     }
 
-    /// One request; how many of its items the receiver rejected.
+    /// Sends a request and returns how many of its items the receiver rejected.
     async fn send(&mut self, body: Bytes) -> Result<u64, Status> {
         let mut request = tonic::Request::new(body);
         *request.metadata_mut() = self.target.headers.clone();
@@ -181,7 +183,7 @@ impl Client {
         self.drop(Reason::Rejected, rejected);
     }
 
-    /// Says so once, until it works again.
+    /// Logs the first failure until a request succeeds again.
     fn failed(&mut self, status: &Status) {
         if self.works != Some(false) {
             self.works = Some(false);
@@ -196,7 +198,7 @@ impl Client {
     }
 }
 
-/// The system's certificate authorities, or those in `SSL_CERT_FILE`.
+/// Configures TLS with the system's certificate authorities, or those in `SSL_CERT_FILE`.
 #[cfg(feature = "tls")]
 fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsError> {
     if target.endpoint.scheme_str() != Some("https") {
@@ -216,7 +218,7 @@ const fn path(signal: Signal) -> &'static str {
     }
 }
 
-/// Whether to try again (OTLP 1.x, "Failures"), and after how long if the receiver says.
+/// Returns whether to retry (OTLP 1.x, "Failures"), and the delay that the receiver requests.
 fn retry_delay(status: &Status) -> Option<Option<Duration>> {
     let asked = retry_info(status.details());
     let again = match status.code() {
@@ -227,13 +229,13 @@ fn retry_delay(status: &Status) -> Option<Option<Duration>> {
         | Code::Unavailable
         | Code::DataLoss => true,
         Code::ResourceExhausted => asked.is_some(),
-        // A connection that broke has a cause here; what a receiver answers has none.
+        // A broken connection has a source; an answer of the receiver has none.
         _ => std::error::Error::source(status).is_some(),
     };
     again.then_some(asked)
 }
 
-/// `google.rpc.Status`, as far as it matters: what is in `grpc-status-details-bin`.
+/// The relevant part of `google.rpc.Status` in `grpc-status-details-bin`.
 #[derive(Clone, PartialEq, Message)]
 struct Details {
     #[prost(message, repeated, tag = "3")]
@@ -275,14 +277,14 @@ fn retry_info(details: &[u8]) -> Option<Duration> {
     Some(Duration::new(seconds, nanoseconds).min(LONGEST_ASKED))
 }
 
-/// By chance, so that the robots of a fleet do not all come back at once.
+/// Applies random jitter, so that the robots of a fleet do not reconnect simultaneously.
 fn shortened(pause: Duration) -> Duration {
     let chance = std::hash::RandomState::new().build_hasher().finish();
     let sixteenths = u32::try_from(chance % 8).unwrap_or(0);
     pause - pause * sixteenths / 16
 }
 
-/// The codec of what is encoded already.
+/// A codec for messages that are already encoded.
 #[derive(Clone, Copy)]
 struct Encoded;
 

@@ -1,8 +1,8 @@
-//! Events on their way out: log records with an event name, in the order and with the words of the
-//! event log.
+//! Export of events as log records with an event name, in the order and with the texts of the event
+//! log.
 //!
-//! Nothing is queued here: the event log keeps the last events anyway, and while the receiver is
-//! away the place in it is all that is remembered. What is overwritten meanwhile is counted.
+//! No queue is needed: the event log keeps the last events, and the exporter keeps its position in
+//! it. Events that are overwritten while the receiver is unavailable are counted.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,21 +21,21 @@ use super::signal_sender::SignalSender;
 use crate::events::EventLog;
 use crate::events::{Batch, Reader, Record, Value};
 
-/// Events that happen together travel together.
+/// Time for which events are collected into one request.
 const GATHER: Duration = Duration::from_millis(500);
-/// Events of one request: some 200 KB at most.
+/// Largest number of events per request: about 200 KB.
 const MOST: usize = 256;
 
-/// Sends what the event log has.
+/// Exports the event log.
 pub(super) struct Reporter {
     log: Arc<EventLog>,
     resource: Resource,
-    /// The number of the last event that was taken.
+    /// Number of the last exported event.
     place: u64,
 }
 
 impl Reporter {
-    /// From the oldest event on.
+    /// Creates a reporter that begins with the oldest event.
     pub(super) fn new(log: Arc<EventLog>, resource: Resource) -> Self {
         Self {
             log,
@@ -44,7 +44,7 @@ impl Reporter {
         }
     }
 
-    /// Exports until the agent ends.
+    /// Exports until the agent stops.
     pub(super) async fn run(mut self, mut sender: SignalSender) {
         while self.gather(&sender).await {
             while let Some(request) = self.take(&sender, MOST) {
@@ -59,7 +59,7 @@ impl Reporter {
         sender.finish(rest, false).await;
     }
 
-    /// Waits for events and for those that follow at once; `false` when the agent ends.
+    /// Waits for events and for those that follow shortly; returns `false` when the agent stops.
     async fn gather(&self, sender: &SignalSender) -> bool {
         let news = async {
             self.log.wait(self.place).await;
@@ -71,7 +71,7 @@ impl Reporter {
         }
     }
 
-    /// The next events as a request.
+    /// Returns the next events as a request.
     fn take(&mut self, sender: &SignalSender, most: usize) -> Option<Request> {
         let Batch {
             lagged,

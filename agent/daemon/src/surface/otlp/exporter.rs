@@ -1,4 +1,4 @@
-//! The thread on which everything is exported, with a runtime of its own.
+//! The thread of all exports, with its own runtime.
 
 use std::sync::Arc;
 use std::thread::JoinHandle;
@@ -19,7 +19,7 @@ use super::traces::{SpanQueue, Tracing};
 use crate::privilege::{self, Role, SpawnError};
 use crate::surface::collect::MetricSources;
 
-/// Ending takes no longer, whatever the receiver does.
+/// Longest time to stop, whatever the receiver does.
 const ENDING: Duration = Duration::from_secs(2);
 
 /// The running thread.
@@ -29,32 +29,32 @@ pub struct Exporter {
     ended: oneshot::Receiver<()>,
 }
 
-/// Why there is none.
+/// Why the exporter cannot start.
 #[derive(Debug, thiserror::Error)]
 pub enum StartError {
-    /// What is asked for cannot be done.
+    /// The settings cannot be applied.
     #[error(transparent)]
     Settings(#[from] SettingsError),
-    /// The system has no thread for it.
+    /// The runtime cannot be created.
     #[error("cannot start the export thread")]
     Runtime(#[source] std::io::Error),
-    /// Likewise, or it has privileges that it should not have.
+    /// The thread cannot be created, or it could not drop its privileges.
     #[error("cannot start the export thread")]
     Thread(#[from] SpawnError),
 }
 
 impl Exporter {
-    /// Exports from now on, in a thread that may make connections; the caller
-    /// need not keep that.
+    /// Starts exporting in a thread that may open connections, so the caller can drop that
+    /// permission.
     ///
     /// # Errors
-    /// When a connection cannot be set up; that the receiver is not there is no error.
+    /// Fails if a connection cannot be configured. An unavailable receiver is no error.
     pub fn start(
         settings: Settings,
         sources: &MetricSources,
         spans: Arc<SpanQueue>,
     ) -> Result<Self, StartError> {
-        // Threads that block look names up, one for each signal at most.
+        // Blocking threads resolve names, at most one per signal.
         let mut runtime = Builder::new_current_thread();
         let runtime = runtime.max_blocking_threads(3).enable_all().build();
         let runtime = runtime.map_err(StartError::Runtime)?;
@@ -64,7 +64,7 @@ impl Exporter {
         let thread = std::thread::Builder::new().name("otlp".to_owned());
         let thread = privilege::spawn(Role::Export, thread, move || {
             runtime.block_on(jobs.run());
-            // A name that is being looked up must not hold the end up.
+            // A pending name resolution must not delay the end.
             runtime.shutdown_background();
             let _ = tell.send(());
         })?;
@@ -75,7 +75,7 @@ impl Exporter {
         })
     }
 
-    /// Exports what there is a last time and ends, within two seconds.
+    /// Exports a last time and stops, within two seconds.
     pub async fn finish(self) {
         self.stop.cancel();
         if timeout(ENDING, self.ended).await.is_err() {
@@ -86,7 +86,7 @@ impl Exporter {
     }
 }
 
-/// What the thread does.
+/// Work of the thread.
 struct Jobs {
     spans: Arc<SpanQueue>,
     metrics: Option<(Collector, SignalSender, Duration)>,
@@ -102,7 +102,7 @@ impl Jobs {
         stop: &CancellationToken,
         runtime: &Runtime,
     ) -> Result<Self, SettingsError> {
-        // Connections belong to the runtime from their beginning.
+        // Connections need the runtime from their creation on.
         let _inside = runtime.enter();
         let sender = |signal: Signal, target: Option<Target>| {
             let client =

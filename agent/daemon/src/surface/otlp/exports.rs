@@ -1,9 +1,9 @@
-//! What became of everything that was to be exported. Counted where it happens, shown with the
-//! agent's own metrics: an exporter that delivers nothing must not look like a robot that does nothing.
+//! Counters of exports, shown with the agent's own metrics: an exporter that delivers nothing must
+//! not look like an idle robot.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-/// What is exported.
+/// An exported signal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signal {
     /// Data points.
@@ -14,35 +14,35 @@ pub enum Signal {
     Traces,
 }
 
-/// How a request ended.
+/// Result of a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
-    /// All of it was taken.
+    /// The receiver accepted all items.
     Delivered,
-    /// The endpoint rejected a part.
+    /// The receiver rejected some items.
     Partial,
-    /// It failed and is sent again.
+    /// The request failed and is sent again.
     Retried,
-    /// It failed and is given up.
+    /// The request failed and is dropped.
     Failed,
 }
 
-/// Why something was not delivered.
+/// Why items were not delivered.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
-    /// There was no room to keep it here.
+    /// The local queue or budget was full.
     Overflow,
-    /// Newer points came while the endpoint was away.
+    /// Newer points arrived while the receiver was unavailable.
     Superseded,
-    /// The endpoint wants nothing of the kind.
+    /// The receiver refuses the signal.
     Refused,
-    /// The endpoint took the rest.
+    /// The receiver rejected these items and accepted the others.
     Rejected,
-    /// The agent ended first.
+    /// The agent stopped first.
     Shutdown,
 }
 
-/// Counters, all at once readable.
+/// Counters of all signals.
 #[derive(Debug, Default)]
 pub struct Exports {
     enabled: [AtomicBool; Signal::ALL.len()],
@@ -51,10 +51,10 @@ pub struct Exports {
 }
 
 impl Signal {
-    /// All of them.
+    /// All signals.
     pub const ALL: [Self; 3] = [Self::Metrics, Self::Events, Self::Traces];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -66,10 +66,10 @@ impl Signal {
 }
 
 impl Outcome {
-    /// All of them.
+    /// All outcomes.
     pub const ALL: [Self; 4] = [Self::Delivered, Self::Partial, Self::Retried, Self::Failed];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -82,7 +82,7 @@ impl Outcome {
 }
 
 impl Reason {
-    /// All of them.
+    /// All reasons.
     pub const ALL: [Self; 5] = [
         Self::Overflow,
         Self::Superseded,
@@ -91,7 +91,7 @@ impl Reason {
         Self::Shutdown,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -105,7 +105,7 @@ impl Reason {
 }
 
 impl Exports {
-    /// From now on this signal is exported, and its counters are shown.
+    /// Marks the signal as exported, so that its counters are shown.
     pub fn enable(&self, signal: Signal) {
         for (each, enabled) in Signal::ALL.into_iter().zip(&self.enabled) {
             if each == signal {
@@ -114,7 +114,7 @@ impl Exports {
         }
     }
 
-    /// The signals that are exported.
+    /// Returns the exported signals.
     pub fn signals(&self) -> impl Iterator<Item = Signal> + '_ {
         let all = Signal::ALL.into_iter().zip(&self.enabled);
         all.filter_map(|(signal, enabled)| enabled.load(Ordering::Relaxed).then_some(signal))
@@ -134,14 +134,14 @@ impl Exports {
         }
     }
 
-    /// How many requests ended so.
+    /// Returns the number of requests with this outcome.
     #[must_use]
     pub fn requests(&self, signal: Signal, outcome: Outcome) -> u64 {
         find(&self.requests, signal, outcome as usize)
             .map_or(0, |count| count.load(Ordering::Relaxed))
     }
 
-    /// How many items were not delivered for this reason.
+    /// Returns the number of items that were not delivered for this reason.
     #[must_use]
     pub fn dropped(&self, signal: Signal, reason: Reason) -> u64 {
         find(&self.dropped, signal, reason as usize)

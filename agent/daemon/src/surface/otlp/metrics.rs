@@ -1,7 +1,7 @@
-//! Metrics on their way out: what the page shows, every so often.
+//! Periodic export of the metrics that the page shows.
 //!
-//! Points are cumulative, so nothing is kept while the receiver is away: the next collection says
-//! it all.
+//! Points are cumulative, so none are kept while the receiver is unavailable: the next collection
+//! supersedes them.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -13,10 +13,10 @@ use super::signal_sender::SignalSender;
 use crate::surface::collect::{MetricSources, collect};
 use crate::surface::metric_sink::MetricSink;
 
-/// As long as a scrape waits for the capture thread.
+/// Longest time to wait for a fresh snapshot, as for a scrape.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
 
-/// Writes collections.
+/// Collects the metrics.
 pub(super) struct Collector {
     sources: MetricSources,
     points: Points,
@@ -24,7 +24,7 @@ pub(super) struct Collector {
 }
 
 impl Collector {
-    /// Of an agent that started then.
+    /// Creates a collector for an agent that started at this time.
     pub(super) fn new(sources: MetricSources, resource: Resource, started: SystemTime) -> Self {
         Self {
             sources,
@@ -33,9 +33,9 @@ impl Collector {
         }
     }
 
-    /// Exports every `period` and at the end.
+    /// Exports every `period`, and once at the end.
     pub(super) async fn run(mut self, mut sender: SignalSender, period: Duration) {
-        // Not all robots of a fleet that was switched on at once report in the same moment.
+        // The offset spreads the exports of a fleet that was switched on simultaneously.
         let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -53,11 +53,11 @@ impl Collector {
         sender.finish(requests, true).await;
     }
 
-    /// All metrics as they are now.
+    /// Returns all metrics as of now.
     pub(super) fn collect(&mut self, now: SystemTime) -> Collection {
         let begun = Instant::now();
         self.points.begin(unix_nanoseconds(now));
-        // Points are pushed to memory, which does not fail.
+        // Writing points to memory cannot fail.
         let _ = collect(
             &mut MetricSink::Points(&mut self.points),
             &self.sources,
@@ -69,7 +69,7 @@ impl Collector {
     }
 }
 
-/// Since 1970, as OTLP writes times.
+/// Returns nanoseconds since 1970, the unit of times in OTLP.
 fn unix_nanoseconds(time: SystemTime) -> u64 {
     let since = time.duration_since(SystemTime::UNIX_EPOCH);
     u64::try_from(since.unwrap_or_default().as_nanos()).unwrap_or(u64::MAX)

@@ -1,6 +1,6 @@
-//! OTLP: metrics, events and traces pushed to a receiver, on a thread of their own.
+//! OTLP: metrics, events and traces are pushed to a receiver on a separate thread.
 //!
-//! The receiver may be absent, slow or come back: memory stays bounded, what is not delivered is
+//! The receiver may be absent, slow or intermittent. Memory stays bounded, undelivered items are
 //! counted, and the capture never waits.
 
 mod client;

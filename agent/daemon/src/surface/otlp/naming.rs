@@ -1,11 +1,12 @@
-//! The catalogue's names as OpenTelemetry writes them: the standard mapping to Prometheus, backwards.
+//! Names of the catalogue in OpenTelemetry's form: the inverse of the standard mapping to
+//! Prometheus.
 //!
-//! Namespaces end in dots; type and unit are no part of a name. Mapped forward again, each gives
-//! exactly the Prometheus name, so that a dashboard reads both.
+//! Namespaces end with dots; type and unit are not part of a name. The forward mapping yields
+//! exactly the Prometheus name, so a dashboard can read both.
 
 use crate::surface::catalogue::{Kind, Metric};
 
-/// What metrics are about, and what their names begin with therefore.
+/// Namespaces, which are the beginnings of names.
 const NAMESPACES: &[&str] = &[
     "build",
     "capture",
@@ -26,7 +27,7 @@ const NAMESPACES: &[&str] = &[
     "writer",
 ];
 
-/// Endings that OpenTelemetry says as a unit, in UCUM.
+/// Suffixes that OpenTelemetry expresses as a unit, in UCUM.
 const UNITS: &[(&str, &str)] = &[
     ("_bytes_per_second", "By/s"),
     ("_seconds", "s"),
@@ -35,7 +36,7 @@ const UNITS: &[(&str, &str)] = &[
     ("_ratio", "1"),
 ];
 
-/// What is counted, as UCUM's annotations, which no mapping turns into a suffix.
+/// Counted items as UCUM annotations, which no mapping turns into a suffix.
 const THINGS: &[(&str, &str)] = &[
     ("datagrams", "{datagram}"),
     ("deliveries", "{delivery}"),
@@ -61,7 +62,7 @@ const THINGS: &[(&str, &str)] = &[
 ];
 
 impl Metric {
-    /// The name in OpenTelemetry, as `ros2.topic.messages`.
+    /// Returns the name in OpenTelemetry, such as `ros2.topic.messages`.
     #[must_use]
     pub fn otlp_name(&self) -> String {
         let (namespace, rest) = self.split();
@@ -80,7 +81,7 @@ impl Metric {
         }
     }
 
-    /// The unit in UCUM; empty for states and information.
+    /// Returns the unit in UCUM; empty for states and information.
     #[must_use]
     pub fn ucum(&self) -> &'static str {
         let (_, name) = self.split();
@@ -95,7 +96,7 @@ impl Metric {
         words.filter_map(thing).next().map_or("", |(_, unit)| unit)
     }
 
-    /// `ros2` and `topic_messages`: without `_total`, which the type says.
+    /// Splits into namespace and name, such as `ros2` and `topic_messages`, without `_total`.
     fn split(&self) -> (&'static str, &'static str) {
         let name = match self.kind {
             Kind::Counter => self.name.strip_suffix("_total").unwrap_or(self.name),
@@ -104,7 +105,7 @@ impl Metric {
         name.split_once('_').unwrap_or((name, ""))
     }
 
-    /// Bytes are then the noun of the name rather than its unit alone.
+    /// Returns whether bytes are the counted item of the name rather than only its unit.
     fn counts_bytes(&self) -> bool {
         self.kind == Kind::Counter && self.ucum() == "By"
     }
@@ -115,7 +116,7 @@ mod tests {
     use super::*;
     use crate::surface::catalogue::CATALOGUE;
 
-    /// What the specification's mapping makes of a metric ("OTLP Metric points to Prometheus"):
+    /// Applies the specification's mapping of a metric ("OTLP Metric points to Prometheus"):
     /// tokens, unit suffix unless the name has it, `_total`, `_ratio`.
     fn forward(name: &str, unit: &str, kind: Kind) -> String {
         let word = |unit: &str| match unit {

@@ -1,8 +1,9 @@
-//! A collection as OTLP data points, encoded as it is written: a large robot's is never in memory
-//! as objects. Requests stay well below the 4 MiB that receivers take by default.
+//! A collection as OTLP data points, encoded as it is written, so that a large robot's points are
+//! never all in memory as objects. Requests stay well below the 4 MiB that receivers accept by
+//! default.
 //!
-//! OTLP's own types and encoding are used here without the SDK: the SDK aggregates measurements
-//! itself and has no way in for histograms and sums that already are.
+//! OTLP's own types and encoding are used without the SDK: the SDK aggregates measurements itself
+//! and accepts no finished histograms and sums.
 
 use opentelemetry_proto::tonic::collector::metrics::v1::ExportMetricsServiceRequest;
 use opentelemetry_proto::tonic::common::v1::any_value::Value;
@@ -21,21 +22,21 @@ use crate::surface::catalogue::{Kind, Metric};
 use crate::surface::metric_sink::{Label, Number, write_capped};
 use ros2probe_model::histogram::Histogram;
 
-/// Where a request ends and the next one begins, in encoded bytes.
+/// Encoded size in bytes at which a request ends.
 const REQUEST_BYTES: usize = 1 << 20;
-/// Further points of one collection are dropped and counted.
+/// Largest encoded size of a collection; further points are dropped and counted.
 const COLLECTION_BYTES: usize = 16 << 20;
 
-/// One collection after the other.
+/// Encodes one collection after the other.
 #[derive(Debug)]
 pub(in crate::surface) struct Points {
     resource: Resource,
     starts: Starts,
     now: u64,
-    /// The metric whose samples come now.
+    /// The metric of the current samples.
     metric: Option<&'static Metric>,
     families: Vec<Family>,
-    /// Encoded length and number of the points in `families`.
+    /// Encoded size and number of the points in `families`.
     bytes: usize,
     items: u64,
     requests: Vec<Request>,
@@ -43,16 +44,16 @@ pub(in crate::surface) struct Points {
     dropped: u64,
 }
 
-/// What a collection came to.
+/// The result of a collection.
 #[derive(Debug, Default)]
 pub(super) struct Collection {
     pub(super) requests: Vec<Request>,
-    /// Points for which there was no room.
+    /// Points dropped because the collection was too large.
     pub(super) dropped: u64,
 }
 
 impl Points {
-    /// Of an agent that started then, in Unix nanoseconds.
+    /// Creates an encoder for an agent that started at this time, in Unix nanoseconds.
     pub(super) fn new(resource: Resource, started: u64) -> Self {
         Self {
             resource,
@@ -68,13 +69,13 @@ impl Points {
         }
     }
 
-    /// A collection begins.
+    /// Begins a collection.
     pub(super) fn begin(&mut self, now: u64) {
         self.now = now;
         self.starts.begin(now);
     }
 
-    /// It ends.
+    /// Ends the collection.
     pub(super) fn end(&mut self) -> Collection {
         self.encode();
         self.starts.end();
@@ -85,7 +86,7 @@ impl Points {
         }
     }
 
-    /// A family begins.
+    /// Begins a family.
     pub(in crate::surface) fn open(&mut self, metric: &'static Metric) {
         if self.families.last().is_some_and(is_empty) {
             self.families.pop();
@@ -94,7 +95,7 @@ impl Points {
         self.families.push(family(metric));
     }
 
-    /// One sample; an info's value is ignored.
+    /// Adds a sample; the value of an info is ignored.
     pub(in crate::surface) fn number(&mut self, labels: &[Label<'_>], value: Number) {
         let Some(metric) = self.metric else { return };
         let value = if metric.kind == Kind::Info {
@@ -132,7 +133,7 @@ impl Points {
         }
     }
 
-    /// One histogram.
+    /// Adds a histogram.
     pub(in crate::surface) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) {
         let Some(metric) = self.metric else { return };
         let (bounds, counts): (Vec<f64>, Vec<u64>) = values.buckets().unzip();
@@ -162,7 +163,7 @@ impl Points {
         }
     }
 
-    /// Makes room for a point; `false`: there is none left.
+    /// Reserves space for a point; returns `false` if the collection is full.
     fn fits(&mut self, length: usize) -> bool {
         if self.total + length > COLLECTION_BYTES {
             self.dropped += 1;
@@ -172,7 +173,7 @@ impl Points {
             self.encode();
             self.families.extend(self.metric.map(family));
         }
-        // Its key and length come on top.
+        // Key and length of the field need further bytes.
         self.bytes += length + 4;
         self.total += length + 4;
         self.items += 1;
@@ -207,7 +208,7 @@ impl Points {
     }
 }
 
-/// What all of this comes from.
+/// Returns the instrumentation scope of all signals.
 pub(super) fn scope() -> InstrumentationScope {
     InstrumentationScope {
         name: env!("CARGO_PKG_NAME").to_owned(),
@@ -216,12 +217,12 @@ pub(super) fn scope() -> InstrumentationScope {
     }
 }
 
-/// An attribute of text.
+/// Returns a text attribute.
 pub(super) fn attribute(key: &str, value: impl Into<String>) -> KeyValue {
     key_value(key, Value::StringValue(value.into()))
 }
 
-/// An attribute of any kind.
+/// Returns an attribute of any type.
 pub(super) fn key_value(key: &str, value: Value) -> KeyValue {
     KeyValue {
         key: key.to_owned(),
@@ -262,7 +263,7 @@ fn is_empty(family: &Family) -> bool {
     }
 }
 
-/// As labels; an empty one is none, in Prometheus too.
+/// Converts labels to attributes; empty ones are omitted, as Prometheus treats them as missing.
 fn attributes(metric: &Metric, labels: &[Label<'_>]) -> Vec<KeyValue> {
     let named = metric.labels.iter().zip(labels);
     named
@@ -275,8 +276,8 @@ fn value(label: &Label<'_>) -> Value {
     match label {
         Label::Text(label) => {
             let mut text = String::new();
-            // As on the page: no text of the network decides how large a request is. Writing to
-            // memory does not fail.
+            // As on the page, the cap keeps text from the network from determining the size of a
+            // request. Writing to memory cannot fail.
             let _ = write_capped(&mut text, label);
             Value::StringValue(text)
         }

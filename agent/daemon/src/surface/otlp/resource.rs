@@ -1,4 +1,4 @@
-//! Who reports: the attributes that all points, records and spans of this agent share.
+//! The resource: attributes that all points, records and spans of this agent share.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -8,17 +8,17 @@ use opentelemetry_proto::tonic::resource::v1::Resource;
 use super::points::attribute;
 use ros2probe_model::identity::Identity;
 
-/// What the operating system says of this host.
+/// Identity of a host, from its operating system.
 #[derive(Clone, Debug, Default)]
 pub struct Host {
-    /// Its name in the network.
+    /// Network name.
     pub name: Option<String>,
-    /// Its identity, which survives a change of the name.
+    /// Machine id, which does not change with the name.
     pub id: Option<String>,
 }
 
 impl Host {
-    /// This one.
+    /// Reads the identity of this host.
     #[must_use]
     pub fn read() -> Self {
         let line = |path: &str| {
@@ -32,7 +32,7 @@ impl Host {
         }
     }
 
-    /// The agent's identity on this host.
+    /// Returns the agent's identity on this host.
     pub(super) fn bits(&self) -> u128 {
         let mut identity = Identity::of(b"ros2probe service.instance.id");
         for text in [&self.id, &self.name] {
@@ -42,7 +42,7 @@ impl Host {
     }
 }
 
-/// `given` adds to what is known of `host` and replaces it.
+/// Returns the resource for `host`; attributes in `given` are added and take precedence.
 pub(super) fn resource(host: &Host, given: &BTreeMap<String, String>) -> Resource {
     let mut attributes = BTreeMap::from([
         ("service.name".to_owned(), "ros2probe".to_owned()),
@@ -72,8 +72,8 @@ pub(super) fn resource(host: &Host, given: &BTreeMap<String, String>) -> Resourc
     }
 }
 
-/// A UUID (version 8) that stays through restarts, so that a robot's series go on; derived, for a
-/// machine's id is not to be passed around as it is.
+/// Returns a UUID (version 8) that survives restarts, so that a robot's series continue. It is
+/// derived, because a machine id should not be published.
 fn instance(host: &Host) -> String {
     let mut bits = host.bits();
     bits = bits & !(0xf << 76) | 0x8 << 76;

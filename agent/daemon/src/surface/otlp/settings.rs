@@ -1,5 +1,5 @@
-//! What is exported where: the file's `otlp` section first, the standard `OTEL_*` variables where it
-//! is silent, defaults after them. Read once, at the start.
+//! Export settings: the file's `otlp` section, then the standard `OTEL_*` variables, then defaults.
+//! They are read once at startup.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,13 +13,13 @@ use super::exports::Signal;
 use super::resource::{Host, resource};
 use crate::config::{Compression, Endpoint, OtlpSettings, otlp_endpoint};
 
-/// How often metrics are exported, and how long an answer may take, by default.
+/// Default interval of metric exports, and default timeout of a request.
 const INTERVAL: Duration = Duration::from_secs(15);
 const TIMEOUT: Duration = Duration::from_secs(10);
-/// Longest file of headers.
+/// Largest size of a file with headers.
 const HEADERS_BYTES: u64 = 1 << 20;
 
-/// Where a signal goes and how.
+/// Destination and connection settings of a signal.
 #[derive(Clone, Debug)]
 pub(super) struct Target {
     pub(super) endpoint: Uri,
@@ -28,11 +28,11 @@ pub(super) struct Target {
     pub(super) gzip: bool,
 }
 
-/// What is exported.
+/// Settings of all exports.
 #[derive(Clone, Debug)]
 pub struct Settings {
     pub(super) resource: Resource,
-    /// Of this host, in ids that depend on it.
+    /// Identity of this host, for ids that depend on it.
     pub(super) host: u128,
     pub(super) interval: Duration,
     pub(super) metrics: Option<Target>,
@@ -40,58 +40,58 @@ pub struct Settings {
     pub(super) traces: Option<Target>,
 }
 
-/// Why nothing can be exported.
+/// Why exports cannot be set up.
 #[derive(Debug, thiserror::Error)]
 pub enum SettingsError {
-    /// The endpoint is none.
+    /// The endpoint is invalid.
     #[error(
-        "{name} is `{value}`, must be an URL of a gRPC receiver, as in `http://collector:4317`"
+        "{name} is `{value}`; it must be the URL of a gRPC receiver, such as `http://collector:4317`"
     )]
     Endpoint {
-        /// Where it is written.
+        /// Name of the setting.
         name: String,
-        /// What is written there.
+        /// Its value.
         value: String,
     },
-    /// TLS is a feature of the build.
+    /// The build lacks the TLS feature.
     #[error(
-        "the OTLP endpoint {0} wants TLS, which this build has not: use http:// to a collector on \
+        "the OTLP endpoint {0} requires TLS, which this build lacks: use http:// to a collector on \
          this host, or build with `--features tls`"
     )]
     NoTls(String),
-    /// A header that cannot be sent.
+    /// A header cannot be sent.
     #[error("{place}: `{name}` is not a valid header: names are lower case, values ASCII")]
     Header {
-        /// Where it is written.
+        /// Name of the setting.
         place: String,
-        /// Its name.
+        /// Name of the header.
         name: String,
     },
     /// The file with headers cannot be read.
     #[error("cannot read the headers in {}", path.display())]
     HeadersFile {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The connection cannot be set up.
+    /// The connection cannot be configured.
     #[error("the OTLP connection cannot be set up")]
     Client(#[source] tonic::transport::Error),
 }
 
 impl Settings {
-    /// What `file` and the environment want; `None`: nothing is exported.
+    /// Returns the settings from `file` and the environment; `None` if nothing is exported.
     ///
     /// # Errors
-    /// When an endpoint or header cannot be used.
+    /// Fails if an endpoint or header is invalid.
     pub fn resolve(
         file: &OtlpSettings,
         environment: &dyn Fn(&str) -> Option<String>,
         host: &Host,
     ) -> Result<Option<Self>, SettingsError> {
         let variables = Variables(environment);
-        // The file wins: one that names an endpoint means it.
+        // An endpoint in the file takes precedence over the variable.
         let disabled = variables.find("OTEL_SDK_DISABLED").is_some_and(|value| {
             value.eq_ignore_ascii_case("true") && !matches!(file.endpoint, Endpoint::At(_))
         });
@@ -118,17 +118,17 @@ impl Settings {
     }
 }
 
-/// The environment.
+/// The environment's variables.
 struct Variables<'e>(&'e dyn Fn(&str) -> Option<String>);
 
 impl Variables<'_> {
-    /// An empty variable is one that is not set.
+    /// Returns a variable's value; an empty one counts as unset.
     fn find(&self, name: &str) -> Option<String> {
         let value = (self.0)(name)?.trim().to_owned();
         (!value.is_empty()).then_some(value)
     }
 
-    /// The signal's own variable, or that of all.
+    /// Returns the signal's own variable, or the one for all signals, with its name.
     fn of(&self, signal: Signal, name: &str) -> Option<(String, String)> {
         let own = match signal {
             Signal::Metrics => "METRICS",
@@ -150,7 +150,8 @@ impl Variables<'_> {
     }
 }
 
-/// As the specification asks, a value that is no number is reported and not used.
+/// Parses a number of milliseconds. As the specification requires, an invalid value is logged and
+/// ignored.
 fn number(name: &str, value: &str) -> Option<Duration> {
     let milliseconds = value.parse().ok().filter(|value| *value > 0);
     if milliseconds.is_none() {
@@ -209,7 +210,7 @@ fn target(
     }))
 }
 
-/// The file's headers if it has any, else the environment's.
+/// Returns the headers of the file, or without any those of the environment.
 fn headers(
     file: &OtlpSettings,
     variables: &Variables<'_>,
@@ -259,7 +260,7 @@ fn headers(
     Ok(headers)
 }
 
-/// The resource's attributes that are given: the file's win over the environment's.
+/// Returns the configured resource attributes; those of the file take precedence.
 fn attributes(file: &OtlpSettings, variables: &Variables<'_>) -> BTreeMap<String, String> {
     let list = variables
         .find("OTEL_RESOURCE_ATTRIBUTES")
@@ -279,7 +280,7 @@ fn attributes(file: &OtlpSettings, variables: &Variables<'_>) -> BTreeMap<String
     attributes
 }
 
-/// `key=value,key=value`, percent-encoded as in the W3C's baggage.
+/// Parses `key=value,key=value`, percent-encoded as in W3C baggage.
 fn pairs(list: &str) -> Vec<(String, String)> {
     let pairs = list.split(',').filter_map(|pair| pair.split_once('='));
     pairs

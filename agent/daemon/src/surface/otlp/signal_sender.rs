@@ -1,7 +1,7 @@
-//! One signal's way out: what is delivered, what is given up, and the end of it all.
+//! Delivery of one signal's requests, and its end.
 //!
-//! What waits is bounded by who calls: one batch is under way, and nothing is collected before it is
-//! settled.
+//! Callers bound the pending requests: one batch is in progress, and no other is collected before
+//! it is delivered or dropped.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -12,14 +12,14 @@ use tokio_util::sync::CancellationToken;
 use super::client::{Client, Request};
 use super::exports::Reason;
 
-/// For what goes out last, of the two seconds that ending may take.
+/// Time for the last batch, out of the two seconds for stopping.
 const LAST: Duration = Duration::from_millis(1_400);
 
-/// A client that knows when to stop.
+/// A client that stops with the agent.
 pub(super) struct SignalSender {
     client: Client,
     stop: CancellationToken,
-    /// What was under way when the end was asked for.
+    /// Requests that were pending when the agent began to stop.
     left: VecDeque<Request>,
 }
 
@@ -32,23 +32,22 @@ impl SignalSender {
         }
     }
 
-    /// Completes when the agent ends.
+    /// Completes when the agent stops.
     pub(super) async fn stopped(&self) {
         self.stop.cancelled().await;
     }
 
-    /// Whether the agent ends.
+    /// Returns whether the agent is stopping.
     pub(super) fn is_stopped(&self) -> bool {
         self.stop.is_cancelled()
     }
 
-    /// Counts what never became a request.
+    /// Counts items that never became part of a request.
     pub(super) fn overflowed(&self, items: u64) {
         self.client.drop(Reason::Overflow, items);
     }
 
-    /// Delivers a batch until it is settled, until `newer` has come to take its place, or until
-    /// the agent ends.
+    /// Delivers a batch until it is delivered or refused, until `newer`, or until the agent stops.
     pub(super) async fn deliver(&mut self, batch: Vec<Request>, newer: Option<Instant>) {
         self.left = batch.into();
         let delivery = self.client.deliver(&mut self.left);
@@ -71,8 +70,8 @@ impl SignalSender {
         }
     }
 
-    /// The last batch: with what was under way, or instead of it where it says the same anew. Each
-    /// request is tried once.
+    /// Sends the last batch, once per request. It replaces pending requests if `instead`, otherwise
+    /// it follows them.
     pub(super) async fn finish(mut self, batch: Vec<Request>, instead: bool) {
         if instead {
             self.give_up(Reason::Superseded);

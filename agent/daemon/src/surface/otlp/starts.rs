@@ -1,8 +1,7 @@
-//! Since when each cumulative series counts, which OTLP wants with every point.
+//! Start times of cumulative series, which OTLP requires in every point.
 //!
-//! A series that is new since the last collection, or that began again, counts since that
-//! collection; the first ones since the agent's start. Bounded: what has no room counts since the
-//! agent's start, too.
+//! A new or reset series starts at the previous collection, and the first ones at the agent's
+//! start. The number of series is bounded; further ones start at the agent's start, too.
 
 use std::collections::HashMap;
 use std::collections::hash_map::RandomState;
@@ -11,7 +10,7 @@ use std::hash::{BuildHasher as _, Hash as _, Hasher as _};
 use crate::surface::catalogue::Metric;
 use crate::surface::metric_sink::Label;
 
-/// Series remembered.
+/// Largest number of series.
 const MAX_SERIES: usize = 200_000;
 
 /// The series of the last collection.
@@ -20,7 +19,7 @@ pub(super) struct Starts {
     hashes: RandomState,
     series: HashMap<u64, Series>,
     agent: u64,
-    /// When the last collection was, and the one that goes on.
+    /// Times of the previous and of the current collection.
     previous: u64,
     now: u64,
 }
@@ -33,7 +32,7 @@ struct Series {
 }
 
 impl Starts {
-    /// Of an agent that started then, in Unix nanoseconds.
+    /// Creates the state of an agent that started at this time, in Unix nanoseconds.
     pub(super) fn new(agent: u64) -> Self {
         Self {
             hashes: RandomState::new(),
@@ -44,19 +43,19 @@ impl Starts {
         }
     }
 
-    /// A collection begins.
+    /// Begins a collection.
     pub(super) fn begin(&mut self, now: u64) {
         self.now = now;
     }
 
-    /// It ends: what it did not hold is forgotten.
+    /// Ends a collection and removes the series that it did not contain.
     pub(super) fn end(&mut self) {
         let now = self.now;
         self.series.retain(|_, series| series.seen == now);
         self.previous = now;
     }
 
-    /// Since when the series counts of which this is the value now.
+    /// Returns the start time of the series that has this value now.
     pub(super) fn start(&mut self, metric: &Metric, labels: &[Label<'_>], value: f64) -> u64 {
         let (previous, now) = (self.previous, self.now);
         let key = self.key(metric, labels);

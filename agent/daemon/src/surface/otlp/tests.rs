@@ -1,4 +1,4 @@
-//! The exporter against a receiver that answers what the test wants.
+//! Tests of the exporter with a receiver that answers as each test requires.
 
 use std::collections::VecDeque;
 use std::net::SocketAddr;
@@ -22,7 +22,7 @@ use crate::config::Config;
 use crate::surface::MetricSources;
 use ros2probe_model::snapshot::Snapshot;
 
-/// What the receiver does with a request.
+/// Reaction of the receiver to a request.
 #[derive(Clone, Copy)]
 enum Answer {
     Taken,
@@ -85,7 +85,7 @@ impl Receiver {
     }
 }
 
-/// An agent of a quiet robot that exports every so many seconds.
+/// Starts an agent of a quiet robot that exports at this interval in seconds.
 fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, Exporter) {
     let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
     let config = Config::parse(yaml.as_bytes()).unwrap();
@@ -125,7 +125,7 @@ async fn what_fails_in_passing_is_sent_again_and_what_is_refused_is_not() {
         Answer::Rejects(7),
     ];
     let (receiver, address) = Receiver::listening(script).await;
-    // The pause before it is sent again is up to a second: what comes next must not overtake it.
+    // The pause before a retry is at most a second, so the next export must not overtake it.
     let (exports, exporter) = exporting(address, 3, "compression: gzip");
     let exports = exports.as_ref();
     until("a part is rejected", || {
@@ -181,7 +181,7 @@ async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_de
     assert!(age < 2.5, "{age} s old");
     exporter.finish().await;
 
-    // One that takes connections and says nothing, then none.
+    // The first receiver accepts connections without answering, then no receiver exists.
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let mut mute = Some(listener);

@@ -1,8 +1,8 @@
-//! Spans on their way out: a bounded queue that the capture thread fills without waiting, and what
-//! is sent of it.
+//! Export of spans: a bounded queue that the capture thread fills without waiting, and its
+//! requests.
 //!
-//! A message's trace and the span of its sending have the same ids from whichever agent they come;
-//! ids of what happens at one host depend on that host.
+//! A message's trace and its send span have the same ids on every agent. Ids of spans of one host
+//! depend on that host.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -24,27 +24,27 @@ use super::signal_sender::SignalSender;
 use ros2probe_model::identity::Identity;
 use ros2probe_model::trace::{Span, SpanStage, Spans};
 
-/// Spans that wait here, and in one request.
+/// Largest number of spans in the queue, and in one request.
 const WAITING: usize = 4096;
 const REQUEST: usize = 512;
-/// They are sent together that end within this time.
+/// Time for which spans are collected into one request.
 const GATHER: Duration = Duration::from_secs(1);
-/// W3C trace flags: sampled, and sampled by chance that all see alike.
+/// W3C trace flags: sampled, and a random trace id.
 const FLAGS: u32 = 0b11;
 
-/// Spans between the capture thread and the exporter.
+/// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
 pub struct SpanQueue {
     waiting: Mutex<VecDeque<Span>>,
     news: Notify,
 }
 
-/// Spans on their way to the exporter, where they are exported.
+/// The input of the queue, if traces are exported.
 #[derive(Clone, Debug, Default)]
 pub struct SpanSink {
-    /// Spans that wait for being exported.
+    /// The queue of spans.
     pub queue: Arc<SpanQueue>,
-    /// Counts those that do not fit.
+    /// Counts spans that do not fit.
     pub exports: Arc<Exports>,
 }
 
@@ -62,7 +62,7 @@ impl SpanSink {
 }
 
 impl SpanQueue {
-    /// Appends these; for how many there was no room.
+    /// Appends spans and returns how many did not fit.
     pub fn put(&self, spans: Vec<Span>) -> u64 {
         if spans.is_empty() {
             return 0;
@@ -97,10 +97,10 @@ impl SpanQueue {
     }
 }
 
-/// Writes requests.
+/// Encodes spans into requests.
 pub(super) struct Tracing {
     resource: Resource,
-    /// Of this agent, in ids of what happens at its host.
+    /// Identity of this host, for ids of its own spans.
     host: u128,
 }
 
@@ -109,7 +109,7 @@ impl Tracing {
         Self { resource, host }
     }
 
-    /// Exports what comes into the queue until the end.
+    /// Exports spans from the queue until the agent stops.
     pub(super) async fn run(self, mut sender: SignalSender, queue: &SpanQueue) {
         loop {
             let gathered = async {
@@ -182,7 +182,7 @@ impl Tracing {
         }
     }
 
-    /// Of the message's span at this stage.
+    /// Returns the id of the message's span at this stage.
     fn id(&self, span: &Span, stage: SpanStage) -> Vec<u8> {
         let mut identity = Identity::of(match stage {
             SpanStage::Send => b"send",
@@ -192,7 +192,7 @@ impl Tracing {
         identity.add(&span.message.trace_id.to_be_bytes());
         match stage {
             SpanStage::Send => {}
-            // Each host that it comes to receives it.
+            // Each receiving host has its own span.
             SpanStage::Receive => identity.add(&self.host.to_be_bytes()),
             SpanStage::Settle(reader) => identity.add(&reader.to_bytes()),
         }
@@ -201,7 +201,8 @@ impl Tracing {
     }
 }
 
-/// By OpenTelemetry's conventions for messaging, and under the names that the metrics' labels have.
+/// Returns the attributes: OpenTelemetry's messaging conventions, and the names of the metrics'
+/// labels.
 fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
     let message = &span.message;
     let (writer, number) = (message.writer, message.sequence_number);

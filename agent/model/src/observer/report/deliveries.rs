@@ -1,4 +1,4 @@
-//! Deliveries, acknowledgements and sockets as the snapshot shows them.
+//! Deliveries, acknowledgements and sockets of a snapshot.
 
 use std::collections::{BTreeSet, HashMap};
 
@@ -14,10 +14,10 @@ use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 use crate::sockets::SocketFacts;
 use crate::topic::Topic;
 
-/// Nodes by their endpoints.
+/// Node names by endpoint.
 type Nodes<'a> = HashMap<Guid, &'a NodeName>;
 
-/// What became of a topic's samples, of live writers and of those that have gone.
+/// Returns the sums over a topic's live and vanished writers.
 pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
     let mut sum = topic.retired_totals.as_deref().cloned().unwrap_or_default();
     for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
@@ -29,7 +29,7 @@ pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
     sum
 }
 
-/// Every receiver and destination of the topic's live writers.
+/// Returns every receiver and destination of the topic's live writers.
 pub(super) fn deliveries(
     observer: &Observer,
     topic: &Topic,
@@ -113,7 +113,7 @@ fn delivery_facts(
     }
 }
 
-/// Every reliable reader that acknowledges to one of the topic's live writers.
+/// Returns every reliable reader that acknowledges to one of the topic's live writers.
 pub(super) fn acknowledgements(
     observer: &Observer,
     topic: &Topic,
@@ -138,7 +138,7 @@ pub(super) fn acknowledgements(
     facts
 }
 
-/// The sockets by which samples of measured topics come.
+/// Returns the sockets that receive samples of measured topics.
 pub(super) fn sockets(observer: &Observer) -> Vec<SocketFacts> {
     let mut cookies = BTreeSet::new();
     for (_, measured) in observer.profiler.iter() {

@@ -1,4 +1,4 @@
-//! Where a sample was lost: before the host, in a socket buffer, in reassembly.
+//! Causes of losses: before the host, in a socket buffer, in reassembly.
 
 use ros2probe_model::input::Input;
 use ros2probe_model::loss::LossCause;
@@ -12,7 +12,7 @@ fn every_cause_is_counted_for_itself_and_all_add_up() {
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {
         match number {
-            // Never left the network.
+            // These samples were never sent to the host.
             10 | 20 | 30 => {}
             40 | 41 => host.no_room(bob, number),
             50 => host.gap(bob, 50),
@@ -74,7 +74,7 @@ fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_bri
     run(&mut host, 2);
     assert_eq!(host.deliveries()[0].delivered.messages, 1);
     host.wait(100);
-    // A retransmission is another arrival; part of it has no room either.
+    // A retransmission is another arrival, and a part of it is dropped, too.
     let again = host.fragments(bob, 2, 4, 3);
     host.put(Record {
         flags: bob.flags | flag::NO_ROOM,
@@ -94,7 +94,8 @@ fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_bri
     let facts = host.deliveries()[0].delivered;
     assert_eq!((facts.lost(), facts.lost_in_socket_buffer), (1, 1));
     assert_eq!(host.losses(LossCause::SocketBuffer), [3]);
-    // The union counts what reached the host, and knows nothing of room.
+    // The writer's measurement counts samples that reached the host, whether or not a buffer was
+    // full.
     let union = host.measurement();
     assert_eq!((union.messages, union.lost, union.recovered), (3, 0, 0));
 }

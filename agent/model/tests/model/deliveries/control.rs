@@ -1,4 +1,4 @@
-//! HEARTBEAT and ACKNACK: what a writer still has, and what a reader waits for.
+//! HEARTBEAT and ACKNACK: the samples that a writer still has, and those that a reader waits for.
 
 use ros2probe_model::loss::LossCause;
 use ros2probe_testing::model::host::{BOB, CAROL, Host};
@@ -12,7 +12,7 @@ fn a_heartbeat_tells_the_tail_to_the_reader_it_is_for_and_to_no_other() {
         host.data(carol, number);
     }
     host.heartbeat(bob.directed(BOB), 1, 13);
-    // The same socket, but for somebody else.
+    // The same socket receives a HEARTBEAT for another participant.
     host.heartbeat(carol.multicast(7413).directed(BOB), 1, 13);
     host.wait(12_000);
     let lost: Vec<_> = host
@@ -62,7 +62,7 @@ fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
         if number % 10 != 0 {
             host.data(bob, number);
         }
-        // All others have acknowledged all: the writer has nothing before this any more.
+        // All other readers have acknowledged everything, so the writer drops the earlier samples.
         host.heartbeat(bob, number, number);
         host.wait(10);
     }
@@ -78,21 +78,21 @@ fn a_best_effort_reader_of_a_reliable_writer_is_sent_nothing_again() {
 fn heartbeats_alone_lose_nothing_until_the_reader_asks() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    // All samples go by shared memory.
+    // All samples use shared memory.
     for number in 1..=100 {
         host.heartbeat(bob.directed(BOB), 1, number);
         host.wait(100);
     }
     host.wait(12_000);
     assert_eq!(host.deliveries()[0].delivered.lost(), 0);
-    // All samples are larger than what gets through, and the reader asks for them.
+    // All samples exceed the size of shared memory, and the reader requests them.
     for number in 101..=120 {
         host.heartbeat(bob.directed(BOB), 1, number);
         host.request(bob, 101, 1, 1 << 31);
         host.wait(100);
     }
     host.wait(12_000);
-    // What it acknowledged before came by shared memory.
+    // The samples that it acknowledged before used shared memory.
     let facts = host.deliveries()[0].delivered;
     assert_eq!((facts.lost(), facts.irrelevant), (20, 99));
 }
@@ -102,7 +102,7 @@ fn what_a_writer_of_few_samples_overwrote_before_it_came_is_lost() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=100 {
-        // KEEP_LAST (1): of 50 and 51 only the HEARTBEAT with 51 came.
+        // With KEEP_LAST (1), only the HEARTBEAT for 51 arrives, but neither 50 nor 51.
         match number {
             10 | 20 | 21 | 50 => {}
             51 => host.heartbeat(bob.directed(BOB), 51, 51),

@@ -1,4 +1,4 @@
-//! Every sample that was sent is delivered, lost for one cause or irrelevant, whatever happens.
+//! Every sent sample is delivered, lost for exactly one cause, or irrelevant.
 
 use proptest::prelude::*;
 use ros2probe_model::loss::LossCause;
@@ -6,7 +6,7 @@ use ros2probe_testing::model::host::{BOB, Host, Seen};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};
 
-/// What becomes of one sample.
+/// The fate of one sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Fate {
     Arrives,
@@ -14,10 +14,10 @@ enum Fate {
     BeforeHost,
     NoRoom,
     Reassembly,
-    /// Retransmitted after it was lost, or had no room.
+    /// Retransmitted after it was lost or dropped by a full buffer.
     Repaired,
     RepairedAfterNoRoom,
-    /// Retransmitted into a full buffer.
+    /// Retransmitted, and dropped again by a full buffer.
     RepairHadNoRoom,
     Excused,
 }
@@ -36,7 +36,8 @@ fn fate() -> impl Strategy<Value = Fate> {
     ]
 }
 
-/// One sample as a whole, or in fragments of which the middle ones meet that fate.
+/// Returns the arrival of a sample, unfragmented or as fragments of which the middle ones are
+/// affected.
 fn arrival(host: &Host, bob: Seen, number: u64, fragmented: bool, part: bool) -> Record {
     let record = match (fragmented, part) {
         (false, _) => host.record(bob, kind::DATA, number),
@@ -62,7 +63,7 @@ proptest! {
         let bob = host.reader(BOB, 7411);
         let no_room = |record: Record| Record { flags: record.flags | flag::NO_ROOM, ..record };
         host.put(arrival(&host, bob, 1, false, false));
-        // The kernel has been told of the writer by then: from here on no fragment is left out.
+        // The kernel knows the writer by then, so it captures every fragment from here on.
         host.wait(300);
         let mut given_up = Vec::new();
         let mut repairs = Vec::new();
@@ -88,7 +89,7 @@ proptest! {
             if matches!(fate, Fate::Repaired | Fate::RepairedAfterNoRoom | Fate::RepairHadNoRoom) {
                 repairs.push((number, *fate, *fragmented));
             }
-            // Repairs come some samples later.
+            // Retransmissions follow some samples later.
             if repairs.len() > 4 {
                 host.heartbeat(bob, 1, number);
                 let (number, fate, fragmented) = repairs.remove(0);
@@ -104,7 +105,7 @@ proptest! {
         for _ in 0..15 {
             host.wait(1000);
         }
-        // What is not known yet is pending, and nothing is open any more.
+        // Unknown causes are pending, and no sample is open any longer.
         let facts = host.deliveries()[0].delivered;
         prop_assert_eq!(facts.messages - facts.history + facts.lost() + facts.irrelevant, sent);
         let unknown = fates.iter().filter(|(fate, ..)| matches!(fate, Fate::BeforeHost | Fate::Reassembly));

@@ -1,4 +1,4 @@
-//! Which receiver a datagram is for: sockets, addresses, processes, readers that come and go.
+//! Receivers of datagrams: sockets, addresses, processes, readers that appear and vanish.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 
@@ -32,11 +32,11 @@ fn two_subscribers_of_one_multicast_with_different_losses_are_told_apart() {
         .iter()
         .map(|each| (each.participant.unwrap().prefix, each.delivered.lost()))
         .collect();
-    // The last one of Bob's had no room, which is known; Carol lost none at the end.
+    // Bob's last sample was dropped with a known cause; Carol lost none at the end.
     assert_eq!(lost, [(BOB, 10), (CAROL, 7)]);
     assert_eq!(deliveries[0].sockets, [101]);
     assert_eq!(deliveries[0].destination.to_string(), GROUP);
-    // Every sample reached this host, if only a full socket.
+    // Every sample reached this host, even if a buffer was full.
     assert_eq!(host.measurement().messages, 50);
     assert_eq!(host.measurement().duplicates, 0);
 }
@@ -48,7 +48,7 @@ fn a_late_joiner_and_its_history_lose_nothing() {
     (1..=500).for_each(|number| host.data(bob, number));
     let carol = host.reader(CAROL, 7413);
     host.data(carol, 501);
-    // What it asked for as history, and a HEARTBEAT that says what there is.
+    // The reader gets the history that it requested, and a HEARTBEAT.
     host.heartbeat(carol, 1, 501);
     (490..=500).for_each(|number| host.data(carol, number));
     (502..=510).for_each(|number| host.data(carol, number));
@@ -68,7 +68,7 @@ fn a_reader_that_leaves_loses_nothing_and_comes_back_without_a_gap() {
         host.data(carol, number);
     }
     host.wait(50);
-    // A last HEARTBEAT tells of a sample that Carol does not wait for any more.
+    // A last HEARTBEAT announces a sample that Carol no longer waits for.
     host.heartbeat(carol.directed(CAROL), 1, 101);
     host.unsubscribe(CAROL, 2);
     for number in 101..=2000 {
@@ -135,7 +135,7 @@ fn a_killed_subscriber_does_not_lose_for_ever() {
         }
         host.wait(100);
     }
-    // What left in the first moments of its silence is taken for lost, no more.
+    // Only samples from the first moments of its silence count as lost.
     let lost = host.deliveries()[0].delivered.lost();
     assert!((30..=60).contains(&lost), "{lost}");
 }
@@ -148,7 +148,7 @@ fn an_address_that_two_announce_in_turn_is_nobodys() {
     host.data(bob, 1);
     let owner = |host: &Host| host.deliveries()[0].participant.map(|guid| guid.prefix);
     assert_eq!(owner(&host), Some(CAROL));
-    // Bob lives: containers have the same addresses.
+    // Bob is alive: containers may have the same addresses.
     host.participant(BOB, bob.address);
     host.participant(CAROL, bob.address);
     host.data(bob, 2);
@@ -181,7 +181,7 @@ fn who_is_silent_and_unknown_is_forgotten() {
 
 #[test]
 fn what_a_participant_sends_to_an_address_of_its_own_by_mistake_tells_nothing_of_its_socket() {
-    // RustDDS announces 127.0.0.1 to other hosts too: an ACKNACK for Alice comes back to Bob.
+    // RustDDS announces 127.0.0.1 to other hosts too, so an ACKNACK for Alice returns to Bob.
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let stray = Record {
@@ -196,7 +196,7 @@ fn what_a_participant_sends_to_an_address_of_its_own_by_mistake_tells_nothing_of
         host.data(group, number);
         host.wait(10);
     }
-    // Samples for a reader on another host come there as well.
+    // Samples for a reader on another host use the same address.
     host.participant(CAROL, "127.0.0.1:7411".parse().unwrap());
     host.subscribe(CAROL, 1);
     (5..=8).for_each(|number| host.data(bob.directed(CAROL), number));

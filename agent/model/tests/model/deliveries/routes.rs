@@ -1,4 +1,4 @@
-//! One delivery by several routes: multicast and unicast, mirrored, and the caps of routes.
+//! One delivery with several routes: multicast and unicast, mirrored, and the caps of routes.
 
 use std::net::SocketAddrV4;
 
@@ -82,7 +82,7 @@ fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
             ..record
         });
     };
-    // By unicast what the multicast brings after all, and the other way round.
+    // Samples missing by multicast arrive by unicast, and vice versa.
     (1..=5).for_each(|number| large(&mut host, bob, number));
     (9..=20).for_each(|number| large(&mut host, bob, number));
     host.wait(11_000);
@@ -134,7 +134,7 @@ fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs
         (delivery.delivered.recovered, delivery.delivered.lost()),
         (5, 4)
     );
-    // Unicast only: two addresses are two receivers.
+    // With unicast only, two addresses are two receivers.
     let mut host = Host::new();
     host.reader(BOB, 7411);
     host.reader(CAROL, 7413);
@@ -166,7 +166,7 @@ fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
     let elsewhere = host.reader(CAROL, 7413).wire();
     host.owner(group, BOB);
     for number in 1..=100 {
-        // The mirror is first, and shows what Bob and Carol get.
+        // The mirror comes first and shows the samples of Bob and Carol.
         host.data(group.wire(), number);
         host.data(group, number);
         if number % 10 == 0 {
@@ -185,7 +185,7 @@ fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
         (100, 0, 0)
     );
     let union = host.measurement();
-    // The very first came before it was known that a socket receives it.
+    // The first sample arrived before the socket of the receiver was known.
     assert_eq!((union.messages, union.lost, union.duplicates), (100, 0, 10));
 }
 
@@ -255,7 +255,7 @@ fn a_full_table_refuses_counts_and_makes_room_when_somebody_is_silent() {
             .iter()
             .all(|each| each.delivered.lost() == 0)
     );
-    // The sums keep what was counted of those that went.
+    // The sums include the deliveries that were dropped.
     let sum: u64 = host
         .deliveries()
         .iter()

@@ -1,4 +1,4 @@
-//! Discovery data: repeated, fragmented, relayed, malformed, and the names of nodes.
+//! Discovery data: repeated, fragmented, relayed, malformed; names of nodes.
 
 use ros2probe_model::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};

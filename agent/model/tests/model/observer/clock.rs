@@ -1,4 +1,4 @@
-//! Time that comes with the data: steps of the wall clock, jumps, and the same result twice.
+//! Steps of the wall clock, jumps, and reproducible results.
 
 use ros2probe_model::churn;
 use ros2probe_model::event::EventKind;
@@ -20,11 +20,11 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
         world.observer.drain();
         let before = world.now;
 
-        // The writer's clock is the same one.
+        // The writer uses the same clock.
         world.now = world.now.saturating_add_signed(step);
         world.observer.input(Input::ClockSet(step));
         world.stream(alice(WRITER), 501..=700);
-        // A gap that is settled ten seconds later, as without the step.
+        // A gap settles after ten seconds, as without the step.
         world.stream(alice(WRITER), 702..=1000);
         let snapshot = world.snapshot();
         assert_eq!(snapshot.at.0, world.now);
@@ -45,7 +45,7 @@ fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
             assert!(world.now.abs_diff(event.at.0) < 10 * SECOND, "{event:?}");
         }
 
-        // And a lease that runs out does so after as long as ever.
+        // A lease expires after its usual duration.
         assert_eq!(world.measurement("/chatter").lost, 0);
         world.wait(9_900);
         assert_eq!(world.snapshot().participants.len(), 1, "{forward}");

@@ -49,7 +49,7 @@ fn who_comes_and_goes_is_told_with_what_was_known_of_it() {
     assert!(world.events().is_empty());
     world.wait(11_000);
     let mut told = world.events();
-    // And that nobody heard it, for as long as it was there.
+    // The missing subscriber is a finding for as long as the publisher exists.
     told.retain(|(_, kind)| !matches!(kind, EventKind::Diagnosis { .. }));
     assert_eq!(told.len(), 3);
     assert_eq!(changes(&told, churn::Event::Expired), 1);
@@ -65,7 +65,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
     world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
     world.sample(alice(WRITER), 1);
     world.events();
-    // Three gaps within a second: 2, 4 to 5, 7.
+    // Three gaps occur within a second: 2, 4 to 5, 7.
     for number in [3, 6, 8] {
         world.wait(100);
         world.sample(alice(WRITER), number);
@@ -150,7 +150,7 @@ fn a_changed_expectation_is_told_once_and_another_watch_changes_nothing() {
     let silence = (None, WatchState::Silent, vec!["silence"]);
     assert_eq!(states(&mut world), [silent, silence]);
 
-    // In front of it, so that its place in the list is another.
+    // A new entry before it changes its index in the list.
     watch(&mut world, vec![expects("/other", None), chatter.clone()]);
     world.wait(2_000);
     assert_eq!(states(&mut world), []);

@@ -1,4 +1,4 @@
-//! Watches, the interest that follows from them, and the topics that are measured.
+//! Watches, the resulting interest, and the topics that are measured.
 
 use std::sync::Arc;
 
@@ -71,7 +71,7 @@ fn the_cap_on_watched_topics_rejects_and_counts() {
             .contains(&(rejected, Some(Verdict::Ignore)))
     );
     assert_eq!(world.snapshot().topics_rejected, 1);
-    // A place that is given back is used.
+    // A freed slot is used.
     world.put(Message::from(ALICE).dispose_by_hash(
         SEDP_WRITERS,
         99,
@@ -117,7 +117,7 @@ fn lists_of_costly_globs_are_asked_a_part_at_a_time() {
         .filter(|it| is_measured(it))
         .count();
     assert!(some < usize::from(TOPICS) / 2, "{some}");
-    // It goes on being counted.
+    // The topic is still counted.
     world.sample(alice(WRITER), 1);
     let mut rounds = 0;
     while !world.observer.apply_more_lists() {

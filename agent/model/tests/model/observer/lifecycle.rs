@@ -1,4 +1,4 @@
-//! Participants and endpoints appear, are renewed, disposed of, expire and come back.
+//! Participants and endpoints appear, renew, are disposed, expire and return.
 
 use ros2probe_model::input::Input;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
@@ -119,7 +119,7 @@ fn a_killed_participant_goes_with_all_it_had_when_its_lease_ends() {
         world.sedp(alice(WRITER), "rt/chatter");
         world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
         world.wait(5000);
-        // Any sign of life renews the lease.
+        // Any packet renews the lease.
         world.sample(alice(WRITER), 1);
         let last = world.now;
         world.wait(u64::from(lease) * 1000 - 200);

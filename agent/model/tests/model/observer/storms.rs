@@ -1,4 +1,4 @@
-//! Forgeries in numbers: tables stay within their caps, and real topics are counted.
+//! Floods of forgeries: tables stay within their caps, and real topics are counted.
 
 use ros2probe_model::observer::Settings;
 use ros2probe_testing::model::forge::Message;

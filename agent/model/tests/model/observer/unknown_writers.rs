@@ -1,4 +1,4 @@
-//! Writers that send and were never announced.
+//! Writers that send but are never announced.
 
 use ros2probe_model::input::Input;
 use ros2probe_model::snapshot::SocketFacts;

@@ -1,5 +1,5 @@
-//! What is wrong, in words: where, since when and what helps. Texts hold no figure that changes
-//! every second, so that the list is sent only when something has changed.
+//! Problems described in words: place, begin and remedy. The texts contain no rapidly changing
+//! numbers, so the list is sent only after real changes.
 
 use std::collections::HashMap;
 
@@ -13,20 +13,20 @@ use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
 
-/// Findings of one stream at most, so that a storm of them stays readable.
+/// Largest number of findings per stream.
 const MOST: usize = 512;
 
-/// What findings are made of.
+/// Input of the findings.
 pub(super) struct Circumstances<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) agent: &'a AgentFacts,
     pub(super) past: &'a Past,
     pub(super) ids: &'a Ids,
-    /// Why the agent sees nothing.
+    /// Why the agent is not ready.
     pub(super) unready: Option<&'a str>,
 }
 
-/// Everything, the worst first.
+/// Returns all findings, the most severe first.
 pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     let mut list = of_agent(circumstances);
     list.extend(of_graph(circumstances));
@@ -67,7 +67,8 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
     let dropped = dropped(agent);
     if dropped > 0 {
         let text =
-            "The agent lost packets for want of room: its counts are lower bounds".to_owned();
+            "The agent dropped packets because a buffer was full: its counts are lower bounds"
+                .to_owned();
         let drops = finding("agent_drops", Severity::Warning, "", text);
         list.push(drops.with_remedy("raise capture.ring_bytes and capture.record_ring_bytes"));
     }
@@ -85,7 +86,8 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-/// What the agent cannot observe: a note for each reason, and one for all that its source lacks.
+/// Returns what the agent cannot observe: one note per reason, and one for all that its source
+/// lacks.
 fn unseen(agent: &AgentFacts) -> Vec<Finding> {
     let mut list = Vec::new();
     let mut lacking = Vec::new();
@@ -103,9 +105,9 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
     }
     if !lacking.is_empty() {
         let source = match agent.source {
-            SourceKind::Host => "The agent looks at the sockets of this host",
-            SourceKind::Wire => "The agent looks at packets on network interfaces",
-            SourceKind::Replay => "A capture holds packets alone",
+            SourceKind::Host => "The agent captures at the sockets of this host",
+            SourceKind::Wire => "The agent captures on network interfaces",
+            SourceKind::Replay => "A capture file contains only packets",
         };
         let text = format!("{source}. It does not show {}", lacking.join(", "));
         list.push(finding("ability", Severity::Note, "source", text));
@@ -113,7 +115,7 @@ fn unseen(agent: &AgentFacts) -> Vec<Finding> {
     list
 }
 
-/// An ability's object, in words.
+/// Returns what an ability shows, in words.
 const fn object(ability: Ability) -> &'static str {
     match ability {
         Ability::Subscribers => "what each subscriber receives",
@@ -128,7 +130,7 @@ const fn object(ability: Ability) -> &'static str {
     }
 }
 
-/// Packets, records and datagrams that were lost for want of room.
+/// Returns the number of packets, records and datagrams dropped because a ring was full.
 pub(super) fn dropped(agent: &AgentFacts) -> u64 {
     let packets: u64 = agent
         .interfaces
@@ -142,7 +144,7 @@ fn of_graph(all: &Circumstances<'_>) -> Vec<Finding> {
     let snapshot = all.snapshot;
     let ends = Ends::new(snapshot);
     let list = snapshot.diagnoses.list.iter();
-    // Without times where the lists do not go together.
+    // The times are omitted if the lists do not match.
     let times = snapshot
         .diagnosed
         .iter()
@@ -196,7 +198,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         Diagnosis::DuplicateNode {
             domain_id, node, ..
         } => {
-            let text = format!("Several nodes bear the name {node}");
+            let text = format!("Several nodes have the name {node}");
             Finding {
                 domain_id: Some(domain_id.0),
                 node: all.ids.node(*domain_id, node),
@@ -239,11 +241,11 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
     }
 }
 
-/// What an endpoint does, and its counterpart.
+/// Role of an endpoint, and its counterpart.
 const PUBLISHER: [&str; 2] = ["publishes", "subscription"];
 const SUBSCRIBER: [&str; 2] = ["subscribes to", "publisher"];
 
-/// An endpoint without a counterpart.
+/// Describes an endpoint without a counterpart.
 fn unmatched(
     kind: &'static str,
     topic: &TopicKey,
@@ -258,7 +260,7 @@ fn unmatched(
     finding(kind, alone(reason), &about, text)
 }
 
-/// A writer and a reader whose QoS differs.
+/// Describes a writer and a reader with incompatible QoS.
 fn incompatible(
     kind: &'static str,
     topic: &TopicKey,
@@ -287,7 +289,7 @@ fn incompatible(
     .with_remedy("let the publisher offer what the subscription requests, or request less")
 }
 
-/// Why an endpoint has no counterpart.
+/// Returns why an endpoint has no counterpart.
 fn lacks(reason: &str, counterpart: &str) -> String {
     match reason {
         "qos" => format!("no {counterpart} has a matching QoS"),
@@ -297,7 +299,8 @@ fn lacks(reason: &str, counterpart: &str) -> String {
     }
 }
 
-/// To be alone is common; to be alone among others is not.
+/// Returns the severity: an endpoint without any counterpart is common, one with only incompatible
+/// counterparts is not.
 fn alone(reason: &str) -> Severity {
     match reason {
         "qos" | "type" | "partition" => Severity::Warning,
@@ -312,7 +315,7 @@ fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
             let (kind, text) = match topic.state {
                 WatchState::Violated => {
                     let broken = topic.violations.join(", ");
-                    let text = format!("{} does not do as expected: {broken}", topic.topic);
+                    let text = format!("{} violates its expectations: {broken}", topic.topic);
                     ("watch_violated", text)
                 }
                 WatchState::Silent => {
@@ -338,7 +341,7 @@ fn of_watches(all: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-/// Topics that lost messages lately, and where those died.
+/// Returns topics that lost messages recently, with the cause.
 fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
     let lost = lost_lately(all.past);
     let topics = all.snapshot.topics.iter();
@@ -359,7 +362,7 @@ fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
     found.collect()
 }
 
-/// Where most of a topic's messages died, as far as that is seen, and what helps there.
+/// Returns where most of a topic's messages were lost, if known, and the remedy.
 fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     let received = topic.received.as_deref();
     let at = received.map_or([0; 3], |received| {
@@ -379,7 +382,7 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     } else if most == before {
         (
             ", most of them before they reach this host",
-            "look at the network and at the sender's host",
+            "check the network and the sender's host",
         )
     } else if most == reassembly {
         (
@@ -394,7 +397,7 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// When a loss began that has gone on since, with pauses shorter than [`LOSS`].
+/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`].
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;
@@ -417,7 +420,7 @@ struct Ends<'a>(HashMap<Guid, &'a EndpointFacts>);
 impl<'a> Ends<'a> {
     fn new(snapshot: &'a Snapshot) -> Self {
         let about = snapshot.diagnoses.list.iter();
-        // Nothing is looked up where nothing is wrong.
+        // Without findings, no lookup is needed.
         if about.len() == 0 {
             return Self(HashMap::new());
         }
@@ -426,7 +429,7 @@ impl<'a> Ends<'a> {
         Self(all.map(|endpoint| (endpoint.guid, endpoint)).collect())
     }
 
-    /// The node of an endpoint, else its GUID.
+    /// Returns the node of an endpoint, or its GUID.
     fn who(&self, guid: Guid) -> String {
         let node = self
             .0
@@ -435,7 +438,7 @@ impl<'a> Ends<'a> {
         node.map_or_else(|| guid.to_string(), ToString::to_string)
     }
 
-    /// What the one offers and the other requests.
+    /// Describes what the writer offers and the reader requests.
     fn difference(&self, policy: Policy, writer: Guid, reader: Guid) -> String {
         let value = |guid: Guid| {
             let endpoint = self.0.get(&guid)?;
@@ -518,7 +521,8 @@ mod tests {
         let lacking = text(&agent);
         assert_eq!(lacking.len(), 1, "{lacking:?}");
         assert!(
-            lacking[0].starts_with("A capture holds packets alone. It does not show what each")
+            lacking[0]
+                .starts_with("A capture file contains only packets. It does not show what each")
                 && lacking[0].contains("losses in the buffers of sockets"),
             "{lacking:?}"
         );

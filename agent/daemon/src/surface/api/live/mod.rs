@@ -1,9 +1,8 @@
-//! `GET /live`: everything that the page shows, first the whole state, then once a second what has
-//! changed since.
+//! `GET /live`: the data of the web page, first the whole state, then the changes of each second.
 //!
-//! Nothing waits for a slow client: each stream knows the last moment that it has sent, and takes
-//! what changed since then when the client takes more. What lies between is not sent. Nothing is
-//! computed while no stream is open.
+//! A slow client delays no other. Each stream stores the last state that it has sent, and sends the
+//! changes since then when the client reads further. States in between are skipped. Without an open
+//! stream, no work is done.
 
 mod findings;
 mod shared_lines;
@@ -35,39 +34,40 @@ use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::snapshot::Transport;
 use shared_lines::SharedLines;
 
-/// Streams at once, of all listeners: fewer than connections, so that requests find one.
+/// Largest number of streams of all listeners: fewer than connections, so that other requests still
+/// get one.
 const MAX_TABS: usize = 16;
-/// Time between two batches. The agent publishes what it knows once a second.
+/// Time between two batches; the agent publishes its state once per second.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// So much earlier the next moment is waited for.
+/// The stream begins to wait for the next state this much earlier.
 const EARLY: Duration = Duration::from_millis(100);
-/// Events in one batch.
+/// Largest number of events in one batch.
 const EVENTS: usize = 64;
 
-/// What all streams have in common; kept only while there is one.
+/// State that all streams share; it exists only while a stream is open.
 #[derive(Debug)]
 pub struct Live {
-    /// How long figures are kept.
+    /// Time for which measurements are kept.
     history: Duration,
     places: Arc<Semaphore>,
     shared: Mutex<Option<SharedLines>>,
 }
 
-/// One client's stream.
+/// The stream of one client.
 struct Stream {
     context: Context,
     access: String,
-    /// The last moment that was sent; `None` = none yet.
+    /// The round of the last state that was sent; `None` before the first.
     seen: Option<u64>,
     sent: Instant,
-    /// The number of the last event that was looked at.
+    /// Number of the last event that was processed.
     place: u64,
     ended: bool,
     permit: Option<OwnedSemaphorePermit>,
 }
 
 impl Live {
-    /// Of an agent that keeps figures for so long.
+    /// Creates the state of an agent that keeps measurements for this time.
     #[must_use]
     pub fn new(history: Duration) -> Self {
         Self {
@@ -86,12 +86,12 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(live))
 }
 
-/// The robot, as it changes
+/// The robot's state and its changes
 ///
-/// Each line is a JSON object with one member. First `open`, `graph`, `agent`, `findings`,
-/// `history` and `values` with every row; then once a second those that have changed, and always
-/// `values`, with the rows that have. A client that reads slowly gets fewer batches, each complete.
-/// Numbers of topics, nodes and participants are valid within one stream.
+/// Each line is a JSON object with one member. The stream begins with `open`, `graph`, `agent`,
+/// `findings`, `history` and `values` with every row. Then each second has the lines that changed,
+/// and always `values` with the rows that changed. A client that reads slowly gets fewer batches,
+/// each complete. Numbers of topics, nodes and participants are valid within one stream.
 #[utoipa::path(
     get,
     path = "/live",
@@ -131,7 +131,7 @@ async fn live(
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// The next batch.
+    /// Returns the next batch.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
             return None;
@@ -152,14 +152,14 @@ impl Pieces for Stream {
 }
 
 impl Stream {
-    /// Waits for the next moment that is shown; whether there is one.
+    /// Waits for the next state to show; returns false if there is no further one.
     async fn moment(&self) -> bool {
         let latest = &self.context.latest;
         let next = async {
             sleep_until(self.sent + INTERVAL - EARLY).await;
             tokio::select! {
                 () = latest.published() => {}
-                // Nothing is published any more once a capture has ended.
+                // A finished capture publishes no further state.
                 () = sleep_until(self.sent + INTERVAL + EARLY * 3) => {}
             }
         };

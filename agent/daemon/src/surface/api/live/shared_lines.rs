@@ -1,5 +1,5 @@
-//! What all streams show of one moment, made once for all of them: each part has the number of the
-//! round in which it changed last, and a stream takes what changed since its own last round.
+//! Lines of one state, formatted once for all streams. Each part stores the round in which it last
+//! changed, and a stream takes the parts that changed since its own last round.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -20,10 +20,10 @@ use ros2probe_api::live::{Ability, Agent, Graph, Line, Progress, Row, Totals, Va
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::Snapshot;
 
-/// One moment, and what it took to come there.
+/// The lines of the current state, with the rounds of their last changes.
 #[derive(Debug, Default)]
 pub(super) struct SharedLines {
-    /// Counts the moments.
+    /// Number of the current round.
     round: u64,
     state: Option<Arc<State>>,
     past: Option<Arc<Past>>,
@@ -38,7 +38,7 @@ pub(super) struct SharedLines {
     progress: Option<Progress>,
 }
 
-/// Lines that are sent whole when they have changed.
+/// Lines that are sent again after each change.
 #[derive(Debug, Default)]
 struct Part {
     changed: u64,
@@ -56,7 +56,7 @@ impl Part {
 }
 
 impl SharedLines {
-    /// Takes in a moment, unless it is the one that is shown.
+    /// Updates the lines to a new state; does nothing if the state is the current one.
     pub(super) fn update(&mut self, state: &Arc<State>, past: &Arc<Past>, in_force: &Arc<InForce>) {
         let is_same = self
             .state
@@ -93,7 +93,7 @@ impl SharedLines {
         self.in_force = Some(Arc::clone(in_force));
     }
 
-    /// The line of the graph.
+    /// Updates the line of the graph.
     fn update_structure<'a>(
         &mut self,
         snapshot: &'a Snapshot,
@@ -106,7 +106,7 @@ impl SharedLines {
         let mut line = Line::Graph(Graph { version, ..graph });
         self.structure.set(&line, round);
         if self.structure.changed == round {
-            // The version is the round, so a graph has another one whenever it differs.
+            // The version is the round, so a changed graph has a new version.
             if let Line::Graph(graph) = &mut line {
                 graph.version = round;
             }
@@ -114,7 +114,7 @@ impl SharedLines {
         }
     }
 
-    /// The lines of the agent and of the findings.
+    /// Updates the lines of the agent and of the findings.
     fn update_agent(&mut self, state: &State, past: &Past, in_force: &InForce) {
         let (snapshot, agent, round) = (state.known(), &state.agent, self.round);
         let unready = state.ready(Instant::now()).err();
@@ -147,8 +147,8 @@ impl SharedLines {
         self.findings.set(&Line::Findings(list), round);
     }
 
-    /// The figures of topics. A topic without figures has an empty row once, so that no mark is left
-    /// behind.
+    /// Updates the rows of topics. A topic that is no longer measured gets an empty row once, which
+    /// clears it on the page.
     fn update_rows(&mut self, rows: BTreeMap<u32, Row>) {
         let round = self.round;
         let emptied = self.rows.keys().filter(|id| !rows.contains_key(id));
@@ -164,14 +164,15 @@ impl SharedLines {
         self.rows.retain(|id, _| topics.contains(id));
     }
 
-    /// What changed of the graph, the agent and the findings since the round `seen`.
+    /// Returns the lines of the graph, the agent and the findings that changed since the round
+    /// `seen`.
     pub(super) fn parts(&self, seen: u64) -> impl Iterator<Item = &Bytes> {
         let parts = [&self.structure, &self.agent, &self.findings];
         let news = parts.into_iter().filter(move |part| part.changed > seen);
         news.map(|part| &part.text)
     }
 
-    /// The figures that changed since then.
+    /// Returns the values that changed since the round `seen`.
     pub(super) fn values(&self, seen: u64) -> Values {
         let news = self.rows.values().filter(|(changed, _)| *changed > seen);
         Values {
@@ -182,7 +183,7 @@ impl SharedLines {
         }
     }
 
-    /// The number of this moment.
+    /// Returns the number of the current round.
     pub(super) const fn round(&self) -> u64 {
         self.round
     }

@@ -1,4 +1,4 @@
-//! The structure of the graph: what changes seldom, and what the rows of figures refer to.
+//! The graph of the stream: it changes seldom, and rows of values refer to it.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -13,7 +13,7 @@ use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts};
 use ros2probe_model::topic_kind::TopicKind;
 
-/// Numbers that stand for names.
+/// Numbers that identify entities within the streams.
 #[derive(Debug, Default)]
 pub(super) struct Ids {
     participants: Numbers<Guid>,
@@ -21,7 +21,7 @@ pub(super) struct Ids {
     topics: Numbers<(DomainId, String)>,
 }
 
-/// Each key's number, counted up and never used again.
+/// The number of each key; numbers increase and are never reused.
 #[derive(Debug)]
 struct Numbers<K> {
     last: u32,
@@ -38,7 +38,7 @@ impl<K> Default for Numbers<K> {
 }
 
 impl<K: Eq + Hash> Numbers<K> {
-    /// The number of `key`, which is there in this round.
+    /// Returns the number of `key` and marks it as present in this round.
     fn number(&mut self, key: K, round: u64) -> u32 {
         let last = &mut self.last;
         let (number, seen) = self.known.entry(key).or_insert_with(|| {
@@ -49,7 +49,7 @@ impl<K: Eq + Hash> Numbers<K> {
         *number
     }
 
-    /// Forgets what was not there in this round.
+    /// Removes keys that are not present in this round.
     fn forget(&mut self, round: u64) {
         self.known.retain(|_, (_, seen)| *seen == round);
     }
@@ -61,7 +61,7 @@ impl Ids {
         self.topics.known.get(&key).map(|(number, _)| *number)
     }
 
-    /// The numbers of all topics.
+    /// Returns the numbers of all topics.
     pub(super) fn topics(&self) -> HashSet<u32> {
         self.topics
             .known
@@ -75,7 +75,7 @@ impl Ids {
         self.nodes.known.get(&key).map(|(number, _)| *number)
     }
 
-    /// The present structure; participants, nodes and topics that are gone lose their numbers.
+    /// Returns the current graph; vanished participants, nodes and topics lose their numbers.
     pub(super) fn structure<'a>(
         &mut self,
         snapshot: &'a Snapshot,
@@ -170,7 +170,7 @@ impl Ids {
     }
 }
 
-/// What the graph draws as a topic.
+/// Returns whether the page shows the topic.
 pub(super) fn is_shown(topic: &TopicFacts) -> bool {
     !matches!(
         topic.kind,
@@ -178,12 +178,12 @@ pub(super) fn is_shown(topic: &TopicFacts) -> bool {
     )
 }
 
-/// Whether a watch or a subscription has it measured now.
+/// Returns whether the topic is measured at present for a watch or subscription.
 pub(super) fn is_measured<'a>(topic: &'a TopicFacts, index: &Index<'a>) -> bool {
     topic.is_read || !index.watches(topic).is_empty()
 }
 
-/// The origin of its watches, as [`Topic`] describes it.
+/// Returns the origins of its watches, in the form of [`Topic`].
 fn watched<'a>(topic: &'a TopicFacts, index: &Index<'a>, in_force: &InForce) -> u8 {
     let (mut own, mut glob) = (0, 0);
     for (watch, _) in index.watches(topic) {

@@ -1,4 +1,4 @@
-//! Figures of topics as rows, their flags, and the rates of the minutes before.
+//! Rows of topics with their values and flags, and the rates of the preceding minutes.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -11,13 +11,13 @@ use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::history::{Past, Second};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts, Transport, WatchState};
 
-/// Seconds and steps of what a stream begins with.
+/// Step of the initial rates, in seconds.
 const STEP: usize = 10;
 const STEPS: usize = 60;
-/// How long a loss is worth a mark, in seconds.
+/// Time for which a loss is flagged, in seconds.
 pub(super) const LOSS: usize = 60;
 
-/// What a topic's flags mean, from the lowest bit on.
+/// Meaning of a topic's flags, from the lowest bit on.
 pub(super) const FLAGS: [&str; 12] = [
     "qos",
     "type",
@@ -33,7 +33,7 @@ pub(super) const FLAGS: [&str; 12] = [
     "rejected",
 ];
 
-/// A flag, by its place in [`FLAGS`].
+/// A flag, by its index in [`FLAGS`].
 #[derive(Clone, Copy)]
 enum Flag {
     Qos,
@@ -50,20 +50,20 @@ enum Flag {
     Rejected,
 }
 
-/// What rows are made of.
+/// Input of the rows.
 pub(super) struct Figures<'a> {
     pub(super) snapshot: &'a Snapshot,
     pub(super) index: &'a Index<'a>,
     pub(super) past: &'a Past,
     pub(super) watchlist: &'a Watchlist,
-    /// Messages in shared memory are seen.
+    /// Whether messages in shared memory are observed.
     pub(super) sees_memory: bool,
-    /// Messages lost in the last [`LOSS`] seconds, by the id that the past has for a topic.
+    /// Messages lost in the last [`LOSS`] seconds, by the topic's id in the history.
     pub(super) lost: HashMap<u32, u32>,
 }
 
 impl Figures<'_> {
-    /// The row of every topic that has one.
+    /// Returns the row of every topic that has one.
     pub(super) fn rows(&self, ids: &Ids) -> BTreeMap<u32, Row> {
         let last = self.past.seconds().last();
         let topics = self.snapshot.topics.iter().filter(|topic| is_shown(topic));
@@ -159,7 +159,7 @@ impl Figures<'_> {
     }
 }
 
-/// Of all topics in the last second.
+/// Returns the totals of all topics in the last second.
 pub(super) fn totals(snapshot: &Snapshot, past: &Past) -> Totals {
     let rows = past
         .seconds()
@@ -182,7 +182,7 @@ pub(super) fn totals(snapshot: &Snapshot, past: &Past) -> Totals {
     totals
 }
 
-/// Messages lost lately, by the past's id of their topic.
+/// Returns the recently lost messages, by the topic's id in the history.
 pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
     let seconds = past.seconds();
     let first = seconds.len().saturating_sub(LOSS);
@@ -196,7 +196,7 @@ pub(super) fn lost_lately(past: &Past) -> HashMap<u32, u32> {
     lost
 }
 
-/// Rates of the last minutes, for those of the topics that were measured.
+/// Returns the rates of the last minutes for measured topics.
 pub(super) fn history(snapshot: &Snapshot, past: &Past, ids: &Ids) -> History {
     let seconds = past.seconds();
     let first = seconds.len().saturating_sub(STEP * STEPS);

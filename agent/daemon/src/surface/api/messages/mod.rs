@@ -1,8 +1,8 @@
-//! `GET /topics/{topic}/messages`: the decoded messages of a topic, a few a second.
+//! `GET /topics/{topic}/messages`: decoded messages of a topic, a few per second.
 //!
-//! Messages are taken as fast as they come and the newest one is shown; the topic is measured while
-//! the stream is open. Definitions are read and payloads decoded on threads that may block, away
-//! from the one that captures and the one that answers.
+//! Messages are taken as they arrive and the newest one is shown; the topic is measured while the
+//! stream is open. Blocking threads read definitions and decode payloads, so neither the capture
+//! nor other answers wait.
 
 mod tree;
 
@@ -37,13 +37,13 @@ use ros2probe_model::dispatch::Sample;
 use ros2probe_model::names::TypeName;
 use tree::{ELEMENTS, Tree};
 
-/// Streams at once, of all listeners: each has the bytes of all messages of its topic captured.
+/// Slots for streams of all listeners; each makes the agent capture all payloads of its topic.
 static STREAMS: Semaphore = Semaphore::const_new(MAX_READERS);
 const MAX_READERS: usize = 8;
-/// Messages shown in a second.
+/// Default and largest rate of shown messages, in hertz.
 const MOST_HERTZ: f64 = 5.0;
 const LEAST_HERTZ: f64 = 0.1;
-/// Room for messages that come while one is shown.
+/// Bytes of messages that may wait while one is shown.
 const QUEUE_BYTES: usize = 16 << 20;
 /// Longest silence of a stream.
 const BEAT: Duration = Duration::from_secs(1);
@@ -52,10 +52,10 @@ const BEAT: Duration = Duration::from_secs(1);
 #[serde(deny_unknown_fields, default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Wanted {
-    /// Its domain; may be left out where the name is in one domain only.
+    /// Domain id; required only if the name exists in several domains.
     #[param(minimum = 0, maximum = 232)]
     domain_id: Option<u32>,
-    /// Messages shown in a second at most; 5 when left out.
+    /// Largest number of messages shown per second; by default 5.
     #[param(minimum = 0.1, maximum = 5)]
     max_hertz: Option<f64>,
 }
@@ -69,17 +69,17 @@ pub(super) struct JsonText(Box<RawValue>);
 pub(super) type MessageLine = Message<JsonText>;
 pub(super) type Line = messages::Line<MessageLine>;
 
-/// One client's stream.
+/// The stream of one client.
 struct Stream {
     context: Context,
     subscription: Subscription,
     pause: Duration,
-    /// When the last message was shown, and when anything was.
+    /// When the last message was shown, and when anything was sent.
     shown: Option<Instant>,
     written: Instant,
     newest: Option<Arc<Sample>>,
     skipped: u64,
-    /// Messages that are not known, with the latest reason.
+    /// Messages that cannot be shown, with the latest reason.
     missed: Option<Missed>,
     clock: Option<f64>,
     known: Option<Known>,
@@ -97,18 +97,18 @@ struct Known {
 
 /// The definition of a topic's type
 ///
-/// As the agent finds it: what discovery announces is a name and a hash, which the definition agrees
-/// with. Names: see `/topics/{topic}/history`.
+/// The definition that the agent finds: discovery announces a name and a hash, and the definition
+/// matches both. For the form of the path, see `/topics/{topic}/history`.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/definition",
     tag = "graph",
     params(TopicParameter, Domain),
     responses(
-        (status = 200, description = "Its type, known or not.", body = Definition),
-        (status = 404, description = "No such topic.",
+        (status = 200, description = "The type of the topic, even if its definition is unknown.", body = Definition),
+        (status = 404, description = "The topic does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It is in several domains.",
+        (status = 409, description = "The name exists in several domains; add `domain_id`.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
 )]
@@ -127,12 +127,13 @@ pub(super) async fn definition(
     Ok(Json(found).into_response())
 }
 
-/// Messages of a topic, decoded
+/// Decoded messages of a topic
 ///
-/// At most five a second, the newest one each time; the topic is measured meanwhile. Each line is a
-/// JSON object with one member: `type` before the first message and when it changes, `message`,
-/// `missed`, `beat` once a second in which nothing else came, and `end`. Names: see
-/// `/topics/{topic}/history`.
+/// The stream shows at most five messages per second, the newest one each time, and the topic is
+/// measured while it is open. Each line is a JSON object with one member. `type` precedes the first
+/// message and follows each change of the type. `message` is a message, and `missed` counts
+/// messages that cannot be shown. `beat` is sent once in each second without another line, and
+/// `end` is the last line. For the form of the path, see `/topics/{topic}/history`.
 #[utoipa::path(
     get,
     path = "/topics/{topic}/messages",
@@ -142,9 +143,9 @@ pub(super) async fn definition(
         (status = 200, description = "Lines, until the client disconnects, or the capture or the \
             agent ends.",
             body = Line, content_type = "application/x-ndjson"),
-        (status = 404, description = "No such topic.",
+        (status = 404, description = "The topic does not exist.",
             body = ProblemBody, content_type = "application/problem+json"),
-        (status = 409, description = "It is in several domains.",
+        (status = 409, description = "The name exists in several domains; add `domain_id`.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 503, description = "Too many streams.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -199,7 +200,7 @@ pub(super) async fn follow(
     Ok(response)
 }
 
-/// What a stream asks of the capture.
+/// Returns the subscription of a stream.
 fn request(topic: Choice, domain_id: u32) -> Request {
     Request {
         topics: Selection {
@@ -210,7 +211,7 @@ fn request(topic: Choice, domain_id: u32) -> Request {
         domain_id: Some(domain_id),
         depth: Depth::Payloads,
         queue_bytes: QUEUE_BYTES,
-        // A page is not worth waiting for, on a replay either.
+        // A slow client must not delay the agent, nor a replay.
         overflow: Overflow::DropOldest,
         label: "GET /topics/{topic}/messages".to_owned(),
     }
@@ -219,7 +220,7 @@ fn request(topic: Choice, domain_id: u32) -> Request {
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// The next lines.
+    /// Returns the next lines.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
             return None;
@@ -280,7 +281,7 @@ impl Stream {
         );
     }
 
-    /// Shows the newest message, or that the stream lives.
+    /// Appends the newest message, or a sign that the stream is alive.
     async fn show(&mut self, lines: &mut Vec<u8>) {
         if let Some(missed) = self.missed.take() {
             write_line(lines, &Line::Missed(missed));
@@ -319,7 +320,8 @@ impl Stream {
         write_line(lines, &Line::Message(line));
     }
 
-    /// The type of a message; writes a `type` line where it differs from that of the message before.
+    /// Returns the type of a message; appends a `type` line if it differs from the previous
+    /// message's.
     async fn find(&mut self, sample: &Sample, lines: &mut Vec<u8>) -> Option<Arc<MessageType>> {
         let name = &sample.topic.message_type;
         let offered = sample.topic.offered.as_ref();
@@ -376,7 +378,7 @@ fn unknown(name: &str, reason: String) -> Definition {
     }
 }
 
-/// The fields of a message; `None` where its type or its bytes are not known.
+/// Decodes the fields of a message; returns `None` if its type or its bytes are unknown.
 fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<JsonText>, String> {
     let (Some(message_type), Some(payload)) = (message_type, &sample.payload) else {
         return Ok(None);

@@ -1,5 +1,5 @@
-//! A decoded message as JSON for a browser: fields in the order of the definition, long arrays and
-//! texts cut, numbers that JavaScript would round as text.
+//! Decoded messages as JSON for a browser: fields in the order of the definition, truncated arrays
+//! and strings. Numbers that JavaScript would round become strings.
 
 use std::cell::Cell;
 
@@ -8,22 +8,22 @@ use serde::{Serialize, Serializer};
 
 use ros2probe_message::{Array, Items, Message, Scalar, Value};
 
-/// Elements of an array that are shown.
+/// Largest number of array elements shown.
 pub(super) const ELEMENTS: usize = 64;
-/// Characters of a text that are shown.
+/// Largest number of characters shown of a string.
 const CHARACTERS: usize = 1024;
-/// Values of one message that are shown, characters of texts by the sixteen.
+/// Largest number of values shown of a message; 16 characters of a string count as one.
 const VALUES: usize = 20_000;
-/// The largest whole number that a double holds exactly.
+/// Largest integer up to which a double represents all integers.
 const EXACT: u64 = 1 << 53;
 
-/// A message as it is shown.
+/// A message to serialize.
 pub(super) struct Tree<'a> {
     message: &'a Message<'a>,
     left: Cell<usize>,
 }
 
-/// A part of it, which draws on the same room.
+/// A part of a message, with the remaining number of values.
 struct Part<'a, T: ?Sized>(&'a T, &'a Cell<usize>);
 
 impl<'a> Tree<'a> {
@@ -41,7 +41,7 @@ impl Serialize for Tree<'_> {
     }
 }
 
-/// Whether there is room for so much, which is taken.
+/// Takes this many values from the remaining number; returns whether enough were left.
 fn draw(left: &Cell<usize>, values: usize) -> bool {
     let rest = left.get().checked_sub(values);
     left.set(rest.unwrap_or(0));
@@ -171,7 +171,7 @@ mod tests {
 
     use super::*;
 
-    /// A message of this definition as it is shown.
+    /// Returns a message of this definition as JSON.
     fn shown(definition: &str, body: &[u8]) -> String {
         let name = "a/msg/B".parse().unwrap();
         let message_type = MessageType::parse(&name, definition).unwrap();

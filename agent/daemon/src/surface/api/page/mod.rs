@@ -1,8 +1,8 @@
-//! The page for browsers, at `/` beside the API: files that are part of the program, and the tokens
-//! that grant a page more than its listener does.
+//! The web page at `/` beside the API: files built into the program, and tokens that grant a page
+//! more rights than its listener does.
 //!
-//! The files hold nothing of the robot and need no token. Their policy lets them load from and ask
-//! this listener only. No foreign page can frame or load them.
+//! The files contain no data of the robot and need no token. Their policy restricts loading and
+//! requests to this listener. Pages of other origins cannot embed or load them.
 
 mod tokens;
 
@@ -31,11 +31,11 @@ use super::Context;
 use super::problem::{Code, Problem};
 pub(super) use tokens::Tokens;
 
-/// The page may load from and connect to its own origin only.
+/// The page can only load from and connect to its own origin.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' \
     data: blob:; connect-src 'self'; worker-src 'self'; manifest-src 'self'; base-uri 'none'; \
     form-action 'none'; frame-ancestors 'none'";
-/// Sent with every file.
+/// Headers of every file.
 const HEADERS: [(HeaderName, &str); 7] = [
     (CONTENT_SECURITY_POLICY, POLICY),
     (X_CONTENT_TYPE_OPTIONS, "nosniff"),
@@ -48,22 +48,22 @@ const HEADERS: [(HeaderName, &str); 7] = [
         HeaderName::from_static("cross-origin-resource-policy"),
         "same-origin",
     ),
-    // An upgrade of the agent is seen at once.
+    // Browsers revalidate, so an upgrade of the agent takes effect at once.
     (CACHE_CONTROL, "no-cache"),
     (VARY, "accept-encoding"),
 ];
-/// Bytes of a file's hash that tell versions apart.
+/// Bytes of a file's hash that identify its version.
 const TAG: usize = 16;
 
-/// What listeners and routes know of the page.
+/// State of the web page, shared by listeners and routes.
 #[derive(Debug, Default)]
 pub struct Page {
-    /// Addresses at which it is served.
+    /// Addresses that serve it.
     addresses: Vec<SocketAddr>,
     pub(super) tokens: Tokens,
 }
 
-/// The page's files with what was made of them.
+/// The files of the page with their derived forms.
 static FILES: LazyLock<Vec<Served>> = LazyLock::new(|| {
     let served = |file| Served {
         file,
@@ -72,20 +72,20 @@ static FILES: LazyLock<Vec<Served>> = LazyLock::new(|| {
     ros2probe_page::FILES.iter().map(served).collect()
 });
 
-/// One file of the page.
+/// A file of the page.
 struct Served {
     file: &'static File,
     forms: OnceLock<Forms>,
 }
 
-/// What is made of a file when it is first asked for.
+/// Forms of a file that are derived at the first request.
 struct Forms {
     tag: String,
     packed: Bytes,
 }
 
 impl Page {
-    /// Of an agent that serves it at these addresses.
+    /// Creates the state of a page served at these addresses.
     #[must_use]
     pub fn new(addresses: Vec<SocketAddr>) -> Self {
         Self {
@@ -94,12 +94,12 @@ impl Page {
         }
     }
 
-    /// Some listener serves it.
+    /// Returns whether a listener serves the page.
     pub(super) const fn is_served(&self) -> bool {
         !self.addresses.is_empty()
     }
 
-    /// Where a browser of the agent's host finds it.
+    /// Returns the address of the page on the agent's host.
     fn address(&self) -> Option<String> {
         let is_near = |address: &&SocketAddr| address.ip().is_loopback();
         let near = self.addresses.iter().find(is_near);
@@ -124,11 +124,11 @@ impl Served {
         })
     }
 
-    /// The file, or 304 where the client has it.
+    /// Returns the file, or 304 if the client has the current version.
     fn answer(&'static self, headers: &HeaderMap) -> Response {
         let forms = self.forms();
         let is_packed = accepts_gzip(headers) && !forms.packed.is_empty();
-        // Another form is another representation (RFC 9110, 8.8.3).
+        // A compressed form is another representation (RFC 9110, 8.8.3).
         let tag = match is_packed {
             true => format!("\"{}-gzip\"", forms.tag),
             false => format!("\"{}\"", forms.tag),
@@ -155,7 +155,7 @@ impl Served {
     }
 }
 
-/// What is not worth compressing stays as it is: empty.
+/// Returns the compressed bytes, or an empty vector if compression saves nothing.
 fn packed(bytes: &[u8]) -> Vec<u8> {
     let mut packer = GzEncoder::new(Vec::new(), Compression::best());
     let packed = std::io::Write::write_all(&mut packer, bytes).and_then(|()| packer.finish());
@@ -167,7 +167,7 @@ fn packed(bytes: &[u8]) -> Vec<u8> {
     }
 }
 
-/// Whether the client takes gzip (RFC 9110, 12.5.3).
+/// Returns whether the client accepts gzip (RFC 9110, 12.5.3).
 fn accepts_gzip(headers: &HeaderMap) -> bool {
     let lists = headers.get_all(ACCEPT_ENCODING).iter();
     let lists = lists.filter_map(|list| list.to_str().ok());
@@ -182,7 +182,7 @@ fn accepts_gzip(headers: &HeaderMap) -> bool {
     })
 }
 
-/// The files, for listeners that serve them.
+/// Returns the routes of the files, for listeners that serve the page.
 pub(super) fn files() -> Router<Context> {
     Router::new()
         .route("/", get(index))
@@ -203,14 +203,15 @@ fn find(path: &str, headers: &HeaderMap) -> Response {
     file.map_or_else(missing, |file| file.answer(headers))
 }
 
-/// What the API has for it.
+/// Returns the API routes of the page.
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new().routes(routes!(token))
 }
 
-/// A token for the page
+/// Create a token for the page
 ///
-/// It grants the rights of the unix socket: payloads, recordings, downloads. `rp page` asks for one.
+/// The token grants the rights of the unix socket: payloads, recordings, downloads. `rp page`
+/// requests one.
 #[utoipa::path(
     post,
     path = "/page/token",
@@ -226,7 +227,7 @@ async fn token(State(context): State<Context>) -> Result<Json<PageToken>, Proble
     }))
 }
 
-/// Shares a page among listeners and routes.
+/// The page, shared among listeners and routes.
 pub(super) type Shared = Arc<Page>;
 
 #[cfg(test)]
@@ -236,7 +237,7 @@ mod tests {
 
     use super::*;
 
-    /// Compressed bytes of the whole page.
+    /// Largest total size of the compressed files in bytes.
     const BUDGET: usize = 120_000;
 
     fn headers(pairs: &[(&HeaderName, &str)]) -> HeaderMap {
@@ -246,7 +247,7 @@ mod tests {
             .collect()
     }
 
-    /// Files of a folder that are served.
+    /// Collects the served files of a folder.
     fn listed(folder: &std::path::Path, prefix: &str, into: &mut BTreeSet<String>) {
         for entry in fs::read_dir(folder).unwrap() {
             let entry = entry.unwrap();

@@ -1,4 +1,4 @@
-//! Tokens that were given to pages. They live in memory and end with the agent.
+//! Tokens of web pages. They are kept in memory and expire when the agent stops.
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
@@ -7,24 +7,24 @@ use std::sync::{Mutex, PoisonError};
 
 use subtle::ConstantTimeEq as _;
 
-/// Tokens that are valid at once; the oldest goes.
+/// Largest number of valid tokens; a further one replaces the oldest.
 const MAX_TOKENS: usize = 16;
-/// Random bytes of a token, which is written in hexadecimal digits.
+/// Random bytes of a token, which is written in hexadecimal.
 const BYTES: usize = 32;
 
-/// The valid ones, the oldest first.
+/// The valid tokens, oldest first.
 #[derive(Default)]
 pub(in super::super) struct Tokens(Mutex<VecDeque<Box<[u8]>>>);
 
 impl Tokens {
-    /// A new one.
+    /// Creates a token.
     ///
     /// # Errors
-    /// The kernel gives no random bytes.
+    /// Fails if the kernel returns no random bytes.
     pub(super) fn mint(&self) -> io::Result<String> {
         let mut bytes = [0; BYTES];
         let flags = rustix::rand::GetRandomFlags::empty();
-        // Up to 256 bytes come whole (getrandom(2)).
+        // Up to 256 bytes are returned at once (getrandom(2)).
         let given = rustix::rand::getrandom(&mut bytes, flags)?;
         if given != BYTES {
             return Err(io::ErrorKind::UnexpectedEof.into());
@@ -42,7 +42,8 @@ impl Tokens {
         Ok(token)
     }
 
-    /// Whether it is one of them; takes the same time for every wrong one of the right length.
+    /// Returns whether the token is valid. The time is equal for all wrong tokens of the right
+    /// length.
     pub(in super::super) fn know(&self, offered: &[u8]) -> bool {
         let tokens = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         tokens.iter().fold(false, |known, token| {

@@ -18,13 +18,13 @@ fn headers(pairs: &[(&str, &str)]) -> HeaderMap {
     pairs.iter().map(pair).collect()
 }
 
-/// The code of the refusal.
+/// Returns the code of the refusal.
 fn refusal(door: &Door, pairs: &[(&str, &str)]) -> Option<Code> {
     let answer = door.let_in(&headers(pairs), Instant::now());
     answer.err().map(|problem| problem.code())
 }
 
-/// A door that grants everything.
+/// Returns a door that grants all rights.
 fn door(kind: Kind) -> Door {
     Door::new(kind, Granted::new(Access::All, None))
 }
