@@ -367,7 +367,7 @@ mod tests {
     #[test]
     fn what_cannot_be_chosen_is_told() {
         let error = |options| Filter::new(options).unwrap_err().to_string();
-        assert!(error(FilterOptions::default()).starts_with("name topics"));
+        assert!(error(FilterOptions::default()).starts_with("no topics selected"));
         let relative = FilterOptions {
             topics: strings(&["chatter"]),
             ..FilterOptions::default()
