@@ -1,15 +1,15 @@
 #!/usr/bin/env bash
-# Installs what a target of the Makefile needs and this machine lacks, naming each thing first.
+# Installs the missing tools of a Makefile target, printing each of them first.
 #
-#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|book|deny...   install what those targets need
-#   prerequisites.sh types                    install what the dashboards are type-checked with
-#   prerequisites.sh page                     install the browser that the page is tested in
+#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|book|deny...   install the tools of those targets
+#   prerequisites.sh types                    install the type checker of the dashboards
+#   prerequisites.sh page                     install the browser of the page's tests
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
-#   prerequisites.sh --left-out               print which tests `make test` leaves out, and why
+#   prerequisites.sh --left-out               print the tests that `make test` omits, with the reason
 #
-# Made for Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
-# changes no system setting; what cannot be had ends it with a line that says how to get it.
+# Supports Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
+# changes no system setting. If a tool is unavailable, it fails with a line on how to install it.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -47,18 +47,18 @@ packages() {
     for package; do installed "$package" || missing+=("$package"); done
     [ ${#missing[@]} -eq 0 ] && return
     command -v apt-get >/dev/null ||
-        die "no apt-get here: install what stands for these Debian packages: ${missing[*]}"
+        die "apt-get is missing: install the equivalents of these Debian packages: ${missing[*]}"
     refresh
     for package in "${missing[@]}"; do
         available "$package" ||
-            die "package $package is in none of this system's sources (on Ubuntu: sudo add-apt-repository universe)"
+            die "no package source has $package (on Ubuntu: sudo add-apt-repository universe)"
     done
     say "installing Debian packages: ${missing[*]}"
     as_root env DEBIAN_FRONTEND=noninteractive \
         apt-get install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
 }
 
-# The package would start a server on port 9090 and enable it at boot: take the programs only.
+# Unpacks only the programs: the package would start a server on port 9090 and enable it at boot.
 prometheus() {
     command -v prometheus >/dev/null && command -v promtool >/dev/null && return
     [ -x "$tools/usr/bin/promtool" ] && return
@@ -69,7 +69,7 @@ prometheus() {
         dpkg-deb -x prometheus_*.deb . && rm prometheus_*.deb)
 }
 
-# What the dashboards are type-checked with. Without it one test fails and says so.
+# The type checker of the dashboards. Without it one test fails and names it.
 types() {
     local directory=$tools/grafana lock=agent/cli/tests/dashboard/types/package-lock.json
     cmp -s "$lock" "$directory/package-lock.json" && [ -d "$directory/node_modules/typescript" ] && return
@@ -81,8 +81,8 @@ types() {
         { rm -f "$directory/package-lock.json"; say "npm failed: the dashboards cannot be type-checked"; }
 }
 
-# Node runs the page's tests, drives the browser and needs to be 20 or newer; Debian 12 has 18 and
-# Ubuntu 22.04 has 12. Node's own builds come from npm then, in a place of their own.
+# Node 20 or newer runs the page's tests and drives the browser. Debian 12 has 18 and Ubuntu 22.04
+# has 12: there Node's own build is installed from npm into a separate directory.
 nodejs() {
     local place=$tools/node version=20.20.2 architecture found
     [ -x "$place/bin/node" ] && return
@@ -98,13 +98,13 @@ nodejs() {
     mkdir -p "$place"
     (cd "$place" && npm pack --silent "node-linux-$architecture@$version" >/dev/null &&
         tar -xzf node-linux-*.tgz --strip-components 1 && rm node-linux-*.tgz) ||
-        die "npm has no node: install node 20 or newer, then run this again"
+        die "npm cannot download node: install node 20 or newer, then run this again"
 }
 
 node_version() { command node --version 2>/dev/null | sed -E 's/v([0-9]+).*/\1/'; }
 
-# A real browser, what drives it, and the rules of accessibility. Debian has Chromium's headless
-# shell as a package. Ubuntu has none: playwright fetches its own build there, into target/tools.
+# A real browser, its driver, and the accessibility rules. Debian packages Chromium's headless shell.
+# On Ubuntu playwright downloads its own build into target/tools.
 page() {
     local place=$tools/page tests=agent/cli/tests/page
     nodejs
@@ -118,7 +118,7 @@ page() {
         cp "$tests/package.json" "$tests/package-lock.json" "$place"
         (cd "$place" && npm ci --ignore-scripts --no-audit --no-fund --silent) || {
             rm -f "$place/package-lock.json"
-            die "npm failed: the page's tests need what $tests/package-lock.json names"
+            die "npm failed: the page's tests need the packages in $tests/package-lock.json"
         }
     fi
     [ -x /usr/bin/chromium-headless-shell ] && return
@@ -135,7 +135,7 @@ page() {
         die "no browser: put a chromium-headless-shell at /usr/bin/chromium-headless-shell"
 }
 
-# The OpenTelemetry receiver that the tests send to; it is linked against this very libpython.
+# The OpenTelemetry receiver of the tests; it is linked against this version of libpython.
 rotel() {
     local place=$tools/rotel
     compgen -G "$place/lib/python3*/site-packages/rotel-0.0.1a15.dist-info" >/dev/null && return
@@ -146,7 +146,7 @@ rotel() {
     "$place/bin/pip" install --quiet --disable-pip-version-check rotel==0.0.1a15
 }
 
-# Throws requests at the control API; in a place of its own, from the Python package index.
+# Generates requests to the control API; installed in a separate Python environment.
 schemathesis() {
     local place=$tools/schemathesis version=4.32.5
     [ "$("$place/bin/st" --version 2>/dev/null)" = "st, version $version" ] && return
@@ -157,7 +157,7 @@ schemathesis() {
     "$place/bin/pip" install --quiet --disable-pip-version-check "schemathesis==$version"
 }
 
-# Other readers of bags, to see what they make of ours.
+# Other implementations that read bags, for comparison.
 bags() {
     local place=$tools/bags
     local versions=("mcap==1.6.0" "rosbags==0.11.9")
@@ -170,7 +170,7 @@ bags() {
     echo "${versions[*]}" >"$place/versions"
 }
 
-# Knows the schema of CycloneDX, to hold our bills of materials against it.
+# Validates the bills of materials against the schema of CycloneDX.
 bills() {
     local place=$tools/bills version=11.12.0
     compgen -G "$place/lib/python3*/site-packages/cyclonedx_python_lib-$version.dist-info" >/dev/null && return
@@ -181,14 +181,14 @@ bills() {
     "$place/bin/pip" install --quiet --disable-pip-version-check "cyclonedx-python-lib[json-validation]==$version"
 }
 
-# Runs the aarch64 binary on another machine: called by name, registered with nothing.
+# Runs the aarch64 binary on other machines; called by name, without binfmt registration.
 qemu() {
     [ "$(uname -m)" = aarch64 ] && return
     command -v qemu-aarch64-static >/dev/null && return
     [ -x "$tools/usr/bin/qemu-aarch64-static" ] && return
     refresh
     available qemu-user-static ||
-        die "package qemu-user-static is in none of this system's sources (on Ubuntu: sudo add-apt-repository universe)"
+        die "no package source has qemu-user-static (on Ubuntu: sudo add-apt-repository universe)"
     say "unpacking qemu-aarch64-static into target/tools (nothing is installed or registered)"
     mkdir -p "$tools"
     (cd "$tools" && apt-get -o APT::Sandbox::User=root download -qq qemu-user-static &&
@@ -196,7 +196,7 @@ qemu() {
         rm qemu-user-static_*.deb)
 }
 
-# Standard libraries to link static binaries with; rust-lld, which comes with Rust, links for both.
+# Standard libraries for static binaries; rust-lld, a part of Rust, links for both architectures.
 musl() {
     local architecture target
     for architecture; do
@@ -208,7 +208,7 @@ musl() {
     done
 }
 
-# A fresh Debian that the package is installed on: containers of it leave it as it is.
+# A fresh Debian for installing the package: its containers do not modify it.
 debian() {
     local place=$tools/debian
     [ -e "$place/complete" ] && return
@@ -221,7 +221,7 @@ debian() {
     as_root sh -c 'rm -rf "$0"/var/cache/apt/archives/*.deb "$0"/var/lib/apt/lists/*; touch "$0/complete"' "$place"
 }
 
-# Without optimization and its own copy of xz: it is built in a third of the time and calls xz.
+# Built without optimization and without its own copy of xz, in a third of the time; it calls xz.
 cargo_deb() {
     packages binutils xz-utils
     command -v cargo-deb >/dev/null && return
@@ -229,30 +229,30 @@ cargo_deb() {
     cargo install cargo-deb --version 3.8.0 --locked --debug --no-default-features
 }
 
-# Built without optimization, which takes two minutes; it waits for tests most of its time.
+# Built without optimization in two minutes: it mostly waits for tests.
 nextest() {
     cargo nextest --version >/dev/null 2>&1 && return
     say "installing cargo-nextest 0.9.151"
     cargo install cargo-nextest --version 0.9.151 --locked --debug --no-default-features --features default-no-update
 }
 
-# No package source has ROS 2 Humble for Debian 12: an archive with a script of its own does.
+# No package source has ROS 2 Humble for Debian 12: an archive with its own script installs it.
 ros2() {
     [ -e /opt/ros/humble/env.sh ] && return
     local installer=../shared/ros2/install.sh
     [ -e "$installer" ] ||
-        die "ROS 2 Humble is missing: /opt/ros/humble/env.sh is not there, nor is $installer"
+        die "ROS 2 Humble is missing: neither /opt/ros/humble/env.sh nor $installer exists"
     say "installing ROS 2 Humble into /opt/ros with $installer"
     as_root bash "$installer"
 }
 
-# Names each test that `make test` leaves out, with the reason, and prints the arguments that leave out
-# what this system lacks.
+# Prints each test that `make test` omits, with the reason, to standard error, and the arguments that
+# omit tests which this system cannot run to standard output.
 left_out() {
     local version elsewhere="started by another test"
-    # `make test` runs these where the corpus is.
+    # `make test` runs these if the corpus exists.
     [ -d "${ROS2PROBE_FIXTURES:-../shared/fixtures}" ] && elsewhere+="|make test-corpus"
-    say "left out here:"
+    say "omitted tests:"
     find agent wire -name target -prune -o -name '*.rs' -print | sort | xargs awk -v elsewhere="$elsewhere" '
         /#\[ignore = / { sub(/.*#\[ignore = "/, ""); sub(/"\].*/, ""); reason = $0 ~ elsewhere ? "" : $0; next }
         reason != "" && match($0, /fn [a-z0-9_]+/) {
@@ -261,7 +261,7 @@ left_out() {
             printf "  %s::%s: %s\n", file, substr($0, RSTART + 3, RLENGTH - 3), reason
             reason = ""
         }' >&2
-    # Ubuntu 22.04 has 249 and nothing newer.
+    # Ubuntu 22.04 has version 249.
     version=$(systemd-analyze --version 2>/dev/null | awk 'NR == 1 { print $2 + 0 }')
     if [ "${version:-0}" -lt 250 ]; then
         say "  dist/systemd::the_exposure_level_is_at_most_2: needs systemd 250, here is ${version:-none}"
@@ -318,12 +318,12 @@ ebpf() {
         LLVM_PREFIX=/usr/lib/llvm-22 cargo install bpf-linker --version 0.13.0 --locked \
             --no-default-features --features llvm-22
     elif [ "$(uname -m)" = x86_64 ]; then
-        # rustup ships LLVM as a shared library for this architecture only; 0.10.2 can use it.
+        # rustup ships LLVM as a shared library for this architecture only; version 0.10.2 can use it.
         packages llvm g++
         say "installing bpf-linker 0.10.2 with the LLVM of $(nightly)"
         cargo "+$(nightly)" install bpf-linker --version 0.10.2 --locked
     else
-        die "bpf-linker needs llvm-22-dev, which this system does not have: add LLVM's own package source"
+        die "bpf-linker needs llvm-22-dev, which no package source has: add LLVM's own package source"
     fi
 }
 
@@ -411,6 +411,6 @@ for need; do
             cargo install cargo-deny --version 0.20.2 --locked
         }
         ;;
-    *) die "prerequisites.sh: $need is none of demo, test, fast, dist, types, page, ebpf, fuzz, miri, book, deny" ;;
+    *) die "prerequisites.sh: unknown target $need: use demo, test, fast, dist, types, page, ebpf, fuzz, miri, book or deny" ;;
     esac
 done

@@ -1,14 +1,15 @@
 #!/usr/bin/env bash
-# Builds the kernel filter's object from its sources, or checks that the committed one is current.
+# Builds the kernel filter's object, or checks that the committed one is current.
 #
 #   build.sh           rebuild filter.bpf.o and filter.bpf.sha256
-#   build.sh --check   fail when the committed object is not what the sources give
-#   build.sh --stale   fail when a source has changed since the object was built (no toolchain)
+#   build.sh --check   fail if the sources do not build the committed object
+#   build.sh --stale   fail if a source has changed since the object was built (no toolchain)
 #
 # filter.bpf.sha256 lists the toolchain and every file that the compiler read, with its checksum.
 #
-# Needs nightly (or what NIGHTLY names) with rust-src, and bpf-linker: `make prerequisites` installs
-# them. LLVM_PREFIX says where LLVM's tools are, if they are not where Debian puts LLVM 22 or in PATH.
+# Needs bpf-linker and nightly (or the toolchain in NIGHTLY) with rust-src: `make prerequisites`
+# installs them. LLVM_PREFIX names the directory of LLVM's tools, unless they are in PATH or where
+# Debian installs LLVM 22.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -18,7 +19,7 @@ strip=${LLVM_PREFIX:-/usr/lib/llvm-22}/bin/llvm-strip
 
 if [ "${1:-}" = --stale ]; then
     sha256sum --check --quiet --strict filter.bpf.sha256 && exit 0
-    echo "agent-ebpf/filter.bpf.o is older than its sources: run 'make ebpf' and commit the result" >&2
+    echo "agent-ebpf/filter.bpf.o is older than its sources: run 'make ebpf' and commit it" >&2
     exit 1
 fi
 
@@ -33,10 +34,10 @@ flags+="${separator}--remap-path-prefix=$(rustc "+$nightly" --print sysroot)=/ru
 CARGO_ENCODED_RUSTFLAGS="$flags" cargo "+$nightly" build --quiet --release --locked \
     --target bpfel-unknown-none -Z build-std=core
 built=target/bpfel-unknown-none/release/filter
-# The linker needs the debug information to write BTF; nobody needs it afterwards.
+# The linker needs the debug information to write BTF; the object does not contain it.
 "$strip" --strip-debug "$built"
 
-# Cargo's dep-info names what was compiled; each file's manifest is the nearest one above it.
+# Cargo's dep-info names the compiled files; each file's manifest is the nearest one above it.
 sources() {
     local file directory
     echo build.sh
@@ -48,7 +49,7 @@ sources() {
         realpath --relative-to=. "$directory/Cargo.toml"
     done
 }
-# Another compiler may order instructions differently without anything being wrong.
+# Another compiler may order instructions differently in a correct object.
 toolchain() { echo "# $(rustc "+$nightly" --version), $(bpf-linker --version)"; }
 list() {
     toolchain
@@ -61,7 +62,7 @@ if [ "${1:-}" = --check ]; then
         echo "agent-ebpf/filter.bpf.o: sources unchanged and they build here; the bytes are not compared,"
         echo "    because another toolchain built it: $(head -n 1 filter.bpf.sha256), here $(toolchain)"
     elif ! cmp -s "$built" filter.bpf.o; then
-        echo "agent-ebpf/filter.bpf.o is not what its sources build: run 'make ebpf' and commit it" >&2
+        echo "agent-ebpf/filter.bpf.o does not match its sources: run 'make ebpf' and commit it" >&2
         exit 1
     elif ! list | cmp -s - filter.bpf.sha256; then
         echo "agent-ebpf/filter.bpf.o is current; its list of sources is not ('make ebpf' renews it)"

@@ -1,14 +1,14 @@
 #!/usr/bin/env python3
-"""Prints what is linked into a binary of rp as a CycloneDX 1.5 bill of materials.
+"""Prints the components of a binary of rp as a CycloneDX 1.5 bill of materials.
 
     bill.py ARCHITECTURE BINARY
 
-It lists the crates along normal edges with the features of this very build, the standard library,
-the kernel object and the page's JavaScript libraries; no build tool, no test. The same sources give the same bytes: no serial
-number, the time is SOURCE_DATE_EPOCH. Python 3.8 or newer, nothing else.
+It lists the crates along normal edges with the features of this build, the standard library, the
+kernel object and the page's JavaScript libraries, but no tools of build or tests. The same sources
+give the same bytes: no serial number, and the time is SOURCE_DATE_EPOCH. Needs only Python 3.8.
 
-cargo-cyclonedx 0.5.9 was tried: it adds 58 crates that are not in the binary (macros, and features
-that this build does not have), writes the path it was run in, and does not know the binary's sum.
+cargo-cyclonedx 0.5.9 is unsuitable: it adds 58 crates that are not in the binary (macros, and
+features that this build does not have) and the current path, and omits the binary's checksum.
 """
 import hashlib
 import json
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LINE = re.compile(r"^(\d+)\t(\S+) v(\S+)(?: \(([^)]*)\))?(?: \(proc-macro\))?\t(.*?)(?: \(\*\))?$")
 
 
-def said(*command):
+def output(*command):
     return subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
@@ -33,15 +33,15 @@ def sha256(path):
 
 
 def checksums():
-    """Of each crate's archive, by name and version, as Cargo.lock has them."""
+    """Returns the checksum of each crate's archive in Cargo.lock, by name and version."""
     lock = (ROOT / "Cargo.lock").read_text()
     entry = re.compile(r'name = "(.*)"\nversion = "(.*)"\nsource = ".*"\nchecksum = "(.*)"')
     return {(name, version): checksum for name, version, checksum in entry.findall(lock)}
 
 
 def crates(target):
-    """Licences of what is linked, and what each links, by name and version."""
-    tree = said("cargo", "tree", "--locked", "--package", "ros2probe", "--edges", "normal,no-proc-macro",
+    """Returns licences and dependencies of the linked crates, by name and version."""
+    tree = output("cargo", "tree", "--locked", "--package", "ros2probe", "--edges", "normal,no-proc-macro",
                 "--target", target, "--prefix", "depth", "--format", "\t{p}\t{l}")
     licences, edges, path = {}, {}, []
     for line in tree.splitlines():
@@ -61,7 +61,7 @@ def purl(crate):
 
 
 def vendored():
-    """The libraries of the page, with the sums of npm's archives and of the files taken from them."""
+    """Returns the page's libraries, with the checksums of npm's archives and of the vendored files."""
     found = {}
     for line in (ROOT / "agent/page/vendor/VERSIONS").read_text().splitlines():
         if line.startswith("#"):
@@ -85,7 +85,7 @@ def main(architecture, binary):
     licences, edges = crates(target)
     sums = checksums()
     program = next(crate for crate in licences if crate[0] == "ros2probe")
-    compiler = re.search(r"^release: (.*)$", said("rustc", "-vV"), re.M).group(1)
+    compiler = re.search(r"^release: (.*)$", output("rustc", "-vV"), re.M).group(1)
     components = []
     for crate in sorted(set(licences) - {program}):
         component = {"type": "library", "bom-ref": purl(crate), "name": crate[0], "version": crate[1]}

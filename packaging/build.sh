@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Makes the Debian package of one binary. The same binary and sources make the same bytes.
+# Builds the Debian package of one binary. The same binary and sources give the same bytes.
 #
 #   packaging/build.sh amd64|arm64 BINARY DIRECTORY [OPTION OF cargo-deb...]
 #
-# writes DIRECTORY/ros2probe_VERSION_ARCHITECTURE.deb. Manual pages and completions are what the
-# binary says of itself; where it cannot run here, RP names one of the same sources that can.
-# What is in the package is listed in agent/cli/Cargo.toml, [package.metadata.deb].
+# writes DIRECTORY/ros2probe_VERSION_ARCHITECTURE.deb. The binary generates manual pages and
+# completions; if it cannot run here, RP names a binary of the same sources that can. The content of
+# the package is listed in agent/cli/Cargo.toml, [package.metadata.deb].
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd)
 
@@ -24,18 +24,18 @@ architecture=$1 binary=$2
 mkdir -p "$3"
 directory=$(cd "$3" && pwd)
 shift 3
-[ -f "$binary" ] || die "there is no $binary"
+[ -f "$binary" ] || die "$binary does not exist: build it first"
 rp=$(realpath "${RP:-$binary}")
 command -v cargo-deb >/dev/null || die "cargo-deb is missing: cargo install cargo-deb --locked"
 
 version=$(sed -n '/^\[workspace.package\]/,/^$/s/^version = "\(.*\)"/\1/p' "$root/Cargo.toml")
-# When the sources were committed; in an unpacked archive without git, when the changelog was written.
+# Time of the latest commit; in an unpacked archive without git, of the changelog.
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git -C "$root" log -1 --format=%ct 2>/dev/null ||
     stat -c %Y "$root/CHANGELOG.md")}
 export LC_ALL=C TZ=UTC
 umask 022
 
-# cargo-deb takes what is built from here, as if cargo had put it there.
+# cargo-deb expects the binaries in this place, where cargo would put them.
 stage=$(mktemp -d)
 trap 'rm -rf "$stage"' EXIT
 built=$stage/$target/release
@@ -55,13 +55,13 @@ gzip -9n <"$root/CHANGELOG.md" >"$parts/CHANGELOG.md.gz"
 cat >"$parts/changelog" <<END
 ros2probe ($version) stable; urgency=medium
 
-  * What changed is in CHANGELOG.md.gz.
+  * See CHANGELOG.md.gz.
 
  -- The ros2probe contributors <ros2probe@users.noreply.github.com>  $(date -R -d "@$SOURCE_DATE_EPOCH")
 END
 gzip -9n "$parts/changelog"
 
-# The libraries that are linked in, with their licences; a text that several share is there once.
+# Lists the linked libraries with their licences; each licence text is included once.
 libraries() {
     local sources=${CARGO_HOME:-$HOME/.cargo}/registry/src name number licence file sum
     declare -A library users texts

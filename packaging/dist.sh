@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Builds what is released: static binaries for x86_64 and aarch64, man pages, completions, packages,
-# a bill of materials for each binary and checksums of it all, in target/dist.
+# Builds a release in target/dist: static binaries for x86_64 and aarch64, man pages, completions,
+# packages, a bill of materials for each binary, and checksums of all files.
 #
 #   packaging/dist.sh           build and check
-#   packaging/dist.sh --again   build a second time, from a copy elsewhere with nothing of this
-#                               machine's but the toolchain and the crates, and compare the checksums
+#   packaging/dist.sh --again   build a second time in another directory, sharing only the toolchain
+#                               and the crates with this machine, and compare the checksums
 #
-# The bytes depend on the sources, Cargo.lock and the version of rustc: not on where this is, who
-# runs it, when, or what else is installed. Needs what `.ci/prerequisites.sh dist` installs.
+# The bytes depend only on the sources, Cargo.lock and the version of rustc: not on the directory,
+# user, time, or other installed software. Needs the tools that `.ci/prerequisites.sh dist` installs.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd -P)
 cd "$root"
@@ -18,7 +18,7 @@ die() {
     exit 1
 }
 
-# Settings of whoever builds must not change what comes out.
+# The builder's settings must not change the result.
 for variable in $(compgen -e); do
     case $variable in
     CARGO_TARGET_DIR | CARGO_BUILD_JOBS) ;;
@@ -35,7 +35,7 @@ out=$target/dist
 version=$(sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 architectures="x86_64 aarch64"
 
-# When the sources were last changed, for the files that carry a time.
+# Time of the latest change of the sources, for files that contain a time.
 source_date() {
     git log -1 --format=%ct 2>/dev/null && return
     local date
@@ -45,7 +45,7 @@ source_date() {
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(source_date)}
 export SOURCE_DATE_EPOCH
 
-# Paths end up in messages of a panic: give each the same name everywhere.
+# Panic messages contain paths: remap them to the same names everywhere.
 flags() {
     local sysroot commit registry
     sysroot=$(rustc --print sysroot)
@@ -69,28 +69,28 @@ binaries() {
     done
 }
 
-# A copy of the sources without their history, built with a CARGO_HOME of its own.
+# Builds a copy of the sources without their history, with a separate CARGO_HOME.
 again() {
     local copy there
-    [ -f "$out/SHA256SUMS" ] || die "there is nothing to compare with: run this without --again first"
+    [ -f "$out/SHA256SUMS" ] || die "$out/SHA256SUMS is missing: run this without --again first"
     copy=$(mktemp -d)
     # shellcheck disable=SC2064
     trap "rm -rf '$copy'" EXIT
     there=$copy/elsewhere/with-another-name
     mkdir -p "$there" "$copy/cargo"
     git ls-files -z --cached --others --exclude-standard | tar -c --null --files-from=- | tar -x -C "$there"
-    # Where crates come from is the user's.
+    # The sources of crates are a setting of the user.
     cp "${CARGO_HOME:-$HOME/.cargo}"/config* "$copy/cargo" 2>/dev/null || true
     step "building again in $there"
     env -u CARGO_TARGET_DIR CARGO_HOME="$copy/cargo" RUSTUP_HOME="${RUSTUP_HOME:-$HOME/.rustup}" \
         SOURCE_DATE_EPOCH="$SOURCE_DATE_EPOCH" "$there/packaging/dist.sh"
-    step "both builds compared"
+    step "comparing both builds"
     diff "$out/SHA256SUMS" "$there/target/dist/SHA256SUMS" || die "the two builds differ"
     sha256sum "$out/SHA256SUMS" "$there/target/dist/SHA256SUMS"
 }
 
 release() {
-    step "what is built: ros2probe $version with $(rustc --version), sources of $(date --date="@$SOURCE_DATE_EPOCH" +%F)"
+    step "building ros2probe $version with $(rustc --version), sources of $(date --date="@$SOURCE_DATE_EPOCH" +%F)"
     local native debian architecture
     rm -rf "$out"
     mkdir -p "$out"
@@ -126,7 +126,7 @@ release() {
     find "$out" -maxdepth 1 -type f -printf '%10s %f\n' | sort -k2 >&2
 }
 
-# All is read before anything is done: this file may change meanwhile.
+# bash reads this line to its end before it runs: the file may change during the build.
 case ${1-} in
 '') release ;;
 --again) again ;;

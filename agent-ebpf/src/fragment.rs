@@ -1,9 +1,10 @@
-//! Datagrams in several IP fragments: one walk across frames, reported once all have come.
+//! Datagrams in several IP fragments: one walk across frames, reported once all fragments have
+//! arrived.
 //!
-//! Only the first fragment has a UDP header, and submessage headers may lie in any. The walk's state
-//! waits in a table between frames. Where the filter cannot go on alone (discovery behind user data,
-//! a header cut in two, fragments out of order) it hands the rest of the datagram to user space with
-//! the walk's state, so nothing is decided twice and nothing is missed.
+//! Only the first fragment has a UDP header, and submessage headers may lie in any fragment. A
+//! table holds the walk's state between frames. The filter cannot continue alone after discovery
+//! behind user data, a header cut in two, or fragments out of order. It then hands the rest of the
+//! datagram and the walk's state to user space, so nothing is decided twice and nothing is missed.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
@@ -19,13 +20,13 @@ use crate::{
     verdict::{self, progress},
 };
 
-/// A datagram whose fragments are further apart than this has been given up, and its identification
-/// may be in use again.
+/// A flow expires after this time: the kernel has given up the datagram, and its identification may
+/// be in use again.
 const FLOW_LIFETIME_NANOSECONDS: u64 = 5_000_000_000;
 
 mod state {
-    /// A new flow's. Trailing fragments that find it came before the first: what the datagram is,
-    /// is not known, and they are captured within the budget of unclassified writers.
+    /// A new flow. Trailing fragments in this state arrived before the first one: the kind of
+    /// datagram is unknown, and they are captured within the budget of unclassified writers.
     pub const HEADLESS: u32 = 0;
     /// RTPS, walked here.
     pub const WALKING: u32 = 1;
@@ -35,7 +36,7 @@ mod state {
     pub const HANDED_OVER: u32 = 3;
     /// Not RTPS.
     pub const FOREIGN: u32 = 4;
-    /// Complete; late copies of fragments change nothing.
+    /// Complete; duplicate fragments change nothing.
     pub const DONE: u32 = 5;
 }
 
@@ -86,9 +87,9 @@ pub extern "C" fn pass(skb: *mut __sk_buff, slot: u32) -> u32 {
     keep
 }
 
-/// The flow of the fragment at hand, made new when there is none or its identification is reused. An
-/// LRU entry may be given to another key while we hold it, and fragments of one datagram may come on
-/// two CPUs: then flows are miscounted.
+/// Returns the flow of the current fragment; creates it if it does not exist or its identification
+/// is reused. The kernel may reuse an LRU entry for another key while this run holds it, and
+/// fragments of one datagram may arrive on two CPUs. In both cases flows are miscounted.
 #[inline(always)]
 fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
     let key = FlowKey {
@@ -97,7 +98,7 @@ fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
         identification: packet.identification,
         interface: packet.interface | packet.outgoing << 31,
     };
-    // SAFETY: the memory of an LRU entry stays, whomever it is given to.
+    // SAFETY: the memory of an LRU entry stays valid when the entry is reused for another key.
     if let Some(flow) = unsafe { FLOWS.get(key) } {
         let reused = flow.state.get() == state::DONE && packet.offset == 0;
         if !reused && packet.now.wrapping_sub(flow.born.get()) < FLOW_LIFETIME_NANOSECONDS {
@@ -115,7 +116,7 @@ fn flow(slot: u32, packet: &Packet) -> Option<&'static Flow> {
     Some(flow)
 }
 
-/// The fragment with the UDP header.
+/// Handles the fragment with the UDP header.
 #[inline(always)]
 fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
     if verdict::begin(skb, slot, scratch.get()).is_none() {
@@ -124,7 +125,7 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u
     }
     let begun = scratch.get();
     begun.walk.record.datagram = flow.token.get();
-    // Any fragment seen before this one was captured: so is the whole.
+    // Every fragment seen before this one was captured, so all of them are.
     let alone = flow.seen.get() == begun.packet.len;
     let (base, present) = (begun.packet.body + 8, begun.packet.len - 8);
     let result = if alone {
@@ -133,7 +134,7 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u
         progress::CAPTURE
     };
     if result >= progress::CAPTURE {
-        // Also when a header is split: user space gets the datagram from its start.
+        // Also if a header is split: user space reads the datagram from its start.
         flow.state.set(state::CAPTURED);
         verdict::captured(slot, scratch.get());
         return 1;
@@ -143,19 +144,19 @@ fn first(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u
     0
 }
 
-/// A later fragment.
+/// Handles any fragment but the first.
 #[inline(always)]
 fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -> u32 {
     let going_on = scratch.get();
     let state = flow.state.get();
     if state == state::HEADLESS {
-        // Nobody may fill the packet ring with fragments of nothing.
+        // Trailing fragments of unknown datagrams must not fill the packet ring.
         return u32::from(verdict::charge(going_on.packet.len));
     }
     if state != state::WALKING {
         return 1;
     }
-    // In the UDP payload, which begins 8 bytes into the IP payload.
+    // Offset in the UDP payload, which begins 8 bytes into the IP payload.
     let start = going_on.packet.offset - 8;
     let end = start + going_on.packet.len;
     let next = flow.next.get();
@@ -166,7 +167,7 @@ fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -
     going_on.count = 0;
     going_on.unknown = 0;
     let base = going_on.packet.body.wrapping_sub(start);
-    // The walk goes on in a fragment that has not come yet: this one is out of order.
+    // The walk continues in a fragment that has not arrived yet: this one is out of order.
     let result = if next < start {
         progress::SPLIT
     } else {
@@ -181,7 +182,7 @@ fn trailing(skb: *mut __sk_buff, slot: u32, mut scratch: Working, flow: &Flow) -
     1
 }
 
-/// Sends ahead what was found, but for the last record, and puts the walk's state away.
+/// Writes the records found so far, except the last one, and stores the walk's state.
 #[inline(always)]
 fn keep_walk(slot: u32, mut scratch: Working, flow: &Flow) {
     let walked = scratch.get();
@@ -215,7 +216,7 @@ fn send_pending(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     }
 }
 
-/// Tells user space how to go on with the datagram.
+/// Writes a HANDOVER record with the walk's state for user space.
 #[inline(always)]
 fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     send_pending(slot, scratch, flow);
@@ -249,7 +250,7 @@ fn hand_over(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     flow.pending.store(record);
 }
 
-/// All fragments have come.
+/// Writes the last record: all fragments have arrived.
 #[inline(always)]
 fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     let state = flow.state.get();
@@ -278,13 +279,13 @@ fn finish(slot: u32, scratch: &mut Scratch, flow: &Flow) {
     let record = &mut scratch.pending;
     flow.pending.load(record);
     if !pending {
-        // Everything was sent ahead: say that it counts now.
+        // All records were written ahead: this record marks them as valid.
         record.kind = kind::COMPLETE;
         record.datagram = flow.token.get();
         record.flags &= !flag::AHEAD;
     }
     flow.has_pending.set(0);
     record.time = scratch.packet.now;
-    // After records that were sent ahead, this one is the sign that the datagram is complete.
+    // After records written ahead, this record completes the datagram.
     runs::give(slot, record, !ahead);
 }

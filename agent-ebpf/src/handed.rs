@@ -1,9 +1,9 @@
-//! Messages that a process hands to Fast DDS's shared memory, seen in the process itself.
+//! Messages that a process writes to Fast DDS's shared memory, read in that process.
 //!
-//! A uprobe where the library is about to copy a message there: once for each message, however many
-//! others will read it. It reads the sender's memory at the addresses that the call names, never
-//! writes, and does not wait: a page that is not there is a message that is counted as unreadable.
-//! Fast DDS 2.x gives the message in one piece, 3.x in a list of buffers.
+//! A uprobe runs where the library is about to copy a message: once per message, however many
+//! readers it has. It reads the sender's memory at the addresses passed to the call, never writes,
+//! and never waits: a message on a page that is not resident counts as unreadable. Fast DDS 2.x
+//! passes the message in one piece, 3.x in a list of buffers.
 
 use aya_ebpf::{
     helpers::{
@@ -31,25 +31,26 @@ use crate::{
 
 /// `maps::ARCHITECTURE`.
 const AARCH64: u32 = 1;
-/// Ancestors of a control group that are compared.
+/// Ancestor control groups that are compared.
 const LEVELS: i32 = 16;
-/// Submessages of one message that are followed; one with more is captured.
+/// Submessages read per message; a message with more is captured.
 const SUBMESSAGES: u32 = 64;
 /// Bytes of a buffer's description in a list: an address and a length.
 const BUFFER: u64 = 16;
-/// Buffers of a list that one search goes through, and those that a list may have.
+/// Buffers visited by one search, and the longest list.
 const SEARCH: u32 = 64;
 const MAX_BUFFERS: u64 = 4096;
-/// Pieces that one message is captured in at most.
+/// Most pieces of one captured message.
 const MAX_PIECES: u32 = 256;
-/// Longer ones are metered, but not captured: user space knows datagrams.
+/// Longer messages are metered but not captured: user space reads them as datagrams of at most 64
+/// KiB.
 const MAX_CAPTURED: u32 = 0xffff;
-/// No list of buffers comes near it.
+/// Larger than any real list of buffers.
 const MAX_LEN: u32 = 1 << 28;
-/// Words that the walk reads at once, and room for them where they lie in two buffers.
+/// Words that the walk reads at once, and the size of the buffer for words that span two buffers.
 const BRIDGE: usize = 8;
 
-/// The message at hand, by slot.
+/// The current message, by slot.
 #[map]
 static HANDED: PerCpuArray<Handed> = PerCpuArray::with_max_entries(SLOTS, 0);
 
@@ -60,14 +61,14 @@ struct Handed {
     list: u64,
     /// Buffers of the list.
     buffers: u32,
-    /// The next one to be looked at.
+    /// Index of the next buffer to read.
     next: u32,
-    /// Address of the buffer at hand.
+    /// Address of the current buffer.
     address: u64,
-    /// Where in the message it begins and ends.
+    /// Offsets in the message at which the current buffer begins and ends.
     start: u32,
     end: u32,
-    /// Words that lie in two buffers.
+    /// Words that span two buffers.
     bridge: [u32; BRIDGE],
 }
 
@@ -102,12 +103,12 @@ impl Bytes for Message {
     }
 }
 
-/// A register at this place of the program's context. In one instruction: the verifier wants the place
-/// to be a part of it.
+/// Reads a register at this offset of the program's context, in one instruction: the verifier
+/// requires a constant offset.
 macro_rules! register {
     ($registers:expr, $place:literal) => {{
         let value: u64;
-        // SAFETY: reads the program's context, of which the verifier allows any register.
+        // SAFETY: reads the program's context, of which the verifier allows every register.
         unsafe {
             asm!(
                 concat!("{0} = *(u64 *)({1} + ", $place, ")"),
@@ -120,21 +121,21 @@ macro_rules! register {
     }};
 }
 
-/// What [`shm_find`] says; values cross a function boundary as `u32`.
+/// Results of [`shm_find`]; values cross a function boundary as `u32`.
 mod found {
     pub const NOWHERE: u32 = 0;
-    /// In the buffer at hand.
+    /// In the current buffer.
     pub const HERE: u32 = 1;
     /// In the bridge.
     pub const BRIDGED: u32 = 2;
 }
 
-/// A call that hands over a message: its registers as the kernel keeps them. `in_list`: the second
-/// argument behind the object is a list of buffers.
+/// Handles a call that writes a message, from its saved registers. `in_list`: the second argument
+/// after the object is a list of buffers.
 #[inline(always)]
 pub fn look(registers: *const u64, in_list: bool) {
-    // The result is an object that the caller makes room for. On x86-64 its address is the first
-    // argument, before the object's own; on AArch64 it has a register of its own, so x1 and x2 follow.
+    // The caller allocates the object that the call returns. On x86-64 its address is the first
+    // argument, before `this`; on AArch64 it has its own register, so the arguments are x1 and x2.
     let (message, len) = if setting!(ARCHITECTURE) == AARCH64 {
         (register!(registers, 8), register!(registers, 16))
     } else {
@@ -149,7 +150,7 @@ pub fn look(registers: *const u64, in_list: bool) {
     release(slot);
 }
 
-/// Whether the running process belongs to those that are looked at.
+/// Returns whether the running process is in the observed control group.
 #[inline(always)]
 fn is_within() -> bool {
     let within = setting!(WITHIN);
@@ -167,7 +168,7 @@ fn is_within() -> bool {
     false
 }
 
-/// One message at `address`, of `len` bytes.
+/// Handles one message of `len` bytes at `address`.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -> u32 {
@@ -185,7 +186,7 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
         (handed.list, handed.buffers) = (u64::from(zero), zero);
         (handed.address, handed.end) = (address, len);
     } else {
-        // A std::vector: where its contents begin and end.
+        // A std::vector: the addresses at which its contents begin and end.
         let Some([begin, end]) = read::<[u64; 2]>(address) else {
             count(slot, Counter::Unreadable, 1);
             return 0;
@@ -219,7 +220,7 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     scratch.named = scratch.named.wrapping_add(1);
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // As `host::identify` does.
+    // Built as in `host::identify`.
     let token = scratch.named << 12 | (slot + 1) << 8 | (cpu & 0xff);
     let record = &mut scratch.walk.record;
     record.time = now;
@@ -269,7 +270,7 @@ pub extern "C" fn shm_message(slot: u32, address: u64, len: u32, in_list: u32) -
     1
 }
 
-/// One submessage, as `verdict::advance` does it.
+/// Walks one submessage, as `verdict::advance` does.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
@@ -289,7 +290,7 @@ pub extern "C" fn shm_advance(slot: u32, len: u32) -> u32 {
     }
 }
 
-/// Hands over the whole message; 1 = all of it found room.
+/// Writes the whole message to the ring; returns 1 if every piece fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
@@ -325,8 +326,8 @@ pub extern "C" fn shm_capture(slot: u32, len: u32, token: u32) -> u32 {
     0
 }
 
-/// One piece from `offset` of the message on, to the end of its buffer at most; its length, 0 = it
-/// was not read or found no room.
+/// Writes one piece, from `offset` of the message to the end of its buffer at most. Returns its
+/// length, or 0 if it could not be read or did not fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
@@ -360,8 +361,8 @@ pub extern "C" fn shm_piece(slot: u32, offset: u32) -> u32 {
     len
 }
 
-/// Looks for the buffer with these bytes of the message and puts it at hand. Bytes of two or more
-/// buffers are put into the bridge.
+/// Finds the buffer with these bytes of the message and makes it the current one. Copies bytes that
+/// span several buffers to the bridge.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
@@ -369,14 +370,14 @@ pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
         return found::NOWHERE;
     };
     if offset < message.start {
-        // From the beginning again: whoever captures does that once.
+        // Restarts from the first buffer; capturing a message does so only once.
         let zero = core::hint::black_box(0);
         (message.next, message.start, message.end) = (zero, zero, zero);
     }
     if shm_move(slot, offset) == 0 {
         return found::NOWHERE;
     }
-    // Again: `shm_move` has had a reference of its own.
+    // Looked up again: `shm_move` has held a reference of its own.
     if handed(slot).is_some_and(|message| offset + len <= message.end) {
         return found::HERE;
     }
@@ -393,7 +394,7 @@ pub extern "C" fn shm_find(slot: u32, offset: u32, len: u32) -> u32 {
     found::BRIDGED
 }
 
-/// One byte of the message for the bridge.
+/// Copies one byte of the message to the bridge.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
@@ -413,7 +414,7 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
     1
 }
 
-/// Goes on in the list to the buffer with this byte; 0 = there is none.
+/// Moves along the list to the buffer with this byte; returns 0 if no buffer holds it.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
@@ -430,7 +431,7 @@ pub extern "C" fn shm_move(slot: u32, offset: u32) -> u32 {
         let Some([address, len]) = read::<[u64; 2]>(at) else {
             return 0;
         };
-        // The length is a `uint32_t` with padding behind it.
+        // The length is a `uint32_t` followed by padding.
         let len = len as u32;
         if len > MAX_LEN || handed.end > MAX_LEN {
             return 0;
@@ -452,7 +453,7 @@ fn handed(slot: u32) -> Option<&'static mut Handed> {
         .map(|handed| unsafe { &mut *handed })
 }
 
-/// A plain value in the memory of the running process.
+/// Reads a plain value from the memory of the running process.
 #[inline(always)]
 fn read<T: Copy>(address: u64) -> Option<T> {
     let mut value = MaybeUninit::<T>::uninit();

@@ -1,9 +1,10 @@
-//! The host hook: datagrams at the sockets of this host, whole, whatever the links cut them into.
+//! The host hook: whole datagrams at the sockets of this host, whatever fragments the links cut
+//! them into.
 //!
-//! A datagram passes once for each socket that receives it and once for each way it is sent. Its
-//! records name the socket. What has to go to user space whole goes there in pieces, and once,
-//! however many sockets receive it: the other copies are metered. The kernel's return value is not
-//! decided here: the entry programs say 1, always.
+//! A datagram passes once per receiving socket and once per transmission. Its records name the
+//! socket. A captured datagram is written in pieces and only once, however many sockets receive it;
+//! its other copies are metered. The return value for the kernel is not decided here: the entry
+//! programs always return 1.
 
 use aya_ebpf::{
     bindings::__sk_buff,
@@ -23,17 +24,18 @@ use crate::{
     pieces, verdict,
 };
 
-/// How long after a capture the same bytes at another socket are a copy. The kernel hands out the
-/// copies of one datagram one after the other, in microseconds; a writer that repeats itself waits
-/// for an answer first.
+/// Within this time after a capture, the same bytes at another socket are a copy. The kernel
+/// delivers the copies of one datagram one after the other, in microseconds; a writer waits for an
+/// answer before it repeats itself.
 const COPY_NANOSECONDS: u64 = 1_000_000;
-/// How long a socket that goes on alone is not looked for: a table that others fill forgets it.
+/// A socket that was just seen is not looked up again for this long; the LRU table forgets it if
+/// others fill the table.
 const MET_NANOSECONDS: u64 = 500_000_000;
 const TCP: u8 = 6;
 const ICMPV6: u8 = 58;
 const UDP: u8 = 17;
 
-/// One datagram; `at` is one of [`hook`].
+/// Handles one datagram; `at` is one of [`hook`].
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
@@ -58,13 +60,14 @@ pub extern "C" fn look(skb: *mut __sk_buff, at: u32) -> u32 {
     0
 }
 
-/// Most of what passes here is TCP: decided on the first words, read in place.
+/// Returns whether the packet may be UDP. Most packets here are TCP: the first words decide, read
+/// in place.
 #[inline(always)]
 fn may_be_udp(skb: *mut __sk_buff) -> bool {
     // SAFETY: the verifier rewrites reads of these fields into the addresses.
     let (start, end) = unsafe { ((*skb).data as usize, (*skb).data_end as usize) };
     if start + 20 > end {
-        // An IP header that is not in one piece: who knows.
+        // The IP header is not contiguous: it may be UDP.
         return true;
     }
     let words = start as *const u8;
@@ -72,7 +75,7 @@ fn may_be_udp(skb: *mut __sk_buff) -> bool {
     let (version, next_ipv6, next_ipv4) = unsafe { (*words >> 4, *words.add(6), *words.add(9)) };
     match version {
         4 => next_ipv4 == UDP,
-        // Others may be extension headers.
+        // Other values may be extension headers.
         6 => !matches!(next_ipv6, TCP | ICMPV6),
         _ => false,
     }
@@ -90,7 +93,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     }
     let mut scratch = scratch(slot)?;
     if scratch.get().packet.fragmented != 0 {
-        // Made by a raw socket; what sockets receive is reassembled.
+        // Sent by a raw socket; what sockets receive is reassembled.
         count(slot, Counter::Fragments, 1);
         return None;
     }
@@ -106,7 +109,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         if pieces::capture(skb, slot) != 0 {
             note(scratch.get());
         } else {
-            // User space is too slow for all of it: then what it counts for goes alone.
+            // User space cannot keep up with all of it: the rest is metered.
             capture = false;
             verdict::meter(skb, slot);
         }
@@ -118,7 +121,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         last.token.set(token);
         last.slot.set(slot);
         last.captured.set(u32::from(capture));
-        // What the program knows as its context is the packet itself.
+        // For the kernel, the program's context is the packet itself.
         last.buffer.set(skb as u64);
     }
     let scratch = scratch.get();
@@ -141,22 +144,22 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     Some(())
 }
 
-/// A name for the datagram at hand and its socket's cookie. `named` counts for the slot, which this
-/// run holds alone.
+/// Returns a token for the current datagram, and its socket's cookie. `named` counts per slot, and
+/// only this run holds the slot.
 #[inline(always)]
 pub fn identify(skb: *mut __sk_buff, slot: u32, named: &mut u32) -> (u32, u64) {
     *named = named.wrapping_add(1);
     // SAFETY: no preconditions.
     let cpu = unsafe { bpf_get_smp_processor_id() } as u32;
-    // Unique among 2^20 datagrams of a CPU, unless there are more than 256 of those. Slots count
-    // from one, so it is never 0.
+    // Unique among 2^20 datagrams of a CPU if at most 256 CPUs exist. Slots count from one, so the
+    // token is never 0.
     let token = *named << 12 | (slot + 1) << 8 | (cpu & 0xff);
     // SAFETY: `skb` is the program's context.
     (token, unsafe { bpf_get_socket_cookie(skb.cast()) })
 }
 
-/// Whether a copy of the datagram at hand, known by the submessage that asks for its capture, was
-/// captured just before. Never on the wire hook.
+/// Returns whether a copy of the current datagram was captured just before, compared by the
+/// submessage that requires the capture. Always false on the wire hook.
 #[inline(always)]
 pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     if scratch.packet.host == 0 {
@@ -184,7 +187,7 @@ pub fn captured_before(slot: u32, scratch: &mut Scratch) -> bool {
     same
 }
 
-/// Notes that the datagram at hand is captured.
+/// Notes that the current datagram is captured.
 #[inline(always)]
 fn note(scratch: &Scratch) {
     let Some(recent) = noted(scratch) else {

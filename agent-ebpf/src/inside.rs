@@ -1,17 +1,17 @@
-//! Reading the kernel's own structures, at places that the loader has looked up.
+//! Reads the kernel's own structures at offsets that the loader has resolved.
 //!
-//! A wrong address gives zeros, never a fault: the helper refuses it.
+//! A wrong address yields zeros, never a fault: the helper refuses it.
 
 use core::mem::MaybeUninit;
 
 use aya_ebpf::helpers::generated::bpf_probe_read_kernel;
 use ros2probe_wire::host::Layout;
 
-/// By `host::Layout`. Set by the loader.
+/// Indexed by `host::Layout`. Set by the loader.
 #[unsafe(no_mangle)]
 pub static LAYOUT: [u32; Layout::COUNT] = [Layout::ABSENT; Layout::COUNT];
 
-/// Where the running kernel has something; [`Layout::ABSENT`] if nowhere.
+/// Returns the offset of a member in the running kernel; [`Layout::ABSENT`] if it does not exist.
 #[inline(always)]
 pub fn place(of: Layout) -> u32 {
     // SAFETY: an index below the array's length.
@@ -20,13 +20,13 @@ pub fn place(of: Layout) -> u32 {
     unsafe { core::ptr::read_volatile(place) }
 }
 
-/// The member at `place` of the structure at `address`.
+/// Reads the member at offset `place` of the structure at `address`.
 #[inline(always)]
 pub fn member<T: Copy>(address: u64, of: Layout) -> Option<T> {
     read(address.wrapping_add(u64::from(place(of))))
 }
 
-/// A plain value in kernel memory.
+/// Reads a plain value from kernel memory.
 #[inline(always)]
 pub fn read<T: Copy>(address: u64) -> Option<T> {
     let mut value = MaybeUninit::<T>::uninit();

@@ -1,13 +1,13 @@
-//! The kernel filter: reads copies, returns how much of a frame user space gets, changes nothing.
+//! The kernel filter: reads copies, returns how many bytes of a frame user space receives, changes
+//! nothing.
 //!
-//! Thin on purpose. What a submessage is and what becomes of it is decided by
-//! `ros2probe_wire::walk`, the same code that user space runs; here are the socket buffer, the maps
-//! and the fragments. Hooks: [`wire`] sees frames on interfaces, [`host_ingress`] and
-//! [`host_egress`] see datagrams at sockets. On request, [`shm_handed`] sees messages in the process
-//! that sends them.
+//! It is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads submessages and
+//! decides what happens to them. This crate adds the socket buffer, the maps and the fragments.
+//! Hooks: [`wire`] reads frames on interfaces, [`host_ingress`] and [`host_egress`] read datagrams
+//! at sockets. If enabled, [`shm_handed`] reads messages in the process that sends them.
 //!
-//! Stays inside what Linux 5.10 verifies: bounded loops, global functions that are verified once,
-//! reads of fixed size, no spin lock, no atomics that return a value.
+//! It stays within what Linux 5.10 verifies: bounded loops, global functions that are verified
+//! once, reads of fixed size, no spin lock, no atomics that return a value.
 
 #![no_std]
 #![no_main]
@@ -44,82 +44,83 @@ const PACKET_OUTGOING: u32 = 4;
 /// The loopback device has this index in every network namespace.
 const LOOPBACK: u32 = 1;
 
-/// What an AF_PACKET SOCK_DGRAM socket has attached: goes on with [`wire`]. A socket pays for the
-/// length of its program, and up to Linux 6.7 it may not hold 20 KB (`net.core.optmem_max`).
+/// Attached to an AF_PACKET SOCK_DGRAM socket; tail-calls [`wire`]. A socket is charged for the
+/// length of its program, and up to Linux 6.7 a program must stay below 20 KB
+/// (`net.core.optmem_max`).
 #[socket_filter]
 pub fn wire_entry(context: SkBuffContext) -> i64 {
     // SAFETY: index 0 is in the array, and the loader puts a program of the same type there.
     unsafe { WIRE.tail_call(&context, 0) };
-    // Only if nothing is there.
+    // Reached only if the array is empty.
     0
 }
 
-/// For such a socket: the frame begins at the IP header. Returns the bytes that go into the socket's
-/// packet ring: all of the frame, or none.
+/// Runs for such a socket: the frame begins at the IP header. Returns the number of bytes that go
+/// into the socket's packet ring: the whole frame or 0.
 #[socket_filter]
 pub fn wire(context: SkBuffContext) -> i64 {
     frame(context.skb.skb).unwrap_or(0)
 }
 
-/// For a cgroup: a datagram on its way into a socket begins at the IP header, reassembled. Returns 1:
-/// the kernel goes on with it.
+/// Runs for a cgroup: a received datagram begins at the IP header, reassembled. Returns 1: the
+/// kernel continues with it.
 #[cgroup_skb(ingress)]
 pub fn host_ingress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::INGRESS);
     1
 }
 
-/// As [`host_ingress`], for a datagram on its way out of a socket, not fragmented yet.
+/// Runs as [`host_ingress`] does, for a datagram that a socket sends, before it is fragmented.
 #[cgroup_skb(egress)]
 pub fn host_egress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::EGRESS);
     1
 }
 
-/// For every datagram that a socket has no room for, directly after [`host_ingress`].
+/// Runs for every datagram that does not fit a socket's buffer, directly after [`host_ingress`].
 #[raw_tracepoint]
 pub fn no_room(context: RawTracePointContext) -> u32 {
     no_room::refused(&context);
     0
 }
 
-/// For every packet that the kernel throws away, with the reason; attached where [`no_room`] is not
-/// told of IPv6.
+/// Runs for every packet that the kernel drops, with the reason; attached where [`no_room`] does
+/// not cover IPv6.
 #[raw_tracepoint]
 pub fn no_room_freed(context: RawTracePointContext) -> u32 {
     no_room::freed(&context);
     0
 }
 
-/// As [`no_room_freed`], where the kernel tells no reason.
+/// Runs as [`no_room_freed`] does, on kernels that give no reason.
 #[raw_tracepoint]
 pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
     no_room::unexplained(&context);
     0
 }
 
-/// For every packet that the kernel throws away, with the reason; attached where it tells one.
+/// Runs for every packet that the kernel drops; attached on kernels that give a reason.
 #[raw_tracepoint]
 pub fn not_reassembled(context: RawTracePointContext) -> u32 {
     reassembly::dropped(&context);
     0
 }
 
-/// As [`not_reassembled`], where the kernel tells no reason.
+/// Runs as [`not_reassembled`] does, on kernels that give no reason.
 #[raw_tracepoint]
 pub fn not_reassembled_unexplained(context: RawTracePointContext) -> u32 {
     reassembly::unexplained(&context);
     0
 }
 
-/// Where a process is about to copy a message into shared memory, in one piece (Fast DDS 2.x).
+/// Runs where a process is about to copy a message in one piece into shared memory (Fast DDS 2.x).
 #[uprobe]
 pub fn shm_handed(context: ProbeContext) -> u32 {
     handed::look(context.as_ptr() as *const u64, false);
     0
 }
 
-/// As [`shm_handed`], for a message in a list of buffers (Fast DDS 3.x).
+/// Runs as [`shm_handed`] does, for a message in a list of buffers (Fast DDS 3.x).
 #[uprobe]
 pub fn shm_handed_list(context: ProbeContext) -> u32 {
     handed::look(context.as_ptr() as *const u64, true);
@@ -132,7 +133,7 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
     let (pkt_type, interface, segments) =
         unsafe { ((*skb).pkt_type, (*skb).ifindex, (*skb).gso_segs) };
     if interface == LOOPBACK && pkt_type == PACKET_OUTGOING {
-        // Loopback frames pass twice; the copy on its way in is the one that counts.
+        // Loopback frames pass twice; the received copy counts.
         count_outside(Counter::LoopbackCopies, 1);
         return Some(0);
     }

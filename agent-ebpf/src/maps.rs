@@ -16,37 +16,39 @@ use ros2probe_wire::{
     walk::Walk,
 };
 
-/// `BPF_F_NO_PREALLOC`: these maps are filled from user space only, and mostly empty.
+/// `BPF_F_NO_PREALLOC`: user space alone fills these maps, and they are mostly empty.
 const NO_PREALLOC: u32 = 1;
 
-/// Records of one datagram that the filter writes itself; more make it capture the datagram.
+/// Most records that the filter writes for one datagram; a datagram with more is captured.
 pub const RECORDS_PER_DATAGRAM: u32 = 32;
 const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 
-/// Runs of programs that may be under way on one CPU, see [`claim_outgoing`]: those for datagrams
-/// on their way in (and for frames) take the slots before [`OUTGOING_SLOT`], the others those from there on.
+/// Runs of programs that may be active on one CPU, see [`claim_outgoing`]: received datagrams and
+/// frames use the slots below [`OUTGOING_SLOT`], sent datagrams the others.
 pub const SLOTS: u32 = 6;
-/// First slot for datagrams on their way out.
+/// First slot for sent datagrams.
 pub const OUTGOING_SLOT: u32 = 2;
-/// Captures that a CPU remembers, a power of two.
+/// Captures remembered per CPU, a power of two.
 const RECENT_CAPACITY: u32 = 16;
 
-/// Whether frames of an interface that is not in [`INTERFACES`] are looked at. Set by the loader.
+/// Whether to read frames of an interface that is not in [`INTERFACES`]. Set by the loader.
 #[unsafe(no_mangle)]
 pub static NEW_INTERFACES: u32 = 1;
-/// Ring bytes from which on a record wakes user space; below, user space polls. Set by the loader.
+/// Fill level of the ring, in bytes, from which a record wakes user space; below it user space
+/// polls. Set by the loader.
 #[unsafe(no_mangle)]
 pub static WAKE_BYTES: u64 = 128 * 1024;
-/// Likewise for pieces of captured datagrams.
+/// The same for pieces of captured datagrams.
 #[unsafe(no_mangle)]
 pub static WAKE_PIECE_BYTES: u64 = 512 * 1024;
 
-/// Whether the kernel preempts what it does with bottom halves disabled (PREEMPT_RT). Set by the
+/// Whether the kernel preempts code that runs with bottom halves disabled (PREEMPT_RT). Set by the
 /// loader.
 #[unsafe(no_mangle)]
 pub static PREEMPTED: u32 = 1;
 
-/// Whether programs may read packets in place: at a cgroup they may. Set by the loader.
+/// Whether programs may read packets in place: at a cgroup they may, at an interface they may not.
+/// Set by the loader.
 #[unsafe(no_mangle)]
 pub static IN_PLACE: u32 = 1;
 
@@ -55,8 +57,8 @@ pub static IN_PLACE: u32 = 1;
 #[unsafe(no_mangle)]
 pub static ARCHITECTURE: u32 = 0;
 
-/// Messages into shared memory: only those of processes of this control group or below; 0 = all. Set
-/// by the loader.
+/// Messages in shared memory: restricts them to processes in or below this control group; 0 = all.
+/// Set by the loader.
 #[unsafe(no_mangle)]
 pub static WITHIN: u64 = 0;
 
@@ -69,7 +71,7 @@ macro_rules! setting {
 }
 pub(crate) use setting;
 
-/// The wire hook's program, for the short one that goes on with it. Set by the loader.
+/// The wire hook's program, which the short socket filter tail-calls. Set by the loader.
 #[map]
 pub static WIRE: ProgramArray = ProgramArray::with_max_entries(1, 0);
 /// Writers and readers that user space has classified: GUID to `Verdict`.
@@ -84,78 +86,79 @@ pub static PARTICIPANTS: HashMap<[u32; 3], u64> =
 #[map]
 pub static UNKNOWN: LruHashMap<[u32; 4], Shared<u32>> =
     LruHashMap::with_max_entries(UNKNOWN_CAPACITY, 0);
-/// What unclassified writers may still cost, by `filter::Budget`.
+/// Remaining budget of unclassified writers, by `filter::Budget`.
 #[map]
 pub static BUDGET: Array<Shared<i64>> = Array::with_max_entries(2, 0);
-/// Interfaces by index: 1 = look, 0 = leave out.
+/// Interfaces by index: 1 = read, 0 = exclude.
 #[map]
 pub static INTERFACES: HashMap<u32, u32> =
     HashMap::with_max_entries(INTERFACE_CAPACITY, NO_PREALLOC);
 /// Fragmented datagrams in flight.
 #[map]
 pub static FLOWS: LruHashMap<FlowKey, Flow> = LruHashMap::with_max_entries(FLOW_CAPACITY, 0);
-/// A flow that has seen nothing; never written.
+/// The initial value of a flow; never written.
 #[map]
 pub static NEW_FLOW: PerCpuArray<Flow> = PerCpuArray::with_max_entries(1, 0);
-/// DATA_FRAGs of samples that are not complete yet, one after the other so far.
+/// Consecutive DATA_FRAGs of incomplete samples.
 #[map]
 pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACITY, 0);
-/// The CPU that last added to a run of a stream: a sender that moves on leaves its run behind.
+/// The CPU that last extended a stream's run: a sender that moves to another CPU leaves its run
+/// behind.
 #[map]
 pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_CAPACITY, 0);
-/// What user space reads a few times a second, or when it is half full.
+/// Records for user space, read a few times a second or when the ring is half full.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
-/// By slot, and one more for what has none, and `filter::Counter`.
+/// Counters by slot and `filter::Counter`; one more slot counts what happens outside of slots.
 #[map]
 pub static COUNTERS: PerCpuArray<[u64; Counter::ALL.len()]> =
     PerCpuArray::with_max_entries(SLOTS + 1, 0);
 /// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
 #[map]
 pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
-/// Sockets that the host hook has met, by cookie.
+/// Sockets that the host hook has seen, by cookie.
 #[map]
 pub static SOCKETS: LruHashMap<u64, Socket> = LruHashMap::with_max_entries(SOCKET_CAPACITY, 0);
 /// Keys that are too large for the stack, by slot.
 #[map]
 static RUN_KEYS: PerCpuArray<RunKeys> = PerCpuArray::with_max_entries(SLOTS, 0);
-/// Where pieces are put together, by slot.
+/// Buffers for building pieces, by slot.
 #[map]
 static PIECE: PerCpuArray<PieceBuffer> = PerCpuArray::with_max_entries(SLOTS, 0);
-/// The frame or datagram at hand, by slot.
+/// The current frame or datagram, by slot.
 #[map]
 static SCRATCH: PerCpuArray<Scratch> = PerCpuArray::with_max_entries(SLOTS, 0);
-/// What this CPU has captured lately, by a hash of it.
+/// Recent captures of this CPU, by hash.
 #[map]
 static RECENT: PerCpuArray<Recent> = PerCpuArray::with_max_entries(RECENT_CAPACITY, 0);
-/// The datagram that a socket of this host received last on this CPU.
+/// The last datagram that a socket of this host received on this CPU.
 #[map]
 static LAST: PerCpuArray<Last> = PerCpuArray::with_max_entries(1, 0);
 
-/// A value that other runs of programs read and write at the same time, on this CPU or on others:
-/// there is no reference to it, only copies of it come and go.
+/// A value that other runs read and write at the same time, on this CPU or others. No reference to
+/// it exists; it is only copied in and out.
 #[repr(transparent)]
 pub struct Shared<T>(UnsafeCell<T>);
 
-// SAFETY: map values live in the kernel's memory, all zero or copied there. Runs that race may see
-// each other's values or lose their own; each use says what that costs.
+// SAFETY: map values live in the kernel's memory, initialized to zero or by a copy. Runs that race
+// may see each other's values or lose their own; each use states the effect.
 unsafe impl<T> Sync for Shared<T> {}
 
 impl<T: Copy> Shared<T> {
-    /// A value to be put into a map.
+    /// Wraps a value for a map.
     #[inline(always)]
     pub const fn new(value: T) -> Self {
         Self(UnsafeCell::new(value))
     }
 
-    /// A number.
+    /// Returns the number.
     #[inline(always)]
     pub fn get(&self) -> T {
         // SAFETY: valid and aligned, as `self` is.
         unsafe { self.0.get().read_volatile() }
     }
 
-    /// Replaces a number.
+    /// Replaces the number.
     #[inline(always)]
     pub fn set(&self, value: T) {
         // SAFETY: as above.
@@ -165,43 +168,43 @@ impl<T: Copy> Shared<T> {
     /// Copies a whole value out.
     #[inline(always)]
     pub fn load(&self, to: &mut T) {
-        // SAFETY: as above; an exclusive reference is to something else.
+        // SAFETY: as above; `to` is exclusive and does not overlap a map value.
         unsafe { core::ptr::copy_nonoverlapping(self.0.get(), to, 1) }
     }
 
     /// Copies a whole value in.
     #[inline(always)]
     pub fn store(&self, from: &T) {
-        // SAFETY: as above; a reference to what never changes is to something else.
+        // SAFETY: as above; `from` is immutable and does not overlap a map value.
         unsafe { core::ptr::copy_nonoverlapping(from, self.0.get(), 1) }
     }
 }
 
-/// Names one fragmented datagram (RFC 791, RFC 8200 4.5), per interface and direction.
+/// Identifies one fragmented datagram (RFC 791, RFC 8200 4.5), per interface and direction.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct FlowKey {
     pub source: [u32; 4],
     pub destination: [u32; 4],
     pub identification: u32,
-    /// Interface index, and the highest bit for frames on their way out.
+    /// Interface index; the highest bit marks sent frames.
     pub interface: u32,
 }
 
-/// A writer's fragments to one destination.
+/// Identifies a writer's fragments to one destination.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Stream {
     pub writer: [u32; 4],
     pub destination: [u32; 4],
     pub destination_port: u32,
-    /// Interface index, and the highest bit for frames on their way out.
+    /// Interface index; the highest bit marks sent frames.
     pub interface: u32,
-    /// Cookie of the receiving or sending socket, where it is known.
+    /// Cookie of the receiving or sending socket; 0 = unknown.
     pub socket: [u32; 2],
 }
 
-/// A stream as one CPU sees it, so that no two CPUs ever add to the same run.
+/// A stream as one CPU sees it, so that two CPUs never extend the same run.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct RunKey {
@@ -209,7 +212,7 @@ pub struct RunKey {
     pub cpu: u32,
 }
 
-/// Where [`RunKey`]s are put together, and the run that is worked on.
+/// Buffers for building [`RunKey`]s, and the current run.
 #[repr(C)]
 pub struct RunKeys {
     pub here: RunKey,
@@ -217,31 +220,31 @@ pub struct RunKeys {
     pub run: Record,
 }
 
-/// What is known of a fragmented datagram so far.
+/// State of a fragmented datagram.
 #[repr(C)]
 pub struct Flow {
     pub walk: Shared<Walk>,
-    /// The last record found, written once the datagram is complete.
+    /// The last record found, written when the datagram is complete.
     pub pending: Shared<Record>,
     pub born: Shared<u64>,
     /// IP payload bytes seen.
     pub seen: Shared<u32>,
-    /// IP payload bytes in all, 0 until the last fragment has come.
+    /// Total IP payload bytes, 0 until the last fragment arrives.
     pub expected: Shared<u32>,
-    /// Starts of fragments seen, a bit for every 8 bytes (RFC 791): a link with a smaller MTU may cut
-    /// so few off.
+    /// Starts of fragments seen, one bit per 8 bytes (RFC 791): a link with a small MTU may cut
+    /// fragments that short.
     pub starts: [Shared<u64>; 128],
     pub state: Shared<u32>,
     pub has_pending: Shared<u32>,
-    /// Records were sent ahead, so user space waits to hear that the datagram is complete.
+    /// Records were written ahead, so user space waits for the completion record.
     pub ahead: Shared<u32>,
     pub token: Shared<u32>,
-    /// Where in the UDP payload the walk goes on; `u32::MAX` = nowhere.
+    /// Offset in the UDP payload at which the walk continues; `u32::MAX` = nowhere.
     pub next: Shared<u32>,
     pub unused: u32,
 }
 
-/// The IP packet at hand.
+/// The current IP packet.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct Packet {
@@ -251,7 +254,7 @@ pub struct Packet {
     pub body: u32,
     /// IP payload bytes in this frame.
     pub len: u32,
-    /// Where they belong in the whole IP payload.
+    /// Offset of these bytes in the whole IP payload.
     pub offset: u32,
     /// More fragments follow.
     pub more: u32,
@@ -279,19 +282,19 @@ pub struct Scratch {
     pub unknown: u32,
     /// Host hook: a copy of the datagram was captured just before.
     pub repeated: u32,
-    /// The participant that was last heard, and when that was noted in [`PARTICIPANTS`].
+    /// The participant whose message was seen last, and when that was noted in [`PARTICIPANTS`].
     pub heard: [u32; 3],
     pub heard_at: u64,
-    /// Host hook: the socket that was last looked for in [`SOCKETS`], and when.
+    /// Host hook: the socket last looked up in [`SOCKETS`], and when.
     pub met: u64,
     pub met_at: u64,
-    /// Host hook: datagrams that this slot has named.
+    /// Host hook: tokens issued by this slot.
     pub named: u32,
-    /// Runs that hold this slot or are about to notice that they do not.
+    /// Runs that hold this slot, or are about to notice that they do not.
     claims: u64,
 }
 
-/// A datagram that was captured, by the submessage that asked for it.
+/// Identifies a captured datagram by the submessage that required the capture.
 #[repr(C)]
 pub struct Recent {
     pub time: Shared<u64>,
@@ -301,46 +304,46 @@ pub struct Recent {
     pub datagram_len: Shared<u32>,
 }
 
-/// What the host hook leaves for a program that learns, directly afterwards and on the same CPU,
-/// that the datagram was not delivered. Its records are still in the slot: slots of datagrams on
-/// their way in are taken by nothing else, and those come one after the other.
+/// State that the host hook leaves for a program that runs directly afterwards on the same CPU, if
+/// the datagram is not delivered. Its records are still in the slot: only received datagrams use
+/// these slots, one after the other.
 #[repr(C)]
 pub struct Last {
     /// The receiving socket; 0 = the datagram was not RTPS.
     pub socket: Shared<u64>,
-    /// The datagram's name, as in `scratch(slot).walk.record.datagram` unless that has moved on.
+    /// The datagram's token: equal to `scratch(slot).walk.record.datagram` unless the slot was
+    /// reused.
     pub token: Shared<u32>,
-    /// Of the working memory with its records, see `Scratch::count`.
+    /// Slot of the working memory with its records, see `Scratch::count`.
     pub slot: Shared<u32>,
-    /// 1 = captured, then there are no records.
+    /// 1 = captured: the slot holds no records.
     pub captured: Shared<u32>,
     pub unused: u32,
-    /// Address of the kernel's packet, by which its end is known.
+    /// Address of the kernel's packet, by which a drop of it is recognized.
     pub buffer: Shared<u64>,
-    /// The socket of which it has been told that it had no room.
+    /// The socket whose full buffer was already counted for this datagram.
     pub told: Shared<u64>,
 }
 
-/// A piece with room for the longest.
+/// One piece, with room for the longest.
 #[repr(C)]
 pub struct PieceBuffer {
     pub piece: Piece,
     pub bytes: [u8; PIECE_BYTES as usize],
 }
 
-/// Takes one of the slots for datagrams on their way out for this run of a program, until
-/// [`release`].
+/// Claims one of the slots for sent datagrams for this run of a program, until [`release`].
 ///
-/// Those datagrams are handled by tasks, which may be preempted by other tasks that send (the kernel
-/// only keeps them on their CPU). Atomics that return a value need Linux 5.12. So each run adds
-/// itself to the slot's claims and looks: all see the additions in one order, since they share a
-/// CPU, and at most one sees itself alone.
+/// Tasks send those datagrams, and other sending tasks may preempt them (the kernel only keeps them
+/// on their CPU). Atomics that return a value need Linux 5.12. So each run adds itself to the
+/// slot's claims, then reads them. All runs share a CPU and see the additions in one order, so at
+/// most one of them reads 1.
 #[inline(always)]
 pub fn claim_outgoing() -> Option<u32> {
     claim(OUTGOING_SLOT, SLOTS)
 }
 
-/// As [`claim_outgoing`], for frames and for datagrams on their way in: those are handled with
+/// Claims a slot as [`claim_outgoing`] does, for frames and received datagrams. Those run with
 /// bottom halves disabled, one after the other, except on kernels that preempt even that.
 #[inline(always)]
 pub fn claim_incoming() -> Option<u32> {
@@ -355,8 +358,8 @@ fn claim(first: u32, end: u32) -> Option<u32> {
     let mut slot = first;
     while slot < end {
         if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
-            // SAFETY: a map value pointer checked against null; `claims` is only touched here and in
-            // `release`, by its address.
+            // SAFETY: a map value pointer checked against null; only this function and `release`
+            // access `claims`, by its address.
             let claims = unsafe { &raw mut (*scratch).claims };
             add(claims, 1);
             // SAFETY: as above.
@@ -371,7 +374,7 @@ fn claim(first: u32, end: u32) -> Option<u32> {
     None
 }
 
-/// Gives a slot back.
+/// Releases a slot.
 #[inline(always)]
 pub fn release(slot: u32) {
     if setting!(PREEMPTED) == 0 && slot < OUTGOING_SLOT {
@@ -383,13 +386,14 @@ pub fn release(slot: u32) {
     }
 }
 
-/// A slot's working memory, by its address. A function that calls another one that uses it too calls
-/// [`Self::get`] again afterwards: two references are never alive at a time.
+/// Address of a slot's working memory. After a call of a function that uses the same memory, the
+/// caller calls [`Self::get`] again: two references never exist at a time.
 #[derive(Clone, Copy)]
 pub struct Working(*mut Scratch);
 
 impl Working {
-    /// The working memory, until the next call of a function that looks it up by the slot.
+    /// Returns the working memory, valid until the next call of a function that looks it up by
+    /// slot.
     #[inline(always)]
     pub fn get(&mut self) -> &mut Scratch {
         // SAFETY: a map value pointer checked against null by `scratch`; the run that has claimed the
@@ -398,42 +402,42 @@ impl Working {
     }
 }
 
-/// The working memory of a slot.
+/// Returns the working memory of a slot.
 #[inline(always)]
 pub fn scratch(slot: u32) -> Option<Working> {
     SCRATCH.get_ptr_mut(slot).map(Working)
 }
 
-/// The keys of a slot.
+/// Returns the keys of a slot.
 #[inline(always)]
 pub fn run_keys(slot: u32) -> Option<&'static mut RunKeys> {
     // SAFETY: the run that has claimed the slot uses it alone, and one reference at a time.
     RUN_KEYS.get_ptr_mut(slot).map(|keys| unsafe { &mut *keys })
 }
 
-/// The piece buffer of a slot.
+/// Returns the piece buffer of a slot.
 #[inline(always)]
 pub fn piece(slot: u32) -> Option<&'static mut PieceBuffer> {
     // SAFETY: as for `run_keys`.
     PIECE.get_ptr_mut(slot).map(|piece| unsafe { &mut *piece })
 }
 
-/// What there is so far of a run.
+/// Returns the run with this key, if it exists.
 #[inline(always)]
 pub fn run(key: &RunKey) -> Option<&'static Shared<Record>> {
     // SAFETY: a map value pointer checked against null; a `Shared<Record>` is laid out as a `Record`.
     RUNS.get_ptr_mut(key).map(|run| unsafe { &*run.cast() })
 }
 
-/// Where a capture with this hash is noted. Runs that interrupt each other here may capture a copy
-/// more or note a capture that is half another's: that matches nothing.
+/// Returns the entry for captures with this hash. Runs that interrupt each other here may capture
+/// one copy more, or store half of another run's capture, which matches nothing.
 #[inline(always)]
 pub fn recent(hash: u32) -> Option<&'static Recent> {
     RECENT.get(hash & (RECENT_CAPACITY - 1))
 }
 
-/// This CPU's last datagram on its way in: those are handled one after the other on a CPU. Packets
-/// that are thrown away between two of them may look, too.
+/// Returns this CPU's last received datagram: a CPU handles those one after the other. Packets
+/// dropped between two of them may read it, too.
 #[inline(always)]
 pub fn last() -> Option<&'static Last> {
     LAST.get(0)
@@ -449,7 +453,7 @@ pub fn count(slot: u32, counter: Counter, by: u64) {
     }
 }
 
-/// Adds to a counter of this CPU where no slot is held.
+/// Adds to a counter of this CPU outside of slots.
 #[inline(always)]
 pub fn count_outside(counter: Counter, by: u64) {
     if let Some(counters) = COUNTERS.get_ptr_mut(SLOTS) {
@@ -459,7 +463,7 @@ pub fn count_outside(counter: Counter, by: u64) {
     }
 }
 
-/// Adds in one instruction, so that nothing comes between.
+/// Adds in one instruction, so that no other run comes between.
 #[inline(always)]
 pub fn add(to: *mut u64, by: u64) {
     // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
@@ -469,19 +473,19 @@ pub fn add(to: *mut u64, by: u64) {
     }
 }
 
-/// The same number, of which the optimizer no longer knows the bounds: a mask that follows stays
-/// where it is, and every verifier sees it.
+/// Returns the same number with bounds hidden from the optimizer, so that a mask that follows is
+/// kept and every verifier sees it.
 #[inline(always)]
 pub fn opaque(value: u32) -> u64 {
     let mut value = u64::from(value);
-    // An instruction that does nothing: line information of none at all would be refused.
+    // The assembly must not be empty: the verifier refuses line information without an instruction.
     // SAFETY: changes nothing.
     unsafe { asm!("{0} = {0}", inout(reg) value, options(pure, nomem, nostack, preserves_flags)) }
     value
 }
 
 /// Copies a whole value from one map to another. Plain assignment would become a call of `memmove`,
-/// a loop over bytes which some verifiers refuse.
+/// a loop over bytes that some verifiers refuse.
 #[inline(always)]
 pub fn copy<T: Copy>(from: &T, to: &mut T) {
     // SAFETY: two references, one of them exclusive: valid, aligned and not overlapping.

@@ -1,12 +1,12 @@
-//! Datagrams that reached a socket and died there: its receive buffer was full.
+//! Datagrams dropped at a socket because its receive buffer was full.
 //!
-//! Directly before, on the same CPU and for the same socket, the host hook has looked at the
-//! datagram and left what it found. So nothing is parsed here, and it works alike on every kernel.
-//! Where the kernel's types are known, the socket is compared: a datagram that the hook has not seen
-//! (another kind of traffic, a socket outside the hook's cgroup) is never taken for another.
+//! Directly before, on the same CPU and for the same socket, the host hook has read the datagram
+//! and stored what it found. So this module parses nothing and works alike on every kernel. Where
+//! the kernel's types are known it compares the socket, so a datagram that the hook has not seen
+//! (other traffic, a socket outside the hook's cgroup) is never mistaken for another.
 //!
-//! Before Linux 6.6 the kernel tells of it for IPv4 only. There the end of the packet itself is
-//! looked at: the one that the hook has just seen is thrown away.
+//! Before Linux 6.6 the kernel reports a full buffer for IPv4 only. There this module watches
+//! packets being freed and recognizes the one that the hook has just seen.
 
 use aya_ebpf::{helpers::bpf_ktime_get_ns, programs::RawTracePointContext};
 use ros2probe_wire::{
@@ -21,8 +21,8 @@ use crate::{
     verdict::write,
 };
 
-/// A packet that is thrown away later than this after the hook has seen it has been in the socket's
-/// buffer, or is another one in the same place: so where it cannot be compared, and where it can.
+/// Longest time between the hook and an immediate drop. A packet freed later was in the socket's
+/// buffer, or is another packet at the same address.
 const AT_ONCE_NANOSECONDS: u64 = 200_000;
 const COMPARED_NANOSECONDS: u64 = 10_000_000;
 
@@ -37,7 +37,7 @@ pub fn refused(context: &RawTracePointContext) {
         socket = member(sk, Layout::SocketCookie).unwrap_or(0);
     }
     if seen == 0 {
-        // Not RTPS, or told already.
+        // Not RTPS, or counted already.
         if last.told.get() != socket {
             refusal(socket);
         }
@@ -65,8 +65,8 @@ pub fn freed(context: &RawTracePointContext) {
     }
 }
 
-/// `kfree_skb(skb, location)`. That it is thrown away at once is all that there is to know, unless
-/// the kernel's types are known.
+/// `kfree_skb(skb, location)`. Without the kernel's types, only the immediate drop identifies the
+/// packet.
 #[inline(always)]
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
@@ -89,7 +89,7 @@ pub fn unexplained(context: &RawTracePointContext) {
     }
 }
 
-/// Something if the packet's UDP header is that of the record's datagram.
+/// Returns `Some` if the packet's UDP header is that of the record's datagram.
 #[inline(always)]
 fn is_of(buffer: u64, record: &Record) -> Option<()> {
     let head: u64 = member(buffer, Layout::BufferHead)?;
@@ -101,7 +101,7 @@ fn is_of(buffer: u64, record: &Record) -> Option<()> {
     same.then_some(())
 }
 
-/// The hook's last datagram, if this is it and nothing has been told of its end.
+/// Returns the hook's last datagram if this is it and its drop is not counted yet.
 #[inline(always)]
 fn seen(buffer: u64) -> Option<&'static Last> {
     last().filter(|last| last.socket.get() != 0 && last.buffer.get() == buffer)
@@ -115,7 +115,7 @@ fn end(last: &Last) {
     tell(last);
 }
 
-/// Counts for a known socket.
+/// Counts the drop for a known socket.
 #[inline(always)]
 fn refusal(socket: u64) {
     if let Some(known) = SOCKETS.get_ptr_mut(&socket) {
@@ -131,7 +131,7 @@ fn tell(last: &Last) {
     undelivered(last.slot.get(), last.token.get(), last.captured.get());
 }
 
-/// Writes what the hook left in `slot` again.
+/// Writes the records that the hook left in `slot` again, marked as not delivered.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
@@ -140,7 +140,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
     };
     let scratch = scratch.get();
     if scratch.walk.record.datagram != token {
-        // Preempted: the slot has gone on to another datagram.
+        // Preempted: the slot holds another datagram by now.
         count_outside(Counter::NoRoomUnseen, 1);
         return 0;
     }

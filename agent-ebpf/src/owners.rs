@@ -1,7 +1,8 @@
-//! Who holds which socket: goes through the open files of all processes when user space reads it.
+//! Lists which process holds which socket: iterates over the open files of all processes when user
+//! space reads it.
 //!
 //! Writes one `host::Owner` for every file that is a socket with a cookie. A socket gets its cookie
-//! when somebody asks for it, as the host hook does for every socket that it sees.
+//! when a program first reads it, as the host hook does for every socket that it sees.
 
 use aya_ebpf::helpers::generated::bpf_seq_write;
 use ros2probe_wire::host::{Layout, Owner};
@@ -36,10 +37,10 @@ pub extern "C" fn socket_owners(context: *mut TaskFile) -> i32 {
 
 #[inline(always)]
 fn entry(context: *mut TaskFile) -> Option<()> {
-    // As plain numbers: the verifier has its own, typed idea of what lies behind these pointers.
+    // As plain numbers: the verifier attaches its own types to these pointers.
     let [_, task, _, file]: [u64; 4] = read(context as u64)?;
     if task == 0 || file == 0 {
-        // The round is over.
+        // The iteration is complete.
         return None;
     }
     let inode: u64 = member(file, Layout::FileInode)?;
@@ -47,7 +48,7 @@ fn entry(context: *mut TaskFile) -> Option<()> {
     if mode & KIND_OF_FILE != SOCKET {
         return None;
     }
-    // A socket in the file system that was opened as a path has neither.
+    // A socket file opened with O_PATH has neither.
     let socket: u64 = member(file, Layout::FilePrivate)?;
     if member::<u64>(socket, Layout::SocketFile)? != file {
         return None;
@@ -81,7 +82,8 @@ fn entry(context: *mut TaskFile) -> Option<()> {
     Some(())
 }
 
-/// Linux 6.18 and later count the drops of some kinds of sockets elsewhere, in two halves.
+/// Reads a socket's drop counter. Linux 6.18 and later count the drops of some kinds of sockets
+/// elsewhere, in two halves.
 #[inline(always)]
 fn drops(sock: u64) -> Option<u32> {
     if place(Layout::SocketDropCounters) != Layout::ABSENT {

@@ -9,16 +9,16 @@ use crate::{
     maps::{Packet, count, opaque, scratch, setting},
 };
 
-/// How far into a datagram [`in_place`] reads: the verifier wants a bound.
+/// Bytes of a datagram that [`in_place`] reads at most: the verifier requires a bound.
 const IN_PLACE_BYTES: usize = 0x7fff;
 
 /// Where a program sees a packet; values cross a function boundary as `u32`.
 pub mod hook {
     /// A frame on an interface.
     pub const WIRE: u32 = 0;
-    /// A datagram on its way into a socket.
+    /// A received datagram at its socket.
     pub const INGRESS: u32 = 1;
-    /// A datagram on its way out of a socket.
+    /// A sent datagram at its socket.
     pub const EGRESS: u32 = 2;
 }
 
@@ -29,8 +29,8 @@ pub const IPV4_MAPPED: u32 = u32::from_ne_bytes([0, 0, 0xff, 0xff]);
 const VLAN: u32 = 0x8100_u16.to_be() as u32;
 const SERVICE_VLAN: u32 = 0x88a8_u16.to_be() as u32;
 
-/// The UDP payload as the walk reads it: payload offset 0 is at `base` of the socket buffer
-/// (wrapping: for a trailing IP fragment that lies before the frame).
+/// The UDP payload as the walk reads it. Payload offset 0 is at `base` of the socket buffer; it
+/// wraps for a trailing IP fragment, whose payload starts before the frame.
 pub struct Payload {
     pub skb: *mut __sk_buff,
     pub base: u32,
@@ -52,11 +52,11 @@ pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     }
 }
 
-/// Reads a value from the part of a datagram that lies in one piece, which costs no call.
+/// Reads a value from the contiguous part of a datagram, without a helper call.
 #[inline(always)]
 fn in_place<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     if setting!(IN_PLACE) == 0 {
-        // What follows is not even verified then: packet taps may not do it.
+        // Packet taps may not read in place; the verifier skips what follows for them.
         return None;
     }
     let offset = opaque(offset) as usize;
@@ -93,13 +93,14 @@ fn load_anywhere<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     Some(unsafe { value.assume_init() })
 }
 
-/// Whether the packet at hand is an IP fragment.
+/// Returns whether the current packet is an IP fragment.
 #[inline(always)]
 pub fn is_fragment(slot: u32) -> Option<bool> {
     Some(scratch(slot)?.get().packet.fragmented != 0)
 }
 
-/// Fills in the scratch packet; 1 when it is (part of) a UDP datagram. `at` is one of [`hook`].
+/// Fills in the scratch packet; returns 1 if it is (part of) a UDP datagram. `at` is one of
+/// [`hook`].
 // Global (not inlined) functions are verified once each, whatever calls them.
 #[unsafe(no_mangle)]
 #[inline(never)]
@@ -112,7 +113,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     let (pkt_type, protocol, interface) =
         unsafe { ((*skb).pkt_type, (*skb).protocol, (*skb).ifindex) };
     let host = at != hook::WIRE;
-    // At a socket the type says nothing: that of a datagram on its way out is not set yet.
+    // At a socket the packet type is unusable: a sent datagram does not have it yet.
     let outgoing = if host {
         at == hook::EGRESS
     } else {
@@ -121,7 +122,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     packet.host = u32::from(host);
     packet.outgoing = u32::from(outgoing);
     packet.interface = interface;
-    // The kernel strips the outer VLAN tag on the way in; a second one is still there.
+    // The kernel strips the outer VLAN tag of received frames; a second one is still there.
     let start = if !host && !outgoing && (protocol == VLAN || protocol == SERVICE_VLAN) {
         4
     } else {
@@ -142,7 +143,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     1
 }
 
-/// RFC 791.
+/// Reads an IPv4 header (RFC 791).
 #[inline(always)]
 fn ipv4(header: [u32; 5], start: u32, packet: &mut Packet) -> Option<()> {
     let [first, second, third, source, destination] = header;
@@ -171,7 +172,7 @@ fn ipv4(header: [u32; 5], start: u32, packet: &mut Packet) -> Option<()> {
     Some(())
 }
 
-/// RFC 8200, with up to eight extension headers.
+/// Reads an IPv6 header (RFC 8200) with up to eight extension headers.
 #[inline(always)]
 fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     let header: [u32; 10] = load(skb, start)?;
@@ -179,7 +180,7 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
     packet.source = [header[2], header[3], header[4], header[5]];
     packet.destination = [header[6], header[7], header[8], header[9]];
     packet.ipv6 = 1;
-    // Opaque, or four zeros in a row become a call of `memset`.
+    // Opaque to the compiler: it would turn four zeros in a row into a call of `memset`.
     let zero = core::hint::black_box(0);
     packet.offset = zero;
     packet.more = zero;
@@ -199,23 +200,25 @@ fn ipv6(skb: *mut __sk_buff, start: u32, packet: &mut Packet) -> Option<()> {
             return Some(());
         }
         if packet.offset != 0 {
-            // Behind a fragment header that is not the first, no header follows.
+            // Only the first fragment has further headers.
             return None;
         }
         let [word, second]: [u32; 2] = load(skb, at)?;
         let word = u32::from_be(word);
         match next {
-            // Hop-by-hop, routing, destination options: length in 8 bytes beyond the first 8.
+            // Hop-by-hop, routing, destination options: length in 8-byte units beyond the first 8
+            // bytes.
             0 | 43 | 60 => at += ((word >> 16 & 0xff) + 1) * 8,
             44 => {
                 packet.fragmented = u32::from(word & 0xfff9 != 0);
-                // The offset field counts 8 bytes and stands three bits up: its value is bytes.
+                // The offset counts 8-byte units and is shifted left by three bits: the masked
+                // value is in bytes.
                 packet.offset = word & 0xfff8;
                 packet.more = word & 1;
                 packet.identification = u32::from_be(second);
                 at += 8;
             }
-            // Authentication header: length in 4 bytes beyond the first 8.
+            // Authentication header: length in 4-byte units beyond the first 8 bytes.
             51 => at += ((word >> 16 & 0xff) + 2) * 4,
             _ => return None,
         }

@@ -1,5 +1,5 @@
-//! Captured datagrams on their way to user space, in pieces: what a program can copy at a time is
-//! bounded, and discovery should not pay for the longest datagram there is.
+//! Captured datagrams for user space, in pieces: a program can copy a bounded length at a time, and
+//! discovery should not reserve room for the longest datagram.
 
 use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
 use ros2probe_wire::{
@@ -14,17 +14,17 @@ use crate::{
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
-/// Of the longest UDP datagram.
+/// Pieces of the longest UDP datagram.
 const PIECES_PER_DATAGRAM: u32 = 65_536 / PIECE_BYTES;
 const OF_THE_DATAGRAM: u16 = flag::FRAGMENTED | flag::OUTGOING | flag::IPV6 | flag::HOST;
 
-/// Participants say again and again that they are there. Everything else that is captured is said
-/// once, and user space should know of it before what follows from it.
+/// Participants repeat their announcements, so those do not wake user space. Every other captured
+/// datagram is sent once, and user space should read it before what depends on it.
 const SPDP_WRITER: u32 = u32::from_ne_bytes(EntityId::SPDP_WRITER.0);
 
 const _: () = assert!(PIECE_BYTES.is_power_of_two());
 
-/// Hands over the datagram at hand; 1 = all of it found room.
+/// Writes the current datagram to the ring; returns 1 if every piece fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -61,7 +61,7 @@ pub extern "C" fn capture(skb: *mut __sk_buff, slot: u32) -> u32 {
     1
 }
 
-/// One piece, from `offset` of the payload at `base`; 1 = written.
+/// Writes one piece, from `offset` of the payload at `base`; returns 1 if it fit.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u32) -> u32 {
@@ -89,7 +89,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
     publish(slot, buffer)
 }
 
-/// Writes the piece that the buffer holds; 1 = written.
+/// Writes the piece in the buffer; returns 1 if it fit.
 #[inline(always)]
 pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     let wake = if scratch(slot)
@@ -106,8 +106,8 @@ pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     u32::from(PIECES.output::<[u8]>(bytes, wake).is_ok())
 }
 
-/// The same number, 1 to [`PIECE_BYTES`], in a form in which every verifier sees these bounds: a mask
-/// directly before it is used, which the optimizer must not know to be superfluous.
+/// Returns the same number, 1 to [`PIECE_BYTES`], in a form whose bounds every verifier sees: a
+/// mask directly before its use, which the optimizer must not remove as redundant.
 #[inline(always)]
 pub fn bounded(len: u32) -> usize {
     let len = opaque(len);

@@ -1,14 +1,14 @@
-//! Datagrams that never became complete: the kernel has given up waiting for IP fragments, or had
-//! no memory left for them.
+//! Datagrams that never became complete: the kernel timed out waiting for IP fragments, or had no
+//! memory for them.
 //!
-//! Looks at every packet that the kernel throws away, and at nothing of it but the reason, unless
-//! it is a fragment's. The first fragment of such a datagram tells which samples are lost; without
-//! it nothing can be named, and the datagram is only counted. So is one whose first bytes are not
-//! in the linear part of the buffer, as some network drivers leave them.
+//! Runs for every packet that the kernel drops, and reads only the reason unless the packet is a
+//! fragment. The first fragment of such a datagram names the lost samples. Without it, or if its
+//! first bytes are not in the linear part of the buffer (some network drivers), the datagram is
+//! only counted.
 //!
-//! That there is no memory is no reason of its own. A first fragment that is thrown away for none
-//! counts as refused if its network namespace has used up what fragments may take. Before Linux 6.2
-//! giving up is no reason of its own either: there a first fragment that is thrown away is enough.
+//! Lack of memory has no drop reason of its own. A first fragment dropped without a reason counts
+//! as refused if its network namespace has used up its memory for fragments. Before Linux 6.2 the
+//! timeout has no reason either: there a dropped first fragment suffices.
 
 use aya_ebpf::{
     helpers::bpf_ktime_get_ns, macros::map, maps::PerCpuArray, programs::RawTracePointContext,
@@ -33,22 +33,22 @@ const HOP_BY_HOP: u32 = 0;
 const ROUTING: u32 = 43;
 const FRAGMENT: u32 = 44;
 const DESTINATION_OPTIONS: u32 = 60;
-/// Submessages of a first fragment that are looked at.
+/// Submessages of a first fragment that are read.
 const SUBMESSAGES: u32 = 64;
 
-/// Working memory. Fragments are thrown away with bottom halves disabled, one after the other; what
-/// turns out to be something else may be interrupted by them.
+/// Working memory. The kernel drops fragments with bottom halves disabled, one after the other;
+/// they may interrupt the drop of another packet.
 #[map]
 static INCOMPLETE: PerCpuArray<Incomplete> = PerCpuArray::with_max_entries(1, 0);
 
 #[repr(C)]
 struct Incomplete {
     walk: Walk,
-    /// Record to be written.
+    /// The record to write.
     record: Record,
-    /// Source, destination and identification of the datagram at hand.
+    /// Source, destination and identification of the current datagram.
     name: [u32; 9],
-    /// Likewise of the one before: its fragments are thrown away one after the other.
+    /// The same of the previous datagram: its fragments are dropped one after the other.
     last: [u32; 9],
     ipv6: u32,
     /// 0 for a datagram's first fragment.
@@ -59,7 +59,7 @@ struct Incomplete {
     more: u32,
     /// Address of the IP payload.
     body: u64,
-    /// Runs that use this or are about to notice that another does.
+    /// Runs that use this entry, or are about to notice that another one does.
     claims: u64,
 }
 
@@ -87,14 +87,14 @@ impl walk::Bytes for Linear {
     }
 }
 
-/// What is known of why a packet is thrown away.
+/// Why a packet was dropped.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Why {
-    /// The kernel has given up waiting.
+    /// The kernel timed out waiting for fragments.
     GaveUp,
-    /// Some other reason, or none.
+    /// Another reason, or an unspecified one.
     Other,
-    /// The kernel does not tell.
+    /// The kernel gives no reason.
     Unknown,
 }
 
@@ -154,7 +154,7 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     if parsed.is_none() || this.protocol != UDP {
         return None;
     }
-    // Of a datagram that became complete, the first fragment does not look like one any more.
+    // A first fragment of a datagram that became complete does not look like one any more.
     if why != Why::GaveUp && (this.offset != 0 || this.more == 0) {
         return None;
     }
@@ -163,7 +163,7 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     }
     let again = is_again(this);
     if this.offset != 0 {
-        // Behind its first fragment, or behind another of its kind.
+        // Dropped after its first fragment, or after another fragment of the same datagram.
         if !again {
             count_outside(Counter::NotReassembledUnnamed, 1);
         }
@@ -210,8 +210,8 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     Some(())
 }
 
-/// Whether there is no memory for further fragments: the kernel's own condition, with some room for
-/// what has changed since it looked.
+/// Returns whether the namespace has no memory for further fragments: the kernel's own condition,
+/// with a margin for what changed since the kernel tested it.
 #[inline(always)]
 fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
     let device: u64 = member(skb, Layout::BufferDevice)?;
@@ -226,7 +226,8 @@ fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
     Some(memory >= limit - (limit >> 4))
 }
 
-/// Whether the fragment at hand is of the datagram of the one before; from now on it is that one.
+/// Returns whether the current fragment belongs to the previous fragment's datagram, and makes the
+/// current datagram the previous one.
 #[inline(always)]
 fn is_again(this: &mut Incomplete) -> bool {
     // Word by word: a comparison of arrays would become a call of `memcmp`.
@@ -240,7 +241,7 @@ fn is_again(this: &mut Incomplete) -> bool {
     different == 0
 }
 
-/// One submessage of a first fragment; 0 = nothing more to be seen.
+/// Handles one submessage of a first fragment; returns 0 at the end.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
@@ -278,7 +279,7 @@ pub extern "C" fn lost(payload: u64, linear: u32) -> u32 {
     1
 }
 
-/// RFC 791.
+/// Reads an IPv4 header (RFC 791).
 #[inline(always)]
 fn ipv4(ip: u64, this: &mut Incomplete) -> Option<()> {
     let [first, second, third, source, destination]: [u32; 5] = read(ip)?;
@@ -303,7 +304,7 @@ fn ipv4(ip: u64, this: &mut Incomplete) -> Option<()> {
     Some(())
 }
 
-/// RFC 8200; a fragment has its fragment header behind up to four extension headers.
+/// Reads an IPv6 header (RFC 8200); the fragment header follows up to four extension headers.
 #[inline(always)]
 fn ipv6(ip: u64, this: &mut Incomplete) -> Option<()> {
     let header: [u32; 10] = read(ip)?;

@@ -1,9 +1,9 @@
-//! Joins the DATA_FRAGs of one sample: a point cloud in two thousand fragments is one record.
+//! Joins the DATA_FRAGs of one sample: a point cloud in two thousand fragments becomes one record.
 //!
-//! A run begins with a sample's first fragment and ends with its last, or where the next fragment is
-//! missing. Everything else (a retransmission, the rest behind a gap) is written as it comes. When
-//! the sender moves to another CPU in the middle, the run is written and a new one goes on there. A
-//! run that nobody continues is taken out by user space, which looks a few times a second.
+//! A run begins with a sample's first fragment and ends with its last, or before a missing
+//! fragment. Everything else (a retransmission, the rest behind a gap) is written at once. If the
+//! sender moves to another CPU in the middle, the run is written and a new one starts there. User
+//! space removes runs that no longer grow; it checks a few times a second.
 
 use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};
@@ -13,8 +13,8 @@ use crate::{
     verdict::write,
 };
 
-/// Writes a record, or keeps it for the fragments that follow if it `joins` others: that is if it
-/// counts now and is not the sign that its datagram is complete.
+/// Writes a record, or keeps it for the fragments that follow if `joins` is set: it must be valid
+/// now and not complete a datagram.
 #[inline(always)]
 pub fn give(slot: u32, record: &Record, joins: bool) {
     if record.kind != kind::DATA_FRAG {
@@ -33,9 +33,10 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
     // SAFETY: no preconditions.
     keys.here.cpu = unsafe { bpf_get_smp_processor_id() } as u32;
     let mut goes_on = false;
-    // The key names this CPU, and packet taps run with bottom halves disabled, so nobody else adds to
-    // it. A task that sends may be preempted here: should another send fragments of the same writer
-    // from the same socket then, fragments are counted in two records or not at all.
+    // The key names this CPU, and packet taps run with bottom halves disabled, so nothing else
+    // extends the run. A task that sends may be preempted here. If another task then sends
+    // fragments of the same writer from the same socket, fragments are counted in two records or
+    // not at all.
     if let Some(known) = run(&keys.here) {
         let run = &mut keys.run;
         known.load(run);
@@ -65,14 +66,14 @@ pub fn give(slot: u32, record: &Record, joins: bool) {
     write(slot, record);
 }
 
-/// A sample's first fragments, with more to come.
+/// Starts a run with a sample's first fragments, if more follow.
 #[inline(always)]
 fn begins(record: &Record) -> bool {
     record.fragment_start == 1 && !record.ends_sample()
 }
 
-/// Writes the run that the stream has left behind on another CPU; whether `record` goes on where it
-/// ends.
+/// Writes the run that the stream has left behind on another CPU; returns whether `record`
+/// continues it.
 #[inline(always)]
 fn take_over(slot: u32, keys: &mut RunKeys, record: &Record) -> bool {
     let Some(last) = RUN_CPUS.get_ptr_mut(&keys.here.stream) else {
@@ -88,8 +89,8 @@ fn take_over(slot: u32, keys: &mut RunKeys, record: &Record) -> bool {
     unsafe { *last = keys.here.cpu };
     copy(&keys.here.stream, &mut keys.elsewhere.stream);
     keys.elsewhere.cpu = before;
-    // The other CPU has nothing to add to this run, whose next fragment is here; should it write the
-    // run at this very moment too, fragments are seen twice, which counts nothing.
+    // The other CPU does not extend this run, since its next fragment is here. If it writes the run
+    // at the same moment, fragments are reported twice, which counts nothing.
     let Some(known) = run(&keys.elsewhere) else {
         return false;
     };

@@ -17,28 +17,28 @@ use crate::{
     runs,
 };
 
-/// Submessages that one run of the program follows; a datagram with more is captured.
+/// Submessages that one run of the program reads; a datagram with more is captured.
 const SUBMESSAGES: u32 = 64;
-/// How old a participant's noted time may be: leases last seconds.
+/// Age at which a participant's noted time is renewed: leases last seconds.
 const HEARD_NANOSECONDS: u64 = 10_000_000;
 /// `BPF_RB_NO_WAKEUP`, `BPF_RB_FORCE_WAKEUP`, `BPF_RB_AVAIL_DATA`.
 pub const NO_WAKEUP: u64 = 1;
 pub const FORCE_WAKEUP: u64 = 2;
 pub const AVAILABLE_DATA: u64 = 0;
 
-/// What [`advance`] says; values cross a function boundary as `u32`.
+/// Results of [`advance`]; values cross a function boundary as `u32`.
 pub mod progress {
-    /// There may be more submessages here.
+    /// More submessages may follow in this frame.
     pub const ON: u32 = 0;
     /// Nothing more in this frame.
     pub const STOP: u32 = 1;
-    /// User space has to see the datagram.
+    /// User space must read the datagram.
     pub const CAPTURE: u32 = 2;
-    /// The submessage goes on in a later fragment: user space has to read it.
+    /// The submessage continues in a later fragment: user space must read it.
     pub const SPLIT: u32 = 3;
 }
 
-/// A datagram in one frame; 1 = keep the frame.
+/// Handles a datagram in one frame; returns 1 to keep the frame.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -72,8 +72,8 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Walks a datagram again that should have gone to user space and found no room, as one that was
-/// captured just before: what is of interest of it becomes records.
+/// Walks a datagram again that could not be captured for lack of room, as if a copy had been
+/// captured: its submessages of interest become records.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
@@ -96,7 +96,7 @@ pub extern "C" fn meter(skb: *mut __sk_buff, slot: u32) -> u32 {
     0
 }
 
-/// Reads the UDP and RTPS headers of the packet at hand and starts the walk; `None` when it is not
+/// Reads the UDP and RTPS headers of the current packet and starts the walk; `None` if it is not
 /// RTPS.
 #[inline(always)]
 pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()> {
@@ -154,8 +154,8 @@ pub fn begin(skb: *mut __sk_buff, slot: u32, scratch: &mut Scratch) -> Option<()
     Some(())
 }
 
-/// Notes the time of a participant's message, if user space follows the participant. One who says
-/// much is not noted each time.
+/// Notes the time of a participant's message if user space tracks the participant, at most every 10
+/// ms.
 #[inline(always)]
 pub fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
     let same = scratch.heard[2] == source[2]
@@ -172,7 +172,7 @@ pub fn heard(scratch: &mut Scratch, source: [u32; 3], now: u64) {
     scratch.heard_at = now;
 }
 
-/// Walks the submessages that begin before `present`; the strongest [`progress`] met.
+/// Walks the submessages that begin before `present`; returns the strongest [`progress`] of them.
 #[inline(always)]
 pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
     let mut submessages = 0;
@@ -186,7 +186,7 @@ pub fn run(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
     progress::CAPTURE
 }
 
-/// One submessage.
+/// Walks one submessage.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u32) -> u32 {
@@ -207,13 +207,13 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u3
         Step::LongGap => endpoint(slot, scratch, true),
     };
     if result == progress::CAPTURE {
-        // Whoever takes over reads this submessage again.
+        // User space reads this submessage again.
         scratch.walk.offset = before;
     }
     result
 }
 
-/// Asks the interest map about the submessage at hand.
+/// Looks up the current submessage in the interest map.
 #[inline(always)]
 pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
     let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
@@ -254,13 +254,13 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
     progress::ON
 }
 
-/// A writer that user space has not classified: `CAPTURE` within its budget, then `STOP` for one
-/// record, then `ON` for nothing.
+/// Handles a writer that user space has not classified: `CAPTURE` within its budget, then `STOP`
+/// for one record, then `ON` without one.
 #[inline(always)]
 fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     let len = scratch.walk.datagram_len;
-    // SAFETY: an LRU entry may be given to another key while we hold it, its memory stays: then two
-    // writers are charged for each other.
+    // SAFETY: the memory of an LRU entry stays valid when the entry is reused for another key; two
+    // writers then share one charge.
     let used = match unsafe { UNKNOWN.get(key) } {
         Some(used) => used,
         None => {
@@ -286,14 +286,13 @@ fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     progress::ON
 }
 
-/// Takes the bytes of something unclassified out of the capture budget.
+/// Charges bytes of unclassified traffic to the capture budget.
 #[inline(always)]
 pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
-/// Takes from a budget, if there is anything left. It is a budget, not an account: CPUs that race may
-/// overdraw it by a datagram.
+/// Charges a budget if any of it is left. CPUs that race may overdraw it by a datagram.
 #[inline(always)]
 pub fn spend(budget: Budget, amount: u32) -> bool {
     let Some(budget) = BUDGET.get(budget as u32) else {
@@ -315,7 +314,7 @@ pub fn captured(slot: u32, scratch: &Scratch) {
     }
 }
 
-/// Writes the first `records` scratch records, each with `flags` added.
+/// Writes the first `records` scratch records, adding `flags` to each.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
@@ -330,7 +329,7 @@ pub extern "C" fn flush(records: u32, flags: u32, slot: u32) -> u32 {
     0
 }
 
-/// One of them: a function of its own, so that the verifier looks at it once and not in a loop.
+/// Writes one of them: a separate function, so that the verifier checks it once and not in a loop.
 #[unsafe(no_mangle)]
 #[inline(never)]
 pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {
@@ -344,13 +343,13 @@ pub extern "C" fn flush_one(index: u32, flags: u32, slot: u32) -> u32 {
     0
 }
 
-/// Writes one record; user space is woken only when the ring runs full.
+/// Writes one record; wakes user space only when the ring fills up.
 #[inline(always)]
 pub fn write(slot: u32, record: &Record) {
     count(slot, output(record), 1);
 }
 
-/// As [`write`], where no slot is held.
+/// Writes a record as [`write`] does, outside of slots.
 #[inline(always)]
 pub fn write_outside(record: &Record) {
     count_outside(output(record), 1);

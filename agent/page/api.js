@@ -1,19 +1,19 @@
-// Requests to the agent this page comes from, and to nothing else.
+// Requests to the agent that serves this page, and to no other host.
 //
-// The token stays in this tab: in the session's storage and in a header, never in an address.
+// The token stays in this tab, in the session's storage and in a header, never in an address.
 
 const KEY = 'ros2probe-token';
 
-/** A refusal: the agent's problem details, or a connection that failed. */
+/** A failed request: the agent's problem details, or a broken connection. */
 export class Refusal extends Error {
-  /** @param {number} status 0 where no answer came @param {string} detail @param {string} code */
+  /** @param {number} status 0 without an answer @param {string} detail @param {string} code */
   constructor(status, detail, code = '') {
     super(detail);
     this.status = status;
     this.code = code;
   }
 
-  /** Whether a token with more rights would help. */
+  /** Returns whether a token with more rights would help. */
   get needsToken() {
     return this.status === 401 || (this.status === 403 && this.code === 'needs-socket');
   }
@@ -29,13 +29,13 @@ export function keepToken(value) {
   else sessionStorage.removeItem(KEY);
 }
 
-/** The address of the agent's endpoint, below where the page itself lies. @param {string} path */
+/** Returns an endpoint's address, relative to the page's. @param {string} path */
 export function endpoint(path) {
   return new URL(path.replace(/^\//, ''), document.baseURI.split('#')[0]).href;
 }
 
 /**
- * Path of a topic or node: the whole name is one segment, its leading slash included.
+ * Returns the path of a topic or node: the whole name is one segment, with its leading slash.
  * @param {string} kind `topics`, `nodes` or `watch`
  * @param {string} name
  * @param {string} [rest]
@@ -66,7 +66,7 @@ export async function request(path, options = {}) {
   try {
     problem = await response.json();
   } catch {
-    // A proxy in between answers in its own words.
+    // A proxy in between may answer in another format.
   }
   const { detail, title, type, code, mistakes } = /** @type {any} */ (problem);
   const text = [detail ?? title ?? `status ${response.status}`, ...(mistakes ?? [])].join('; ');

@@ -74,7 +74,7 @@ function App() {
       + ` · ${host ? visible(host) : 'ros2probe'}`;
   }, [place, state.open]);
   useEffect(() => {
-    // Another view begins at its top, and a screen reader with its heading.
+    // A new view starts at its top, and a screen reader at its heading.
     if (!first.current) {
       window.scrollTo(0, 0);
       main.current?.querySelector('h1')?.focus({ preventScroll: true });
@@ -167,21 +167,21 @@ function Status() {
   return html`<span class="status"><${Mark} severity=${severity} /> ${word}</span>`;
 }
 
-/** What stands between the page and live figures. */
+/** Explains why the page shows no live figures. */
 function Notice() {
   if (stream.status === 'lost') {
-    const why = stream.problem?.message ?? 'the connection broke';
+    const why = stream.problem?.message ?? 'the connection was lost';
     return html`<p class="notice" role="status"><${Mark} severity="warning" /> No connection: ${why}.
       ${state.batches > 0 ? ' The figures below are the last ones.' : ''} Trying again.</p>`;
   }
   if (stream.status === 'paused') {
-    return html`<p class="notice" role="status">Paused: the figures below stand still.${' '}
+    return html`<p class="notice" role="status">Paused: the figures below are not updated.${' '}
       <button type="button" onClick=${() => stream.resume()}>Continue</button></p>`;
   }
   return null;
 }
 
-/** The one polite region: findings that appear while the page is open. */
+/** The only polite live region: announces findings that appear while the page is open. */
 function News() {
   const known = useRef(/** @type {Set<string>|null} */ (null));
   const [text, say] = useState('');
@@ -201,7 +201,7 @@ function News() {
 }
 
 /**
- * Single keys: `/`, `?`, `p`, and `g` with a second one. They can be switched off.
+ * Handles single keys: `/`, `?`, `p`, and `g` with a second one. They can be switched off.
  * @param {(dialog: string) => void} show
  */
 function keyboard(show) {
@@ -234,7 +234,7 @@ function keyboard(show) {
   return () => document.removeEventListener('keydown', press);
 }
 
-// A fragment that no view has and that is no token is left to the view `No such view`.
+// A fragment that is neither a view nor a token is shown by the view `No such view`.
 if (!location.hash && parse('')) history.replaceState(null, '', address(''));
 const place = /** @type {HTMLElement} */ (document.getElementById('app'));
 place.textContent = '';

@@ -1,8 +1,8 @@
-// Pan and zoom of a drawing: wheel, drag, two fingers, keys. Nothing is drawn again for it.
+// Pan and zoom of a drawing: wheel, drag, two fingers, keys. Neither redraws anything.
 
 const LEAST = 0.05;
 const MOST = 4;
-/** Names can be read from this scale on. */
+/** Smallest scale at which names are legible. */
 const LEGIBLE = 0.7;
 
 export class Camera {
@@ -15,7 +15,7 @@ export class Camera {
     this.scale = 1;
     this.size = { width: 0, height: 0 };
     this.fitted = true;
-    /** Whether the last press moved the drawing, and is no click. */
+    /** Whether the last press moved the drawing and so is not a click. */
     this.moved = false;
     /** @type {Map<number, {x: number, y: number}>} */ this.pointers = new Map();
     const on = (/** @type {string} */ name, /** @type {(event: any) => void} */ listener) =>
@@ -34,7 +34,7 @@ export class Camera {
   }
 
   /**
-   * The drawing has this size now; a fitted view stays fitted.
+   * Sets the size of the drawing; a fitted view stays fitted.
    * @param {number} width
    * @param {number} height
    */
@@ -45,7 +45,7 @@ export class Camera {
     if (first && this.scale < LEGIBLE) this.begin();
   }
 
-  /** Shows the left of a drawing that would be too small to read as a whole. */
+  /** Shows the left part of a drawing that would be illegible as a whole. */
   begin() {
     const { height } = this.view();
     this.scale = LEGIBLE;
@@ -87,7 +87,7 @@ export class Camera {
     this.apply();
   }
 
-  /** Moves the view, if need be, so that a vertex is in it. @param {{x: number, y: number}} at */
+  /** Moves the view if a vertex is outside of it. @param {{x: number, y: number}} at */
   show(at) {
     const { width, height } = this.view();
     const [x, y] = [this.x + at.x * this.scale, this.y + at.y * this.scale];
@@ -99,7 +99,7 @@ export class Camera {
     this.apply();
   }
 
-  /** Takes a key; whether it means something here. @param {string} key */
+  /** Handles a key; returns whether it has a function here. @param {string} key */
   key(key) {
     const { width, height } = this.view();
     if (key === '+' || key === '=') this.zoom(1.3, width / 2, height / 2);
@@ -154,7 +154,7 @@ export class Camera {
   /** @param {PointerEvent} event */
   up(event) {
     this.pointers.delete(event.pointerId);
-    // The click that follows still sees that it was a drag.
+    // The click event that follows still sees `moved`.
     setTimeout(() => { if (!this.pointers.size) this.moved = false; }, 0);
   }
 }

@@ -1,4 +1,4 @@
-// A chart of the last ten minutes: uPlot on a canvas, the same in words, and as a table.
+// A chart of the last ten minutes: uPlot on a canvas, a summary in words, and a table.
 // All charts of a view share one cursor, which the arrow keys move as well.
 
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
@@ -7,7 +7,7 @@ import { html } from './ui.js';
 
 const uPlot = /** @type {any} */ (globalThis).uPlot;
 const HEIGHT = 150;
-/** Steps of an axis that counts: half a message does not exist. */
+/** Steps of an axis of counts, which are whole numbers. */
 const WHOLE = [1, 2, 5].flatMap((step) => [0, 1, 2, 3, 4, 5, 6, 7, 8].map((power) => step * 10 ** power))
   .sort((one, other) => one - other);
 
@@ -17,7 +17,7 @@ const WHOLE = [1, 2, 5].flatMap((step) => [0, 1, 2, 3, 4, 5, 6, 7, 8].map((power
  */
 
 /**
- * What a line shows, in words.
+ * Returns a summary of a line in words.
  * @param {Line} line
  * @param {(value: number|null) => string} print
  */
@@ -137,7 +137,7 @@ export function Chart({ title, times, lines, print, note, whole }) {
 }
 
 /**
- * Every tenth value, the latest first.
+ * A table of every tenth value, the latest first.
  * @param {{title: string, times: number[], lines: Line[],
  *   print: (value: number|null) => string}} props
  */

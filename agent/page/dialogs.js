@@ -10,7 +10,7 @@ import { html, Mark, matches, Name } from './ui.js';
 /** @param {{title: string, close: () => void, children: any}} props */
 function Dialog({ title, close, children }) {
   const own = useRef(/** @type {HTMLDialogElement|null} */ (null));
-  // Before the next key: who types `/imu` at once loses no letter.
+  // Before the next key event, so that fast typing of `/imu` loses no letter.
   useLayoutEffect(() => {
     const before = /** @type {HTMLElement|null} */ (document.activeElement);
     own.current?.showModal();
@@ -19,7 +19,7 @@ function Dialog({ title, close, children }) {
   const outside = (/** @type {MouseEvent} */ event) => {
     if (event.target === own.current) close();
   };
-  // A field for a search takes the first Escape for itself otherwise.
+  // Otherwise a search field consumes the first Escape.
   const leave = (/** @type {KeyboardEvent} */ event) => {
     if (event.key !== 'Escape') return;
     event.preventDefault();
@@ -34,7 +34,7 @@ function Dialog({ title, close, children }) {
 
 const MOST_FOUND = 60;
 
-/** Topics, nodes, services and findings by words of their names and types. @param {any} props */
+/** Searches topics, nodes, services and findings by name and type. @param {any} props */
 export function Search({ close }) {
   const [words, look] = useState('');
   const field = useRef(/** @type {HTMLInputElement|null} */ (null));
@@ -100,7 +100,7 @@ function search(words, services) {
       : address('graph', null, { services: true });
     found.push({ kind: 'service', name: service.name, more, href });
   }
-  // A name that is the words comes before one that holds them.
+  // An exact match precedes names that contain the words.
   const exact = (/** @type {{name: string}} */ each) =>
     (each.name === words || each.name === `/${words}` ? 0 : 1);
   return found.sort((one, other) => exact(one) - exact(other)).slice(0, MOST_FOUND);
@@ -114,7 +114,7 @@ export function Keys({ views, close }) {
     ...views.map(([, title, key]) => [`g ${key}`, title]),
     ['↑ ↓', 'In a table: the row above, the row below'],
     ['← →', 'In a chart: move the cursor of all charts; PageUp and PageDown by a minute'],
-    ['← → ↑ ↓', 'In the graph: walk along edges, and within a column'],
+    ['← → ↑ ↓', 'In the graph: move along edges, or within a column'],
     ['+ − 0', 'In the graph: zoom in, zoom out, fit'],
     ['Enter', 'In the graph: show details, open or close a box'],
   ];
@@ -126,7 +126,7 @@ export function Keys({ views, close }) {
       (<kbd>/</kbd>, <kbd>?</kbd>, <kbd>p</kbd>, <kbd>g</kbd>)</label></${Dialog}>`;
 }
 
-/** Takes a token, which stays in this tab. @param {{close: () => void}} props */
+/** Asks for a token, which stays in this tab. @param {{close: () => void}} props */
 export function Token({ close }) {
   const field = useRef(/** @type {HTMLInputElement|null} */ (null));
   const access = state.open?.access;

@@ -9,7 +9,7 @@ export const NOTHING = '–';
 const PREFIXES = ['', 'k', 'M', 'G', 'T'];
 
 /**
- * Three significant digits, without an exponent.
+ * Formats three significant digits, without an exponent.
  * @param {number} value
  * @returns {string}
  */
@@ -21,7 +21,7 @@ function digits(value) {
 }
 
 /**
- * A quantity with a decimal prefix: 12345 and "B" give "12.3 kB".
+ * Formats a quantity with a decimal prefix: 12345 and "B" give "12.3 kB".
  * @param {number|null|undefined} value
  * @param {string} unit
  * @returns {string}
@@ -37,7 +37,7 @@ function scaled(value, unit) {
   return `${text} ${PREFIXES[power]}${unit}`;
 }
 
-/** Messages a second. @param {number|null|undefined} hertz */
+/** Formats messages per second. @param {number|null|undefined} hertz */
 export function rate(hertz) {
   return scaled(hertz, 'Hz');
 }
@@ -47,13 +47,13 @@ export function bytes(count) {
   return scaled(count, 'B');
 }
 
-/** @param {number|null|undefined} count bytes a second */
+/** @param {number|null|undefined} count bytes per second */
 export function bandwidth(count) {
   return count == null ? NOTHING : scaled(count, 'B/s');
 }
 
 /**
- * A whole number with separators between thousands.
+ * Formats a whole number with separators between thousands.
  * @param {number|null|undefined} value
  */
 export function count(value) {
@@ -62,7 +62,7 @@ export function count(value) {
 }
 
 /**
- * A duration in seconds: "350 µs", "1.25 ms", "4.0 s", "3 min 5 s", "2 h 5 min", "3 d 4 h".
+ * Formats a duration: "350 µs", "1.25 ms", "4.0 s", "3 min 5 s", "2 h 5 min", "3 d 4 h".
  * @param {number|null|undefined} seconds
  */
 export function duration(seconds) {
@@ -84,7 +84,7 @@ export function duration(seconds) {
 }
 
 /**
- * How long something has lasted, in whole seconds: "3 s", "2 min 5 s".
+ * Formats an age in whole seconds: "3 s", "2 min 5 s".
  * @param {number|null|undefined} seconds
  */
 export function age(seconds) {
@@ -94,7 +94,7 @@ export function age(seconds) {
 }
 
 /**
- * A part of one as a percentage. A loss above zero never prints as zero.
+ * Formats a fraction as a percentage. A loss above zero never prints as zero.
  * @param {number|null|undefined} part
  */
 export function percent(part) {
@@ -107,7 +107,7 @@ export function percent(part) {
 }
 
 /**
- * The time of day of a Unix time, in the browser's zone.
+ * Formats the time of day of a Unix time, in the browser's zone.
  * @param {number|null|undefined} seconds
  */
 export function clock(seconds) {
@@ -118,7 +118,7 @@ export function clock(seconds) {
 }
 
 /**
- * Date and time of day of a Unix time, in the browser's zone.
+ * Formats date and time of day of a Unix time, in the browser's zone.
  * @param {number|null|undefined} seconds
  */
 export function date(seconds) {
@@ -130,7 +130,7 @@ export function date(seconds) {
 }
 
 /**
- * "1 topic", "3 topics".
+ * Formats a number with its noun: "1 topic", "3 topics".
  * @param {number} number
  * @param {string} noun
  * @param {string} [plural]
@@ -150,8 +150,8 @@ const UNSEEN = new RegExp(
 );
 
 /**
- * A name or any other text from the network, with each character that prints nothing or reorders
- * its neighbours shown as `\u{202e}`.
+ * Returns a name or other text from the network with escapes such as `\u{202e}` for characters that
+ * print nothing or reorder their neighbours.
  * @param {unknown} text
  * @returns {string}
  */
@@ -165,7 +165,7 @@ export function visible(text) {
 }
 
 /**
- * At most `most` characters of a visible text: beginning and end, which distinguish names best.
+ * Returns at most `most` characters of a visible text: its beginning and end.
  * @param {unknown} text
  * @param {number} most
  */

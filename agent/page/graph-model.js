@@ -1,12 +1,12 @@
-// From the state to what the graph view draws: which vertices, which edges, in which boxes.
-// Nothing here depends on figures, so that figures change the look and never the layout.
+// Converts the state to the graph view's vertices, edges and boxes.
+// Figures are not used here, so that they change the look but never the layout.
 
 import { shortened, visible } from './format.js';
 
-/** Nodes above which namespace boxes are closed at first. */
+/** Number of nodes above which namespace boxes are initially closed. */
 export const MANY_NODES = 60;
 
-// Topics that join everything with everything, by the last part of their names.
+// Topics that connect most nodes, by the last part of their names.
 const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 'diagnostics',
   'diagnostics_agg', 'diagnostics_toplevel_state', 'bond']);
 
@@ -14,7 +14,7 @@ const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 
  * @typedef {{mode: 'both'|'nodes', hubs: boolean, hidden: boolean,
  *   boxes: 'none'|'namespace'|'process', toggled: Set<string>, focus: string|null,
  *   hops: number}} Options
- *   `toggled` holds the boxes that are not as they are at first.
+ *   `toggled` holds the boxes whose initial state the user has changed.
  * @typedef {{key: string, kind: 'node'|'participant'|'topic'|'service'|'action'|'box',
  *   name: string, detail: string, parent: string|null, topic: number|null, node: number|null,
  *   closed: boolean, count: number, members: string[], w: number, h: number}} Vertex
@@ -23,10 +23,10 @@ const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 
  *   guids: string[], passages: number}} Edge
  * @typedef {{vertices: Vertex[], edges: Edge[], signature: string, folded: number,
  *   nodes: number}} Graph
- *   `folded` counts the hubs left out; `nodes` those shown before boxes were closed.
+ *   `folded` counts the omitted hubs; `nodes` the nodes before boxes were closed.
  */
 
-// Every node serves these.
+// Services that every node has.
 const PARAMETERS = new Set(['describe_parameters', 'get_parameter_types', 'get_parameters',
   'list_parameters', 'set_parameters', 'set_parameters_atomically', 'get_type_description']);
 
@@ -98,7 +98,7 @@ function vertex(key, kind, name, more = {}) {
 }
 
 /**
- * Nodes and topics with the edges between them.
+ * Collects nodes and topics with the edges between them.
  * @param {import('./state.js').State} state
  * @param {Options} options
  * @param {{nodes: any[], edges: any[]}|null} joints
@@ -172,8 +172,8 @@ function gather(state, options, joints) {
 }
 
 /**
- * What lies within some hops of one vertex. A hop leads from node to node, or from a topic to its
- * nodes. Null where the vertex does not exist.
+ * Returns the vertices within `hops` of one vertex. A hop leads from node to node, or from a topic
+ * to its nodes. Null if the vertex does not exist.
  * @param {{vertices: Map<string, Vertex>, edges: Edge[]}} base
  * @param {string} focus
  * @param {number} hops
@@ -211,7 +211,7 @@ function around(base, focus, hops) {
 }
 
 /**
- * One edge for each pair of nodes, with all topics that go from the one to the other.
+ * Returns one edge per pair of nodes, with all topics from one to the other.
  * @param {Map<string, Vertex>} vertices
  * @param {Edge[]} edges
  */
@@ -252,7 +252,7 @@ function pairs(vertices, edges) {
 }
 
 /**
- * Boxes of namespaces that hold at least two nodes, the inner ones in the outer ones.
+ * Returns nested boxes of namespaces that contain at least two nodes.
  * @param {Map<string, Vertex>} vertices
  * @returns {Map<string, Vertex>}
  */
@@ -274,7 +274,7 @@ function namespaces(vertices) {
     const own = spaces(node.name);
     for (const [depth, space] of own.entries()) {
       const size = sizes.get(space) ?? 0;
-      // A namespace that holds nothing but one inner namespace is drawn as that one.
+      // A namespace with a single inner namespace is drawn as the inner one.
       const inner = own[depth + 1];
       if (size < 2 || (inner && sizes.get(inner) === size)) continue;
       const key = `box:${space}`;
@@ -287,7 +287,7 @@ function namespaces(vertices) {
 }
 
 /**
- * Boxes of hosts, and of processes that hold at least two nodes.
+ * Returns boxes of hosts, and of processes with at least two nodes.
  * @param {import('./state.js').State} state
  * @param {Map<string, Vertex>} vertices
  * @returns {Map<string, Vertex>}
@@ -334,7 +334,7 @@ function processes(state, vertices) {
 }
 
 /**
- * Puts topics, services and actions into the innermost box that holds all their nodes.
+ * Puts topics, services and actions into the innermost box that contains all their nodes.
  * @param {Map<string, Vertex>} vertices
  * @param {Edge[]} edges
  * @param {Map<string, Vertex>} boxes
@@ -379,7 +379,7 @@ function closedBoxes(boxes, toggled, many) {
   if (many) {
     const below = (/** @type {string|null} */ parent) =>
       [...boxes.values()].filter((box) => box.parent === parent);
-    // A single box around everything would say nothing: its inner ones are closed.
+    // A single box around everything is useless: its inner ones are closed instead.
     let level = below(null);
     while (level.length === 1 && below(level[0].key).length) level = below(level[0].key);
     for (const box of level) closed.add(box.key);
@@ -392,7 +392,7 @@ function closedBoxes(boxes, toggled, many) {
 }
 
 /**
- * Replaces what lies in closed boxes by the boxes.
+ * Replaces the content of closed boxes by the boxes.
  * @param {Map<string, Vertex>} vertices
  * @param {Map<string, Vertex>} boxes
  * @param {Edge[]} edges
@@ -443,7 +443,7 @@ function close(vertices, boxes, edges, closed) {
   return { vertices: shown, edges: [...joined.values()] };
 }
 
-/** Pixels of a text in the graph's font, which is a monospaced one. @param {string} text */
+/** Returns the width in pixels in the graph's monospaced font. @param {string} text */
 function textWidth(text) {
   let units = 0;
   // East Asian characters are twice as wide.
@@ -451,16 +451,16 @@ function textWidth(text) {
   return units * 6.7;
 }
 
-/** The longest figures of a topic. */
+/** The longest text of a topic's figures. */
 const FIGURES = '99.9 kHz · 99.9 MB/s';
 
-/** Characters of a name in the graph. */
+/** Most characters of a name in the graph. */
 export const MOST_LABEL = 32;
 
 /** @param {Vertex} own */
 function measure(own) {
   const label = shortened(own.name, MOST_LABEL);
-  // Figures come and go without another layout: there is room for them from the start.
+  // Figures appear without another layout, so room is reserved for them.
   const detail = own.kind === 'topic' ? FIGURES : shortened(own.detail, MOST_LABEL);
   own.w = Math.max(96, Math.ceil(Math.max(textWidth(label), textWidth(detail)) + 34));
   own.h = own.kind === 'topic' || own.detail || own.closed ? 40 : 28;
@@ -468,7 +468,7 @@ function measure(own) {
 }
 
 /**
- * The graph in the language of Graphviz.
+ * Returns the graph in Graphviz's language.
  * @param {Graph} graph
  * @param {(edge: Edge) => string} labelOf
  */

@@ -1,4 +1,4 @@
-// Lays graphs out beside the page's own thread. Answers bear the number of their question.
+// Computes layouts outside of the page's thread. A result carries the number of its request.
 
 import { layout } from './layout.js';
 

@@ -2,13 +2,13 @@
 //
 // Cycles are broken by a depth-first search, ranks are the longest paths pulled together, long edges
 // bend through one dummy a rank, barycentre sweeps reduce crossings, and least squares with
-// separations (pooled adjacent violators) give y. The same input gives the same picture. Where
-// `previous` gives a place, it is the order to begin with, and only a clear gain in crossings
-// replaces it, so that a picture keeps its order while the graph changes.
+// separations (pooled adjacent violators) give y. The same input gives the same picture. Positions
+// in `previous` give the initial order, which only a clear gain in crossings replaces, so that a
+// picture keeps its order while the graph changes.
 
 /**
  * @typedef {{id: string, w: number, h: number, parent?: string|null, title?: number}} Vertex
- *   `parent` is the id of the box around it; `title` the height a box keeps free above its content.
+ *   `parent` is the id of its box; `title` the height that a box keeps free above its content.
  * @typedef {{id: string, from: string, to: string}} Edge
  * @typedef {{x: number, y: number}} Point
  * @typedef {{id: string, x: number, y: number, w: number, h: number, box: boolean}} Placed
@@ -22,16 +22,16 @@
 
 const SWEEPS = 24;
 const SETTLES = 24;
-// Vertices and dummies from which a graph gets half the work.
+// Number of vertices and dummies above which half the sweeps are made.
 const LARGE = 4000;
-// How strongly an edge pulls, by how many of its ends are dummies: long edges are straight first.
+// Weight of an edge, by its number of dummy ends: long edges become straight first.
 const FORCE = [1, 2, 8];
-// A new order must save this part of the crossings to replace the previous one.
+// A new order replaces the previous one if it has at most this fraction of its crossings.
 const GAIN = 0.75;
 
 /**
  * Places vertices, boxes and edges.
- * @param {Vertex[]} vertices boxes are the vertices that others name as `parent`
+ * @param {Vertex[]} vertices a vertex that is another one's `parent` is a box
  * @param {Edge[]} edges between vertices that are not boxes
  * @param {Options} [options]
  * @returns {Layout}
@@ -57,7 +57,7 @@ export function layout(vertices, edges, options = {}) {
     }
     return found;
   };
-  // Each edge belongs to the innermost box that holds both ends, between that box's children.
+  // Each edge belongs to the innermost box around both ends, between children of that box.
   /** @type {Map<string|null, {from: string, to: string, edge: number}[]>} */
   const inner = new Map();
   edges.forEach((edge, index) => {
@@ -161,8 +161,8 @@ function size(sizes, id) {
  */
 
 /**
- * One level: each connected part is layered by itself, the parts are stacked, and vertices without
- * an edge fill rows below.
+ * Arranges one level: each connected part is layered separately, the parts are stacked, and vertices
+ * without an edge fill rows below.
  * @param {Item[]} items
  * @param {Link[]} links
  * @param {Record<string, Point>} previous
@@ -203,7 +203,7 @@ function arrange(items, links, previous, options) {
     if (part.items.length > 1) joined.push(part);
     else alone.push(part.items[0]);
   }
-  // Parts keep their order while they are known; new ones follow, the larger first.
+  // Known parts keep their order; new ones follow, the largest first.
   const top = (/** @type {{items: Item[]}} */ part) => {
     let least = Infinity;
     for (const item of part.items) least = Math.min(least, previous[item.id]?.y ?? Infinity);
@@ -253,7 +253,7 @@ function arrange(items, links, previous, options) {
 }
 
 /**
- * One connected part.
+ * Layers one connected part.
  * @param {Item[]} items
  * @param {Link[]} links
  * @param {Record<string, Point>} previous
@@ -264,7 +264,7 @@ function arrange(items, links, previous, options) {
  */
 function layered(items, links, previous, gapX, gapY, sweeps) {
   const index = new Map(items.map((item, place) => [item.id, place]));
-  // Pairs once, however many links they have.
+  // Each pair once, however many links it has.
   /** @type {Map<number, [number, number]>} */
   const pairs = new Map();
   for (const link of links) {
@@ -307,7 +307,7 @@ function layered(items, links, previous, gapX, gapY, sweeps) {
     const a = /** @type {number} */ (index.get(link.from));
     const b = /** @type {number} */ (index.get(link.to));
     const route = routes.get(a < b ? a * items.length + b : b * items.length + a) ?? [];
-    // A dummy is as wide as its column: two points, so that an edge crosses a column level.
+    // A dummy is as wide as its column: two points make an edge horizontal there.
     const points = [];
     for (const vertex of route) {
       const { left, right } = x[columns.rank[vertex]];
@@ -329,8 +329,8 @@ function layered(items, links, previous, gapX, gapY, sweeps) {
 }
 
 /**
- * The pairs without cycles: those that lead backwards in a sequence of all vertices are turned
- * round. The sequence takes sources first and sinks last, else what gives most and takes least.
+ * Removes cycles: pairs that lead backwards in a sequence of all vertices are reversed. The sequence
+ * takes sources first and sinks last, else the vertex with most outgoing and fewest incoming edges.
  * @param {Item[]} items
  * @param {[number, number][]} pairs
  * @param {Record<string, Point>} previous
@@ -377,7 +377,7 @@ function acyclic(items, pairs, previous) {
       if (sequence[sink] < 0) remove(sink, last--);
       continue;
     }
-    // What stood left before stays left: a new edge turns no old one round.
+    // Vertices stay in their previous order: a new edge reverses no existing one.
     let best = -1;
     let most = -Infinity;
     for (let vertex = 0; vertex < items.length; vertex += 1) {
@@ -395,7 +395,7 @@ function acyclic(items, pairs, previous) {
 }
 
 /**
- * Longest paths, then each vertex moves where its edges are shortest.
+ * Ranks by longest paths, then moves each vertex to where its edges are shortest.
  * @param {number} size
  * @param {[number, number][]} directed
  */
@@ -442,7 +442,7 @@ function ranks(size, directed) {
   return rank;
 }
 
-/** Lists of neighbours one behind the other: those of `v` are from `begin[v]` to `begin[v + 1]`. */
+/** Concatenated lists of neighbours: those of `v` are from `begin[v]` to `begin[v + 1]`. */
 class Neighbours {
   /** @param {number[][]} lists */
   constructor(lists) {
@@ -474,7 +474,7 @@ class Columns {
     return this.rank.length;
   }
 
-  /** Packs the neighbours for the passes that follow, which add none. */
+  /** Packs the neighbours; no more can be added afterwards. */
   seal() {
     this.toLeft = new Neighbours(this.left);
     this.toRight = new Neighbours(this.right);
@@ -489,7 +489,7 @@ class Columns {
   }
 
   /**
-   * Joins two vertices through dummies, which it returns.
+   * Connects two vertices through dummies, which it returns.
    * @param {number} a
    * @param {number} b
    */
@@ -526,7 +526,7 @@ function order(columns, items, previous, sweeps) {
   const mostly = startOrder(columns, items, previous);
   for (const column of columns.list) column.forEach((vertex, at) => { place[vertex] = at; });
   const kept = items.map((item) => previous[item.id]?.y);
-  // First only what is new moves, then everything, and then the gain has to be worth it.
+  // First only new vertices move, then all, which requires a clear gain.
   const gentle = mostly ? swept(columns, place, sweeps / 2, kept) : Infinity;
   const initial = columns.list.map((column) => column.slice());
   const free = swept(columns, place, sweeps, null);
@@ -574,7 +574,7 @@ function swept(columns, place, sweeps, kept) {
       }
       column.forEach((vertex, at) => { place[vertex] = at; });
     }
-    // Counting costs more than sweeping: a large graph is counted every other time.
+    // Counting is slower than sweeping: for a large graph it happens every other time.
     if (columns.size > LARGE && rightwards) continue;
     const found = crossed(columns, place, tree);
     idle += columns.size > LARGE ? 2 : 1;
@@ -590,7 +590,8 @@ function swept(columns, place, sweeps, kept) {
 }
 
 /**
- * The order of before, new vertices beside their neighbours; whether anything was known.
+ * Restores the previous order, with new vertices beside their neighbours. Returns whether any
+ * vertex was known.
  * @param {Columns} columns
  * @param {Item[]} items
  * @param {Record<string, Point>} previous
@@ -606,7 +607,7 @@ function startOrder(columns, items, previous) {
     }
   });
   if (!known) return false;
-  // Dummies and new vertices take the mean of their neighbours, from both sides, until all have one.
+  // Dummies and new vertices take the mean of their neighbours on both sides, until all have one.
   for (let round = 0; round < columns.list.length + 2; round += 1) {
     let missing = 0;
     for (let vertex = 0; vertex < columns.size; vertex += 1) {
@@ -634,7 +635,7 @@ function startOrder(columns, items, previous) {
 }
 
 /**
- * Crossings between neighbouring columns, by a Fenwick tree.
+ * Counts the crossings between adjacent columns, by a Fenwick tree.
  * @param {Columns} columns
  * @param {Int32Array} place
  * @param {Int32Array} tree
@@ -663,7 +664,7 @@ function crossed(columns, place, tree) {
 }
 
 /**
- * Gives each vertex its y: near its neighbours, in the column's order, with room between.
+ * Sets y of each vertex: near its neighbours, in the column's order, with a gap between them.
  * @param {Columns} columns
  * @param {number} gapY
  */
@@ -703,13 +704,13 @@ function settle(columns, gapY) {
 }
 
 /**
- * The places nearest to the wanted ones that keep order and room: pooled adjacent violators.
+ * Computes the positions nearest to `wanted` that keep order and gap: pooled adjacent violators.
  * @param {number[]} column
  * @param {Float64Array} wanted
  * @param {Float64Array} weight
  * @param {number[]} height
  * @param {number} gapY
- * @param {Float64Array} y receives the places
+ * @param {Float64Array} y receives the positions
  */
 function separate(column, wanted, weight, height, gapY, y) {
   const offset = new Float64Array(column.length);

@@ -1,5 +1,5 @@
-// The message of a topic as it comes: a tree of its fields, and charts of the numbers chosen in it.
-// The agent sends at most five a second, and only while this is open.
+// The current message of a topic: a tree of its fields, and charts of selected numbers.
+// The agent sends at most five messages per second, and only while this is open.
 
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
 import { named, Refusal, request } from './api.js';
@@ -10,9 +10,9 @@ import { state, stream, useKept } from './store.js';
 import { AskButton, Failed, html, Mark, Name, Text } from './ui.js';
 
 const HERTZ = 5;
-/** Points of a field's chart: two minutes at five a second. */
+/** Points of a field's chart: two minutes at five per second. */
 const MOST_POINTS = 600;
-/** Lines of a tree: a message of thousands of fields stays a page. */
+/** Most lines of a tree: a message may have thousands of fields. */
 const MOST_LINES = 400;
 
 /**
@@ -21,9 +21,9 @@ const MOST_LINES = 400;
  */
 
 /**
- * A message as lines; arrays and texts that the agent cut show their whole length.
+ * Returns a message as lines; arrays and texts truncated by the agent show their full length.
  * @param {unknown} value
- * @param {Set<string>} closed paths of objects that are not unfolded
+ * @param {Set<string>} closed paths of collapsed objects
  * @param {number} [most]
  * @returns {Leaf[]}
  */
@@ -51,7 +51,7 @@ export function flatten(value, closed, most = MOST_LINES) {
 }
 
 /**
- * Members of an object or array with their number; for a text that was cut, the text.
+ * Returns the members of an object or array with their number; for a truncated text, the text.
  * @param {unknown} value
  * @returns {[[string|number, unknown][]|null, number, string|null]}
  */
@@ -69,7 +69,7 @@ function inside(value) {
 }
 
 /**
- * The number at a path such as `pose.position.x` or `ranges[3]`; null where it is no number.
+ * Returns the number at a path such as `pose.position.x` or `ranges[3]`; null for other values.
  * @param {unknown} value
  * @param {string} path
  * @returns {number|null}
@@ -91,11 +91,11 @@ export function LiveMessage({ topic, scope, name }) {
   const [open, turn] = useState(false);
   const may = state.may('all');
   return html`<section aria-labelledby="live"><h2 id="live">Live message</h2>
-    ${!may && html`<p>Messages may hold anything the robot sees. Showing them needs a token with the
+    ${!may && html`<p>Messages may contain anything the robot sees. Showing them needs a token with the
       right <strong>all</strong>: run <code>rp page</code> on the robot. <${AskButton} /></p>`}
     ${may && html`<p><button type="button" aria-expanded=${open} onClick=${() => turn(!open)}>${open
-      ? 'Close' : 'Show messages'}</button> <span class="dim">at most ${HERTZ} a second; the topic is
-      measured meanwhile</span></p>`}
+      ? 'Close' : 'Show messages'}</button> <span class="dim">at most ${HERTZ} per second; the topic
+      is measured while they are shown</span></p>`}
     ${may && open && html`<${Follow} scope=${scope} name=${name} topic=${topic} />`}</section>`;
 }
 
@@ -147,11 +147,11 @@ function Follow({ scope, name, topic }) {
     };
     refuse(null);
     setEnd('');
-    follow().then(() => setEnd((/** @type {string} */ reason) => reason || 'the connection broke'), (error) => {
+    follow().then(() => setEnd((/** @type {string} */ reason) => reason || 'the connection was lost'), (error) => {
       if (abort.signal.aborted) return;
-      refuse(error instanceof Refusal ? error : new Refusal(0, 'the connection broke'));
+      refuse(error instanceof Refusal ? error : new Refusal(0, 'the connection was lost'));
     });
-    // A hidden tab asks for nothing.
+    // A hidden tab sends no requests.
     const hidden = () => {
       if (document.visibilityState === 'hidden') abort.abort();
       else if (abort.signal.aborted) again((/** @type {number} */ value) => value + 1);

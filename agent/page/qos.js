@@ -1,17 +1,17 @@
-// Endpoints with what they offer and request, side by side, and where a pair does not fit.
+// Offered and requested QoS of endpoints, side by side, with incompatible policies marked.
 
 import { count, duration, rate } from './format.js';
 import { address } from './router.js';
 import { html, Mark, Name } from './ui.js';
 import { state } from './store.js';
 
-/** Endpoints shown side by side; those of incompatible pairs come first. */
+/** Most endpoints side by side; those of incompatible pairs come first. */
 const MOST_COLUMNS = 8;
 
 const infinite = (/** @type {number|null} */ seconds) =>
   (seconds == null ? 'infinite' : duration(seconds));
 
-/** Each policy: the finding's word for it, its title, and its value. */
+/** Each policy: its name in findings, its title, and its value. */
 const POLICIES = /** @type {[string, string, (qos: any) => string][]} */ ([
   ['reliability', 'Reliability', (qos) => qos.reliability],
   ['durability', 'Durability', (qos) => qos.durability],
@@ -65,7 +65,7 @@ export function Endpoints({ details, topic }) {
 export function Offered({ details }) {
   const broken = details.diagnoses.filter((/** @type {any} */ each) =>
     each.kind === 'qos_incompatible');
-  // GUID of an endpoint to its policies that do not fit some counterpart.
+  // GUID of an endpoint to its policies that are incompatible with some counterpart.
   /** @type {Map<string, Set<string>>} */
   const bad = new Map();
   for (const each of broken) {

@@ -2,14 +2,14 @@
 
 /**
  * @typedef {{view: string, name: string|null, query: Record<string, string>}} Route
- *   `name` is that of a topic or node where the view shows one.
+ *   `name` is that of the topic or node in the view, if any.
  */
 
 const VIEWS = ['', 'topics', 'graph', 'nodes', 'events', 'recordings', 'agent', 'token'];
 
 /**
  * @param {string} fragment with or without its `#`
- * @returns {Route|null} null where no view has that address
+ * @returns {Route|null} null if no view has that address
  */
 export function parse(fragment) {
   const text = fragment.replace(/^#/, '').replace(/^\/?/, '');
@@ -23,7 +23,7 @@ export function parse(fragment) {
       query: Object.fromEntries(new URLSearchParams(query)),
     };
   } catch {
-    // A fragment typed by hand may hold a broken escape.
+    // A fragment typed by hand may contain an invalid escape.
     return null;
   }
 }
@@ -31,7 +31,7 @@ export function parse(fragment) {
 /**
  * @param {string} view
  * @param {string|null} [name]
- * @param {Record<string, string|number|boolean|null|undefined>} [query] empty values are left out
+ * @param {Record<string, string|number|boolean|null|undefined>} [query] empty values are omitted
  */
 export function address(view, name = null, query = {}) {
   const given = Object.entries(query)
@@ -53,7 +53,7 @@ export function nodeAddress(node) {
 }
 
 /**
- * The token that `rp page` puts into the fragment, or null.
+ * Returns the token that `rp page` puts into the fragment, or null.
  * @param {string} fragment
  */
 export function tokenOf(fragment) {

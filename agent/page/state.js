@@ -1,11 +1,11 @@
-// What the page knows of the robot: the lines of `GET /live` merged into one state.
+// The page's view of the robot: the lines of `GET /live` merged into one state.
 //
 // The agent sends the whole graph when its structure changes, and only the rows whose figures
-// changed. Nothing here grows with time: series keep ten minutes, events the latest thousand.
+// changed. The state is bounded: series keep ten minutes, events the latest thousand.
 
 /** Points of a sparkline. */
 export const STEPS = 60;
-/** Events kept. */
+/** Most events kept. */
 export const MOST_EVENTS = 1000;
 
 /**
@@ -34,7 +34,7 @@ const NO_FIGURES = Object.freeze({
   flags: 0, last: null,
 });
 
-/** A series of the last ten minutes in steps; each step is the mean of its values. */
+/** A series of the last ten minutes in steps; a step is the mean of its values. */
 export class Series {
   constructor() {
     /** @type {(number|null)[]} */ this.points = [];
@@ -79,16 +79,16 @@ export class State {
   stepBegan = 0;
   /** @type {{part: number|null, finished: boolean}|null} */ replay = null;
   /** @type {string|null} */ ended = null;
-  /** Whole batches taken since the state is of this run. */
+  /** Complete batches of this run of the agent. */
   batches = 0;
 
-  /** Forgets everything, as another run of the agent demands. */
+  /** Resets the state for another run of the agent. */
   clear() {
     Object.assign(this, new State(), { structure: this.structure + 1 });
   }
 
   /**
-   * Takes one line. Returns whether a batch is whole with it.
+   * Applies one line. Returns whether it completes a batch.
    * @param {Record<string, any>} line
    * @returns {boolean}
    */
@@ -117,7 +117,7 @@ export class State {
     this.structure += 1;
     this.participants = new Map(graph.participants.map((/** @type {any[]} */ row) => {
       const [id, guid, domain, vendor, announced, pid, process, cgroup] = row;
-      // Control groups are known of this host's processes only.
+      // Control groups are known only for processes of this host.
       const host = announced ?? (cgroup == null ? null : this.open?.host ?? null);
       return [id, { id, guid, domain, vendor, host, pid, process, cgroup }];
     }));
@@ -166,7 +166,7 @@ export class State {
 
   /** @param {number} time */
   advance(time) {
-    // A replay that begins again, and a clock set back, begin a new step.
+    // A restarted replay, or a clock set back, begins a new step.
     if (time < this.time) this.stepBegan = time;
     this.time = time;
     for (const [id, figures] of this.figures) {
@@ -225,38 +225,38 @@ export class State {
     this.events = all.slice(-MOST_EVENTS);
   }
 
-  /** Figures of now: a topic that is no longer measured has flags alone. @param {number} id */
+  /** Returns current figures: only flags for an unmeasured topic. @param {number} id */
   figuresOf(id) {
     const own = this.figures.get(id) ?? NO_FIGURES;
     return this.topics.get(id)?.measured === false ? { ...NO_FIGURES, flags: own.flags } : own;
   }
 
-  /** The rates of a topic over the last ten minutes. @param {number} id */
+  /** Returns the rates of a topic over the last ten minutes. @param {number} id */
   pointsOf(id) {
     return this.series.get(id)?.points ?? [];
   }
 
-  /** The names of a topic's flags. @param {number} id @returns {string[]} */
+  /** Returns the names of a topic's flags. @param {number} id @returns {string[]} */
   flagsOf(id) {
     const { flags } = this.figuresOf(id);
     return (this.open?.flags ?? []).filter((/** @type {string} */ _, /** @type {number} */ bit) =>
       flags & (1 << bit));
   }
 
-  /** The names of an endpoint's passages. @param {number} mask @returns {string[]} */
+  /** Returns the names of an endpoint's passages. @param {number} mask @returns {string[]} */
   passagesOf(mask) {
     return (this.open?.passages ?? []).filter((/** @type {string} */ _,
       /** @type {number} */ bit) => mask & (1 << bit));
   }
 
-  /** Whether the listener grants a right: `read`, `watch` or `all`. @param {string} right */
+  /** Returns whether the listener grants `read`, `watch` or `all`. @param {string} right */
   may(right) {
     const order = ['read', 'watch', 'all'];
     return order.indexOf(this.open?.access ?? '') >= order.indexOf(right);
   }
 
   /**
-   * The node of an endpoint, or its participant where it has none.
+   * Returns the node of an endpoint, or its participant if it has no node.
    * @param {Endpoint} endpoint
    * @returns {{key: string, name: string, node: Node|null}}
    */
@@ -279,7 +279,7 @@ export class State {
     return find(this.nodes.values(), name, domain);
   }
 
-  /** Whether the graph spans several domains, so that a name alone names nothing. */
+  /** Returns whether the graph spans several domains, so that names alone are ambiguous. */
   hasDomains() {
     let first = null;
     for (const participant of this.participants.values()) {
@@ -305,8 +305,8 @@ function find(things, name, domain) {
 }
 
 /**
- * Cuts a stream of text into lines and parses each as JSON. A line that is cut in two waits for
- * its rest; an empty line is skipped.
+ * Splits a stream of text into lines and parses each as JSON. An incomplete line waits for its
+ * rest; an empty line is skipped.
  */
 export class Lines {
   constructor() {
@@ -316,7 +316,7 @@ export class Lines {
   /**
    * @param {string} text
    * @returns {Record<string, any>[]}
-   * @throws {SyntaxError} for a line that is no JSON
+   * @throws {SyntaxError} for a line that is not JSON
    */
   take(text) {
     const lines = (this.rest + text).split('\n');

@@ -22,7 +22,7 @@ function changed() {
 export const state = new State();
 export const stream = new Stream(state, changed);
 
-/** Draws the component again with each batch. */
+/** Renders the component again after each batch. */
 export function useLive() {
   const [, draw] = useReducer((/** @type {number} */ count) => count + 1, 0);
   useEffect(() => {
@@ -33,7 +33,7 @@ export function useLive() {
   return state;
 }
 
-/** The route of the address; null where no view has it. */
+/** Returns the route of the address; null if no view has it. */
 export function useRoute() {
   const [route, become] = useState(() => parse(location.hash));
   useEffect(() => {
@@ -44,16 +44,16 @@ export function useRoute() {
   return route;
 }
 
-/** Changes the query of the address without a new entry in the history. @param {string} to */
+/** Replaces the address without a new entry in the history. @param {string} to */
 export function replaceAddress(to) {
   history.replaceState(null, '', to);
   window.dispatchEvent(new HashChangeEvent('hashchange'));
 }
 
 /**
- * Asks an endpoint again and again while the view is shown and the stream runs.
- * @param {string|null} path null asks nothing
- * @param {number} every milliseconds; 0 asks once
+ * Requests an endpoint periodically while the view is shown and the stream runs.
+ * @param {string|null} path null sends no request
+ * @param {number} every milliseconds; 0 sends one request
  * @returns {{data: any, problem: Refusal|null, refresh: () => void}}
  */
 export function usePoll(path, every) {
@@ -95,7 +95,7 @@ export function usePoll(path, every) {
 }
 
 /**
- * A value kept in this browser under a key.
+ * Keeps a value in this browser under a key.
  * @template T
  * @param {string} key
  * @param {T} initial
@@ -124,6 +124,6 @@ export function keep(key, value) {
   try {
     localStorage.setItem(`ros2probe-${key}`, JSON.stringify(value));
   } catch {
-    // A browser that keeps nothing shows the page all the same.
+    // The page works without storage.
   }
 }

@@ -1,4 +1,4 @@
-// The one stream of a tab: `GET /live`, reopened when it breaks, closed while nobody looks.
+// The only stream of a tab: `GET /live`, reopened if it breaks, closed while the tab is hidden.
 
 import { Refusal, request } from './api.js';
 import { Lines } from './state.js';
@@ -15,7 +15,7 @@ const LONGEST_WAIT_MS = 10000;
 export class Stream {
   /**
    * @param {import('./state.js').State} state
-   * @param {() => void} changed called once a batch, and when the status changes
+   * @param {() => void} changed called after each batch, and when the status changes
    */
   constructor(state, changed) {
     this.state = state;
@@ -66,14 +66,14 @@ export class Stream {
     this.open();
   }
 
-  /** Opens the stream anew, as another token demands. */
+  /** Reopens the stream, for example with another token. */
   reopen() {
     this.close('connecting');
     this.wait = FIRST_WAIT_MS;
     this.open();
   }
 
-  /** The tab was hidden or shown. */
+  /** Handles that the tab was hidden or shown. */
   seen() {
     clearTimeout(this.sleep);
     if (document.visibilityState === 'hidden') {

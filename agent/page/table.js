@@ -1,21 +1,21 @@
-// A table of which only the rows in sight are in the document, so that 500 topics cost what 30 do.
-// It scrolls with the window, which keeps it usable on a phone and at 400 % zoom.
+// A table with only the visible rows in the document, so that 500 topics cost as much as 30.
+// It scrolls with the window, so that it is usable on a phone and at 400 % zoom.
 
 import { useEffect, useLayoutEffect, useRef, useState } from './vendor/hooks.mjs';
 import { html } from './ui.js';
 
-/** Rows kept above and below those in sight. */
+/** Rows rendered above and below the visible ones. */
 const SPARE = 12;
 
 /**
  * @template T
  * @typedef {{key: string, title: string, cell: (row: T) => any, by?: (row: T) => any,
  *   kind?: string, header?: boolean}} Column
- *   `by` gives what the column sorts by; `kind` is a class: `number`, `wide` (hidden on a phone).
+ *   `by` returns the sort key; `kind` is a class: `number`, `wide` (hidden on a phone).
  */
 
 /**
- * The rows in the order of a column; equal ones keep their order.
+ * Returns the rows in the order of a column; equal ones keep their order.
  * @template T
  * @param {T[]} rows
  * @param {Column<T>[]} columns
@@ -47,7 +47,7 @@ function compare(a, b, down) {
  */
 export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
   const body = useRef(/** @type {HTMLElement|null} */ (null));
-  /** Pixels of the rows that have been drawn, by key: names wrap, so rows differ. */
+  /** Heights in pixels of rendered rows, by key: names wrap, so rows differ. */
   const heights = useRef(/** @type {Map<string, number>} */ (new Map()));
   const known = useRef({ width: 0, mean: 37 });
   const [range, setRange] = useState({ first: 0, last: 40 });
@@ -69,8 +69,8 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
       if (rows[first + at]) heights.current.set(keyOf(rows[first + at]), height);
     });
     if (sum > 0) known.current.mean = Math.max(20, sum / drawn.length);
-    // Rows that cover the window stay, whatever was estimated: drawing others would change the
-    // widths of columns, these the heights of rows, and these again which rows are in sight.
+    // Rows that cover the window stay, whatever was estimated: other rows would change the widths of
+    // columns, then the heights of rows, and then which rows are visible.
     const top = drawn[0]?.getBoundingClientRect().top ?? 0;
     const covers = drawn.length > 0 && (first === 0 || top <= 0)
       && (last === rows.length || top + sum >= window.innerHeight);
@@ -92,7 +92,7 @@ export function Table({ label, columns, rows, keyOf, sort, onSort, rowClass }) {
   };
   useLayoutEffect(measure, [rows.length]);
   useEffect(() => {
-    // Never twice in a frame: a table that cannot settle must not hold the page.
+    // At most once per frame: a table that never settles must not block the page.
     let asked = requestAnimationFrame(measure);
     const soon = () => {
       cancelAnimationFrame(asked);

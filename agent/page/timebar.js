@@ -1,4 +1,4 @@
-// The time of a replay: what the figures of every view are of.
+// The time of a replay, to which the figures of every view refer.
 
 import { date, duration, percent } from './format.js';
 import { state, useLive } from './store.js';

@@ -1,4 +1,4 @@
-// Small parts that several views are made of.
+// Small components shared by the views.
 
 import { h } from './vendor/preact.mjs';
 import { useEffect, useRef, useState } from './vendor/hooks.mjs';
@@ -10,7 +10,7 @@ import { nodeAddress, topicAddress } from './router.js';
 export const html = htm.bind(h);
 
 /**
- * A name from the network: isolated from the text around it, with nothing unseen in it.
+ * A name from the network, isolated from the text around it, with invisible characters escaped.
  * @param {{text: string, most?: number}} props
  */
 export function Name({ text, most = 0 }) {
@@ -30,7 +30,7 @@ export function NodeLink({ node, most }) {
   return html`<a href=${nodeAddress(node)}><${Name} text=${node.name} most=${most} /></a>`;
 }
 
-/** How bad something is: a mark, a word and a colour. */
+/** Mark and word of each severity. */
 const MARKS = /** @type {Record<string, [string, string]>} */ ({
   error: ['✖', 'error'],
   warning: ['▲', 'warning'],
@@ -45,7 +45,7 @@ export function Mark({ severity }) {
     ><span class="unseen">${word}</span></span>`;
 }
 
-/** Each flag of a topic: severity, word, and what it means. */
+/** Each flag of a topic: severity, word, and explanation. */
 export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
   qos: ['error', 'QoS', 'A publisher and a subscription have incompatible QoS.'],
   type: ['error', 'type', 'Publishers and subscriptions have different types.'],
@@ -56,12 +56,12 @@ export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
   rejected: ['warning', 'rejected', 'limits.topics is reached: the topic is not measured.'],
   unheard: ['note', 'unheard', 'A publisher has no matching subscription.'],
   unfed: ['note', 'unfed', 'A subscription has no matching publisher.'],
-  unseen: ['note', 'unseen', 'Messages of a pair pass where the agent cannot look.'],
+  unseen: ['note', 'unseen', 'Messages of a pair take a path that the agent cannot observe.'],
   sampled: ['note', 'sampled', 'Counts come from samples of shared memory.'],
   encrypted: ['note', 'encrypted', 'A participant announces DDS security.'],
 });
 
-/** Words for the ways of messages. */
+/** Words for the passages of messages. */
 export const PASSAGES = /** @type {Record<string, string>} */ ({
   network: 'network',
   shared_memory: 'shared memory',
@@ -79,7 +79,7 @@ export function Badges({ flags }) {
   });
 }
 
-/** The worst of a topic's flags: `error`, `warning`, `note` or `good`. @param {string[]} flags */
+/** Returns the worst flag: `error`, `warning`, `note` or `good`. @param {string[]} flags */
 export function worst(flags) {
   const order = ['error', 'warning', 'note'];
   const found = flags.map((flag) => FLAGS[flag]?.[0] ?? 'note');
@@ -87,7 +87,7 @@ export function worst(flags) {
 }
 
 /**
- * The course of the last ten minutes. The number beside it says the same to a screen reader.
+ * A sparkline of the last ten minutes. Screen readers read the number beside it instead.
  * @param {{points: (number|null)[], steps?: number}} props
  */
 export function Spark({ points, steps = 60 }) {
@@ -117,7 +117,7 @@ export function Failed({ problem, what }) {
     ${problem.needsToken && html` <${AskButton} />`}</p>`;
 }
 
-/** Opens the dialog that takes a token. */
+/** A button that opens the token dialog. */
 export function AskButton() {
   return html`<button type="button" onClick=${() => askToken()}>Enter a token</button>`;
 }
@@ -127,7 +127,7 @@ export function askToken() {
 }
 
 /**
- * A button that does one thing at a time and shows its refusal.
+ * A button that runs one action at a time and shows its error.
  * @param {{action: () => Promise<unknown>, children: any, label?: string, disabled?: boolean,
  *   pressed?: boolean, kind?: string}} props
  */
@@ -154,7 +154,7 @@ export function Act({ action, children, label, disabled, pressed, kind = '' }) {
 }
 
 /**
- * A number with its name.
+ * A number with its label.
  * @param {{label: string, value: string, points?: (number|null)[], href?: string}} props
  */
 export function Figure({ label, value, points, href }) {
@@ -169,7 +169,7 @@ export function Empty({ children }) {
 }
 
 /**
- * Whether all words of a filter are in a text.
+ * Returns whether a text contains all words of a filter.
  * @param {string} filter
  * @param {string} text
  */
@@ -190,7 +190,7 @@ export function Filter({ value, change, label, found, noun }) {
     <span class="dim">${several(found, noun)}</span></label>`;
 }
 
-/** Hands text or bytes to the browser as a file. @param {string} file @param {Blob} blob */
+/** Downloads text or bytes as a file. @param {string} file @param {Blob} blob */
 export function download(file, blob) {
   const link = document.createElement('a');
   link.href = URL.createObjectURL(blob);
@@ -199,7 +199,7 @@ export function download(file, blob) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-/** Lines of text from the network, each as visible as a name. @param {{text: string}} props */
+/** Lines of text from the network, escaped like names. @param {{text: string}} props */
 export function Text({ text }) {
   return html`<pre tabindex="0">${String(text).split(/\r?\n/).map(visible).join('\n')}</pre>`;
 }

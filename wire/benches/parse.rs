@@ -1,5 +1,5 @@
-//! How long the parsers take over real datagrams: the walk over all submessages of one, a participant's and an
-//! endpoint's announcement, and a `ros_discovery_info` sample.
+//! Time of the parsers on real datagrams: the walk over all submessages of one, a participant's and
+//! an endpoint's announcement, and a `ros_discovery_info` sample.
 
 #![expect(
     clippy::unwrap_used,
@@ -23,7 +23,7 @@ macro_rules! captured {
     };
 }
 
-/// Payload of a datagram's first DATA, and whose it is.
+/// Returns the vendor and the payload of a datagram's first DATA.
 fn first_data(datagram: &[u8]) -> (VendorId, Payload<'_>) {
     let vendor = VendorId([datagram[6], datagram[7]]);
     let mut payload = None;

@@ -1,8 +1,8 @@
-//! The one reader of bytes that came from somebody else.
+//! The one reader of untrusted bytes.
 //!
-//! Every length field opens a sub-cursor, so an inner length cannot escape the outer one; every
-//! read says what it was reading, where, and why it failed. Offsets are relative to the slice the
-//! outermost cursor was made from.
+//! Every length field opens a sub-cursor, so an inner length cannot escape the outer one. Every
+//! error names the field, its offset and the reason. Offsets are relative to the slice of the
+//! outermost cursor.
 
 /// Byte order of the bytes that follow.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -24,14 +24,14 @@ pub enum Reason {
     BadMarker,
     /// Text that is not UTF-8 or lacks its terminator.
     BadText,
-    /// A value outside what the field may hold.
+    /// A value outside the field's range.
     BadValue,
-    /// More of something than the parser is willing to hold.
+    /// More elements than the parser accepts.
     OverLimit,
 }
 
 impl Reason {
-    /// Label value of a metric: a bounded set of words.
+    /// Returns the label value for metrics: one of a bounded set of words.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -48,11 +48,11 @@ impl Reason {
 /// One failed read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct WireError {
-    /// What was being read, in the specification's words.
+    /// The field that was being read, in the specification's words.
     pub what: &'static str,
-    /// Byte offset where it should have begun.
+    /// Byte offset at which the field begins.
     pub offset: usize,
-    /// Why it could not be read.
+    /// Why the read failed.
     pub reason: Reason,
 }
 
@@ -79,7 +79,7 @@ pub struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// At the start of `bytes`.
+    /// Creates a cursor at the start of `bytes`.
     #[must_use]
     pub const fn new(bytes: &'a [u8], endianness: Endianness) -> Self {
         Self {
@@ -89,37 +89,37 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Bytes not read yet.
+    /// Returns the bytes that are not read yet.
     #[must_use]
     pub const fn rest(&self) -> &'a [u8] {
         self.rest
     }
 
-    /// How many bytes are left.
+    /// Returns the number of bytes left.
     #[must_use]
     pub const fn remaining(&self) -> usize {
         self.rest.len()
     }
 
-    /// Position relative to the outermost cursor's start.
+    /// Returns the position relative to the outermost cursor's start.
     #[must_use]
     pub const fn offset(&self) -> usize {
         self.offset
     }
 
-    /// Byte order of the multi-byte reads.
+    /// Returns the byte order of multi-byte reads.
     #[must_use]
     pub const fn endianness(&self) -> Endianness {
         self.endianness
     }
 
-    /// The same position, read in another byte order from here on.
+    /// Returns the same position with another byte order.
     #[must_use]
     pub const fn with_endianness(self, endianness: Endianness) -> Self {
         Self { endianness, ..self }
     }
 
-    /// The error for a field that begins here.
+    /// Returns an error for the field at the current position.
     #[must_use]
     pub const fn error(&self, what: &'static str, reason: Reason) -> WireError {
         WireError {
@@ -222,8 +222,8 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Skips to the next multiple of `alignment` counted from the outermost start, or to the end
-    /// when the padding is cut off: trailing padding may be missing, what follows may not.
+    /// Skips to the next multiple of `alignment`, counted from the outermost start, or to the end
+    /// if the padding is cut off: trailing padding may be missing.
     pub fn align(&mut self, alignment: usize) {
         let padding = self.offset.wrapping_neg() & (alignment - 1);
         let padding = padding.min(self.rest.len());

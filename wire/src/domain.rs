@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-/// Id of a DDS domain. Announced ones may be any number; ports exist up to [`Self::MAX`].
+/// Id of a DDS domain. A participant may announce any number; UDP ports exist up to [`Self::MAX`].
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct DomainId(pub u32);
 

@@ -1,8 +1,8 @@
-//! `ros_discovery_info`: which nodes a participant holds and which endpoints are theirs.
+//! `ros_discovery_info`: the nodes of a participant and their endpoints.
 //!
 //! `rmw_dds_common/msg/ParticipantEntitiesInfo` as CDR. A sample is the participant's whole state
-//! and replaces the one before. Iron and later write 16-byte gids, Humble 24-byte ones, under the
-//! same topic and type name, and both may be in one domain: the layout is told from the bytes.
+//! and replaces the previous one. Iron and later write 16-byte gids, Humble 24-byte ones, under the
+//! same topic and type name. One domain may have both, so the bytes decide the layout.
 
 use alloc::string::String;
 use alloc::vec::Vec;
@@ -11,7 +11,7 @@ use crate::cursor::{Cursor, Endianness, Reason, WireError};
 use crate::guid::{EntityId, Guid};
 use crate::text;
 
-/// Most nodes kept of one participant.
+/// Most nodes kept per participant.
 pub const MAX_NODES: usize = 1024;
 /// Longest node name or namespace (ROS allows 255 characters for both together).
 const MAX_NAME_LEN: usize = 256;
@@ -19,27 +19,27 @@ const MAX_NAME_LEN: usize = 256;
 /// One participant's nodes.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct ParticipantEntities {
-    /// Whose nodes; taken from the payload.
+    /// GUID of the participant, taken from the payload.
     pub participant: Guid,
     /// Its nodes, in the order they were created.
     pub nodes: Vec<NodeEntities>,
 }
 
-/// One node's endpoints.
+/// One node and its endpoints.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct NodeEntities {
     /// Namespace, such as `/` or `/robot1`.
     pub namespace: String,
     /// Name without its namespace.
     pub name: String,
-    /// Its readers.
+    /// GUIDs of its readers.
     pub readers: Vec<Guid>,
-    /// Its writers.
+    /// GUIDs of its writers.
     pub writers: Vec<Guid>,
 }
 
 impl NodeEntities {
-    /// Namespace and name with exactly one slash between them.
+    /// Returns namespace and name, joined by exactly one slash.
     #[must_use]
     pub fn fully_qualified_name(&self) -> String {
         let slash = if self.namespace.ends_with('/') {
@@ -52,25 +52,25 @@ impl NodeEntities {
 }
 
 impl ParticipantEntities {
-    /// From a sample's payload, encapsulation header included.
+    /// Parses a sample's payload, encapsulation header included.
     ///
     /// # Errors
-    /// [`Reason::BadMarker`] when it is not plain CDR; the error of the likelier layout when it
-    /// reads in neither.
+    /// Returns [`Reason::BadMarker`] if it is not plain CDR, and the error of the likelier layout
+    /// if neither layout fits.
     pub fn parse(payload: &[u8]) -> Result<Self, WireError> {
         let mut cursor = Cursor::new(payload, Endianness::Big);
         let error = cursor.error("encapsulation", Reason::BadMarker);
         let endianness = match cursor.u16("encapsulation")? {
-            // CDR and plain CDR2 differ in the alignment of 64-bit values, of which there are none.
+            // CDR and plain CDR2 differ in the alignment of 64-bit values, which this type does not
+            // contain.
             0x0000 | 0x0006 => Endianness::Big,
             0x0001 | 0x0007 => Endianness::Little,
             _ => return Err(error),
         };
         cursor.u16("encapsulation options")?;
         let cursor = cursor.with_endianness(endianness);
-        // The longer gid's last eight bytes are zero. In the shorter layout this is where the
-        // number of nodes and the first namespace's length stand; both are zero only when nothing
-        // follows.
+        // The longer gid's last eight bytes are zero. In the shorter layout they hold the number of
+        // nodes and the first namespace's length; both are zero only if nothing follows.
         let padded = cursor
             .rest()
             .get(16..24)
@@ -80,7 +80,7 @@ impl ParticipantEntities {
     }
 }
 
-/// The whole payload with gids of `gid_len` bytes.
+/// Parses the whole payload with gids of `gid_len` bytes.
 fn entities(mut cursor: Cursor<'_>, gid_len: usize) -> Result<ParticipantEntities, WireError> {
     let error = cursor.error("participant gid", Reason::BadValue);
     let participant = gid(&mut cursor, gid_len)?;
@@ -112,7 +112,7 @@ fn gids(cursor: &mut Cursor<'_>, gid_len: usize) -> Result<Vec<Guid>, WireError>
     cursor.align(4);
     let error = cursor.error("gid count", Reason::BadLength);
     let count = usize::try_from(cursor.u32("gid count")?).map_err(|_| error)?;
-    // The bytes are shown to be there before anything is allocated for them.
+    // Checks that the bytes exist before it allocates for them.
     let length = count.checked_mul(gid_len).ok_or(error)?;
     let mut bytes = cursor.sub("gids", length)?;
     let mut gids = Vec::with_capacity(count);
@@ -319,7 +319,7 @@ mod tests {
     }
 
     fn guids() -> impl Strategy<Value = Vec<Guid>> {
-        // Entity ids of the first endpoints are small numbers and look like counts.
+        // Entity ids of the first endpoints are small numbers that look like counts.
         let guid = (any::<[u8; 12]>(), 0..40_u8).prop_map(|(prefix, entity)| {
             Guid::new(GuidPrefix(prefix), EntityId([0, 0, entity, 3]))
         });

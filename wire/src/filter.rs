@@ -1,24 +1,24 @@
 //! Names and limits that the kernel filter and its loader agree on.
 
-/// What the filter counts, per CPU; the value is the index in its counter array.
+/// Counters of the filter, per CPU; the value is the index in its counter array.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Counter {
-    /// UDP frames looked at.
+    /// UDP frames read.
     Frames = 0,
     /// RTPS messages begun (first or only IP fragment).
     Messages,
     /// Datagrams of no interest.
     Ignored,
-    /// Datagrams that became records only.
+    /// Datagrams reported as records only.
     Metered,
     /// Datagrams handed to user space whole.
     Captured,
-    /// Of those: because a writer was not classified yet.
+    /// Datagrams among them captured because a writer was not classified yet.
     CapturedUnknown,
     /// Frame bytes handed to user space.
     CapturedBytes,
-    /// Submessages of unclassified writers beyond their capture budget that became records.
+    /// Submessages of unclassified writers, beyond their capture budget, reported as records.
     MeteredUnknown,
     /// Submessages of unclassified writers beyond all budgets.
     UnknownOverBudget,
@@ -26,48 +26,48 @@ pub enum Counter {
     Records,
     /// Records lost because the ring was full.
     RecordsLost,
-    /// IP fragments looked at.
+    /// IP fragments read.
     Fragments,
-    /// IP fragments seen again.
+    /// Duplicate IP fragments.
     FragmentsRepeated,
     /// IP fragments whose first fragment is unknown: reordered, or the flow was evicted.
     FragmentsWithoutFlow,
     /// Fragmented datagrams of interest that became complete.
     FragmentedComplete,
-    /// Fragmented datagrams whose walk user space had to continue.
+    /// Fragmented datagrams handed over to user space.
     HandedOver,
-    /// Fragmented datagrams that the flow table had no room for.
+    /// Fragmented datagrams that did not fit the flow table.
     FlowTableFull,
     /// Submessages or headers that contradict their datagram's length.
     Malformed,
     /// Second copies of loopback frames.
     LoopbackCopies,
-    /// Frames of interfaces that the configuration leaves out.
+    /// Frames of interfaces that the configuration excludes.
     InterfaceExcluded,
-    /// Frames that hold several datagrams (UDP segmentation offload); not taken apart.
+    /// Frames that hold several datagrams (UDP segmentation offload); not read.
     Segmented,
-    /// Frames or datagrams not looked at, because too many runs of the program had interrupted each
-    /// other on one CPU.
+    /// Frames or datagrams skipped because too many runs of the program interrupted each other on
+    /// one CPU.
     Contended,
-    /// Host hook: captured datagrams of which a piece found no room in the ring.
+    /// Host hook: captured datagrams with a piece that did not fit the ring.
     PiecesLost,
     /// Host hook: copies of a datagram that was captured just before, not captured again.
     CopiesNotCaptured,
-    /// RTPS datagrams that a socket had no room for.
+    /// RTPS datagrams dropped at a full socket buffer.
     NoRoom,
-    /// Datagrams that a socket had no room for and that the host hook had not just seen there.
+    /// Datagrams dropped at a full socket buffer that the host hook had not just seen there.
     NoRoomUnseen,
-    /// RTPS datagrams that lacked IP fragments until the kernel gave up, or were refused for lack of
-    /// memory for fragments, and whose first fragment was there.
+    /// RTPS datagrams with missing IP fragments that the kernel gave up, or refused for lack of
+    /// memory for fragments, whose first fragment is known.
     NotReassembled,
-    /// UDP datagrams likewise whose first fragment was not there, or not where it can be read.
+    /// UDP datagrams given up or refused likewise, whose first fragment is missing or unreadable.
     NotReassembledUnnamed,
-    /// Messages on their way into shared memory that could not be read in their sender's memory.
+    /// Messages for shared memory that could not be read in their sender's memory.
     Unreadable,
 }
 
 impl Counter {
-    /// All of them, in index order.
+    /// Every counter, in index order.
     pub const ALL: [Self; 29] = [
         Self::Frames,
         Self::Messages,
@@ -100,7 +100,7 @@ impl Counter {
         Self::Unreadable,
     ];
 
-    /// Label value.
+    /// Returns the label value.
     #[must_use]
     pub const fn label(self) -> &'static str {
         match self {
@@ -147,7 +147,7 @@ pub enum Budget {
     Records = 1,
 }
 
-/// Writers and readers that the interest map holds.
+/// Writers and readers in the interest map.
 pub const INTEREST_CAPACITY: u32 = 16_384;
 /// Participants whose last message the filter notes.
 pub const PARTICIPANT_CAPACITY: u32 = 4_096;
@@ -157,10 +157,10 @@ pub const UNKNOWN_CAPACITY: u32 = 1_024;
 pub const FLOW_CAPACITY: u32 = 1_024;
 /// Interfaces of one network namespace.
 pub const INTERFACE_CAPACITY: u32 = 1_024;
-/// Runs of DATA_FRAGs that wait for the sample's next fragments.
+/// Incomplete runs of DATA_FRAGs.
 pub const RUN_CAPACITY: u32 = 512;
-/// Bytes captured of one unclassified writer before it is only metered: enough for the whole
-/// `ros_discovery_info` burst of a node that starts, a few datagrams of a point cloud.
+/// Bytes captured per unclassified writer before it is only metered: enough for the whole
+/// `ros_discovery_info` burst of a starting node, or a few datagrams of a point cloud.
 pub const UNKNOWN_CAPTURE_BYTES: u32 = 256 * 1024;
 
 #[cfg(test)]

@@ -1,11 +1,11 @@
-//! From a captured frame to a UDP datagram, or to the piece of one that an IP fragment carries.
+//! Parses a captured frame into a UDP datagram, or the piece of one that an IP fragment carries.
 //!
-//! Views only: nothing is copied, nothing is kept between frames, checksums are not verified
-//! (transmit offload leaves them unset in captures). Reassembly is somebody else's business, and
-//! so is everything that is not UDP over IP: it is named and left alone.
+//! Views only: nothing is copied or kept between frames, and checksums are not verified (transmit
+//! offload leaves them unset in captures). Reassembly happens elsewhere. Packets that are not UDP
+//! over IP are identified and not read.
 //!
-//! A capture may hold less of a frame than was on the wire. Every length reported here is the true
-//! one; the bytes beside it may be fewer.
+//! A capture may hold less of a frame than was on the wire. Every length here is the true one; the
+//! bytes beside it may be fewer.
 
 mod ip;
 
@@ -18,7 +18,7 @@ pub struct Link(pub u16);
 impl Link {
     /// BSD loopback: address family in the byte order of the capturing host.
     pub const NULL: Self = Self(0);
-    /// Ethernet, also what Linux gives for `lo` and for Wi-Fi in managed mode.
+    /// Ethernet; Linux also reports it for `lo` and for Wi-Fi in managed mode.
     pub const ETHERNET: Self = Self(1);
     /// Raw IP as some BSDs number it.
     pub const RAW_BSD: Self = Self(12);
@@ -37,7 +37,7 @@ impl Link {
     /// Linux cooked capture, version 2: with the interface's index.
     pub const LINUX_SLL2: Self = Self(276);
 
-    /// Whether [`parse`] knows this link layer.
+    /// Returns whether [`parse`] supports this link layer.
     #[must_use]
     pub const fn is_supported(self) -> bool {
         matches!(
@@ -56,18 +56,18 @@ impl Link {
     }
 }
 
-/// Whom a frame is for, as Linux says it (`PACKET_*` in `linux/if_packet.h`).
+/// The recipient of a frame, as Linux numbers it (`PACKET_*` in `linux/if_packet.h`).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct PacketType(pub u8);
 
 impl PacketType {
-    /// Addressed to this host. Also what is assumed where the link layer does not say.
+    /// Addressed to this host. The default if the link layer does not carry a type.
     pub const HOST: Self = Self(0);
     /// Link-layer broadcast.
     pub const BROADCAST: Self = Self(1);
     /// Link-layer multicast.
     pub const MULTICAST: Self = Self(2);
-    /// Addressed to somebody else.
+    /// Addressed to another host.
     pub const OTHER_HOST: Self = Self(3);
     /// Sent by this host.
     pub const OUTGOING: Self = Self(4);
@@ -76,11 +76,11 @@ impl PacketType {
 /// One captured frame.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Frame<'a> {
-    /// Index of the interface, where the link header carries it (cooked v2).
+    /// Index of the interface, if the link header carries it (cooked v2).
     pub interface: Option<u32>,
-    /// Direction, where the link header carries it (cooked v1 and v2).
+    /// Direction, if the link header carries it (cooked v1 and v2).
     pub packet_type: PacketType,
-    /// The IP packet; `None` when the frame carries something else (ARP, LLDP, a third tag).
+    /// The IP packet; `None` if the frame carries something else (ARP, LLDP, a third tag).
     pub packet: Option<Packet<'a>>,
 }
 
@@ -91,11 +91,11 @@ pub struct Packet<'a> {
     pub source: [u8; 16],
     /// Destination address; IPv4 as `::ffff:a.b.c.d`.
     pub destination: [u8; 16],
-    /// What it carries.
+    /// Content of the packet.
     pub payload: Payload<'a>,
 }
 
-/// What an IP packet carries.
+/// Content of an IP packet.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Payload<'a> {
     /// A whole UDP datagram.
@@ -113,29 +113,29 @@ pub struct Datagram<'a> {
     pub source_port: u16,
     /// Port it was sent to.
     pub destination_port: u16,
-    /// Payload after the UDP header, as much as was captured.
+    /// Captured bytes of the payload after the UDP header.
     pub payload: &'a [u8],
     /// True length of the payload.
     pub length: u32,
 }
 
-/// A part of a UDP datagram, UDP header included where the part begins at zero.
+/// A part of a UDP datagram. A part at offset zero includes the UDP header.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Fragment<'a> {
-    /// IP identification: what the parts of one datagram have in common (16 bits in IPv4).
+    /// IP identification, shared by the parts of one datagram (16 bits in IPv4).
     pub id: u32,
-    /// Where the part begins, in bytes from the UDP header's start.
+    /// Offset of the part in bytes from the UDP header's start.
     pub offset: u32,
-    /// Whether parts follow; the part without this flag tells the datagram's length.
+    /// Whether parts follow; the end of the last part is the datagram's length.
     pub more: bool,
-    /// The part, as much of it as was captured.
+    /// Captured bytes of the part.
     pub bytes: &'a [u8],
     /// True length of the part.
     pub length: u32,
 }
 
 impl Fragment<'_> {
-    /// Where the next part begins. Never beyond 65535.
+    /// Returns the offset of the next part, at most 65535.
     #[must_use]
     pub const fn end(&self) -> u32 {
         self.offset.saturating_add(self.length)
@@ -148,10 +148,10 @@ const ETHER_TYPE_IPV6: u16 = 0x86dd;
 const ETHER_TYPES_VLAN: [u16; 3] = [0x8100, 0x88a8, 0x9100];
 const MOST_VLAN_TAGS: usize = 2;
 
-/// Reads one frame of a capture. `length` is the frame's length on the wire.
+/// Parses one frame of a capture. `length` is the frame's length on the wire.
 ///
 /// # Errors
-/// A header that is cut off or contradicts itself, or a link layer nobody taught us.
+/// Fails if a header is cut off or contradicts itself, or if the link layer is not supported.
 pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireError> {
     let mut cursor = Cursor::new(bytes, Endianness::Big);
     let length = true_length(bytes, length);
@@ -180,8 +180,8 @@ pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireErr
             network(protocol, cursor, length)?
         }
         Link::NULL | Link::LOOP => {
-            // AF_INET is 2 everywhere; AF_INET6 is 10 on Linux, 24, 28 or 30 on the BSDs. Small
-            // numbers, so the byte order shows by itself.
+            // AF_INET is 2 everywhere; AF_INET6 is 10 on Linux, 24, 28 or 30 on the BSDs. The
+            // numbers are small, so the byte order is unambiguous.
             let family = u32::from_be_bytes(cursor.array("loopback address family")?);
             match family.min(family.swap_bytes()) {
                 2 => Some(ip::v4(cursor, length)?),
@@ -201,15 +201,15 @@ pub fn parse(link: Link, bytes: &[u8], length: u32) -> Result<Frame<'_>, WireErr
     })
 }
 
-/// Reads what an `AF_PACKET` socket of type `SOCK_DGRAM` hands over: no link header, the protocol
+/// Parses a packet of an `AF_PACKET` socket of type `SOCK_DGRAM`: no link header, with the protocol
 /// and the packet type beside it.
 ///
-/// Of a doubly tagged frame the kernel strips the outer tag only. What arrives then begins with the
-/// inner tag, while what is sent begins with the IP header though its protocol names a tag. Since
-/// Linux 6.11 the protocol is the one behind all tags, also where a tag is left.
+/// Of a doubly tagged frame the kernel strips the outer tag only. A received packet then begins
+/// with the inner tag; a sent one begins with the IP header although its protocol names a tag.
+/// Since Linux 6.11 the protocol is the one behind all tags, even if a tag is left.
 ///
 /// # Errors
-/// As [`parse`].
+/// Fails as [`parse`] does.
 pub fn parse_cooked(
     protocol: u16,
     packet_type: PacketType,
@@ -229,9 +229,9 @@ pub fn parse_cooked(
     network(protocol, cursor, length)
 }
 
-/// Whether a tag comes before the packet although `protocol` does not say so: two octets of control
-/// information and the packet's own ether type. What reads so and is no tag is an IPv4 packet of
-/// 2048 octets or an IPv6 packet of more than 24,000.
+/// Returns whether a tag precedes the packet although `protocol` does not announce one: two octets
+/// of control information and the packet's own ether type. Without a tag, only an IPv4 packet of
+/// 2048 octets or an IPv6 packet of more than 24,000 reads the same.
 fn begins_with_unnamed_tag(protocol: u16, bytes: &[u8], length: usize) -> bool {
     const LEAST_AMBIGUOUS: usize = 2048;
     let version = match protocol {
@@ -275,7 +275,7 @@ fn raw(cursor: Cursor<'_>, length: usize) -> Result<Option<Packet<'_>>, WireErro
     }
 }
 
-/// A capture that claims less than it holds is wrong about the claim.
+/// Returns the claimed length, or the captured length if the claim is smaller and so wrong.
 fn true_length(bytes: &[u8], length: u32) -> usize {
     usize::try_from(length)
         .unwrap_or(usize::MAX)

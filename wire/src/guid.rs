@@ -1,7 +1,7 @@
-//! Identities on the wire: who sent it, which endpoint of theirs, for whom.
+//! Identities on the wire: GUIDs of participants and endpoints.
 //!
 //! RTPS 2.5, 9.3.1: a GUID is a 12-byte participant prefix and a 4-byte entity id, both in wire
-//! order whatever the submessage's endianness says.
+//! order regardless of the submessage's endianness.
 
 use core::fmt;
 
@@ -70,26 +70,27 @@ impl EntityId {
     /// Secure variant of [`Self::SEDP_SUBSCRIPTIONS_WRITER`].
     pub const SEDP_SUBSCRIPTIONS_SECURE_WRITER: Self = Self([0xff, 0x00, 0x04, 0xc2]);
 
-    /// Builtin (discovery, liveliness, security) or vendor entity rather than the user's.
+    /// Returns whether it is a builtin (discovery, liveliness, security) or vendor entity, not the
+    /// user's.
     #[must_use]
     pub const fn is_builtin(self) -> bool {
         self.0[3] & 0xc0 != 0
     }
 
-    /// Writer by its kind octet (with or without key), whatever its origin.
+    /// Returns whether its kind octet is a writer's (with or without key), of any origin.
     #[must_use]
     pub const fn is_writer(self) -> bool {
         matches!(self.0[3] & 0x3f, 0x02 | 0x03)
     }
 
-    /// Reader by its kind octet (with or without key), whatever its origin.
+    /// Returns whether its kind octet is a reader's (with or without key), of any origin.
     #[must_use]
     pub const fn is_reader(self) -> bool {
         matches!(self.0[3] & 0x3f, 0x04 | 0x07)
     }
 }
 
-/// A participant or endpoint; ROS calls it GID.
+/// Identity of a participant or endpoint; ROS calls it GID.
 #[derive(
     Clone,
     Copy,
@@ -107,26 +108,26 @@ impl EntityId {
 )]
 #[repr(C)]
 pub struct Guid {
-    /// The participant.
+    /// The participant's prefix.
     pub prefix: GuidPrefix,
-    /// The entity within it.
+    /// The entity within the participant.
     pub entity: EntityId,
 }
 
 impl Guid {
-    /// From its parts.
+    /// Combines a prefix and an entity id.
     #[must_use]
     pub const fn new(prefix: GuidPrefix, entity: EntityId) -> Self {
         Self { prefix, entity }
     }
 
-    /// From the 16 bytes as they stand in a parameter or a key hash.
+    /// Converts from 16 bytes in wire order, as in a parameter or a key hash.
     #[must_use]
     pub fn from_bytes(bytes: [u8; 16]) -> Self {
         zerocopy::transmute!(bytes)
     }
 
-    /// The 16 bytes in wire order.
+    /// Returns the 16 bytes in wire order.
     #[must_use]
     pub fn to_bytes(self) -> [u8; 16] {
         zerocopy::transmute!(self)
@@ -145,7 +146,7 @@ impl fmt::Display for EntityId {
     }
 }
 
-/// Prefix and entity id in hex, joined by a dot.
+/// Formats prefix and entity id in hex, joined by a dot.
 impl fmt::Display for Guid {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}.{}", self.prefix, self.entity)

@@ -1,8 +1,8 @@
-//! What the host hook gives user space besides records: captured datagrams in pieces, and what it
-//! knows of the sockets that receive and send them.
+//! Output of the host hook besides records: captured datagrams in pieces, and the sockets that
+//! receive and send them.
 //!
-//! Shared binary layout with the kernel program. Words are in the host's byte order except where
-//! they hold wire bytes (addresses).
+//! Shared binary layout with the kernel program. Words are in the host's byte order unless they
+//! hold wire bytes (addresses).
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -11,9 +11,9 @@ pub const PIECE_BYTES: u32 = 16_384;
 /// Sockets that the hook remembers.
 pub const SOCKET_CAPACITY: u32 = 4_096;
 
-/// One piece of a captured datagram; the bytes follow. Pieces of one datagram come in order of
-/// their offset and bear the same token; other datagrams' pieces may lie between them. A datagram
-/// whose last piece does not come lacked room in the ring.
+/// One piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in order of
+/// their offset with the same token; pieces of other datagrams may lie between them. If the last
+/// piece is missing, the ring was full.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -25,7 +25,7 @@ pub struct Piece {
     pub socket: u64,
     /// Source address, 16 wire bytes, IPv4-mapped for IPv4.
     pub source: [u32; 4],
-    /// Destination address likewise.
+    /// Destination address, in the same form.
     pub destination: [u32; 4],
     /// Source UDP port.
     pub source_port: u16,
@@ -33,13 +33,13 @@ pub struct Piece {
     pub destination_port: u16,
     /// Interface index in the socket's network namespace.
     pub interface: u32,
-    /// Names the datagram among those of the last seconds, as [`crate::Record::datagram`] does.
+    /// Token of the datagram, unique for some seconds, as in [`crate::Record::datagram`].
     pub datagram: u32,
     /// Length of the whole UDP payload.
     pub datagram_len: u32,
-    /// Where in the UDP payload this piece belongs.
+    /// Offset of this piece in the UDP payload.
     pub offset: u32,
-    /// Bytes that follow, at most [`PIECE_BYTES`].
+    /// Number of bytes that follow, at most [`PIECE_BYTES`].
     pub len: u32,
     /// Bits of [`crate::record::flag`].
     pub flags: u16,
@@ -49,7 +49,7 @@ pub struct Piece {
 
 const _: () = assert!(size_of::<Piece>() == 80 && align_of::<Piece>() == 8);
 
-/// What the hook knows of a socket, by cookie.
+/// State of a socket, by cookie.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -57,7 +57,7 @@ const _: () = assert!(size_of::<Piece>() == 80 && align_of::<Piece>() == 8);
 pub struct Socket {
     /// Id of the cgroup it was created in: the inode of that cgroup's directory.
     pub cgroup: u64,
-    /// Datagrams that it had no room for, RTPS or not.
+    /// Datagrams dropped at its full buffer, RTPS or not.
     pub no_room: u64,
 }
 
@@ -73,24 +73,24 @@ pub struct Owner {
     pub inode: u64,
     /// Datagrams that the socket has dropped, as `/proc/net/udp` shows them.
     pub drops: u32,
-    /// Zero where the kernel does not say where it counts `drops`.
+    /// Zero if the location of the kernel's drop counter is unknown.
     pub drops_known: u32,
-    /// Process id as the host's first process sees it.
+    /// Process id in the initial PID namespace.
     pub process_id: u32,
-    /// Process id as the process itself sees it: another one in a container.
+    /// Process id in the process's own PID namespace, which differs in a container.
     pub own_process_id: u32,
-    /// Name of the process, filled up with zeros.
+    /// Name of the process, padded with zeros.
     pub name: [u8; 16],
 }
 
 const _: () = assert!(size_of::<Owner>() == 48 && align_of::<Owner>() == 8);
 
-/// Places in the running kernel's types that the programs read, by index in their `LAYOUT` array:
-/// offsets of members in bytes, enumerators. Filled in by the loader.
+/// Members of the running kernel's types that the programs read, as indices of their `LAYOUT`
+/// array, which the loader fills with byte offsets and enumerators.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Layout {
-    /// `sk_buff.head`, where a packet's bytes begin.
+    /// `sk_buff.head`, the start of a packet's bytes.
     BufferHead = 0,
     /// `sk_buff.tail`: bytes from the head to the end of the linear part.
     BufferTail,
@@ -98,7 +98,7 @@ pub enum Layout {
     BufferNetworkHeader,
     /// `sk_buff.transport_header`: bytes from the head to the UDP header.
     BufferTransportHeader,
-    /// `sk_buff.skb_iif`: the interface it came in on.
+    /// `sk_buff.skb_iif`: the receiving interface.
     BufferInterface,
     /// `SKB_DROP_REASON_SOCKET_RCVBUFF`.
     ReasonBufferFull,
@@ -114,25 +114,25 @@ pub enum Layout {
     BufferDevice,
     /// `net_device.nd_net`: its network namespace.
     DeviceNamespace,
-    /// `net.ipv4.fqdir`: all fragments over IPv4 that wait in a network namespace.
+    /// `net.ipv4.fqdir`: the incomplete IPv4 datagrams of a network namespace.
     NamespaceFragments4,
-    /// `net.ipv6.fqdir`.
+    /// `net.ipv6.fqdir`: the same for IPv6.
     NamespaceFragments6,
-    /// `fqdir.mem`: bytes that they take.
+    /// `fqdir.mem`: bytes in use for fragments.
     FragmentsMemory,
-    /// `fqdir.high_thresh`: bytes that they may take.
+    /// `fqdir.high_thresh`: limit of those bytes.
     FragmentsLimit,
     /// `sock.__sk_common.skc_cookie`.
     SocketCookie,
     /// `sock.sk_drops`.
     SocketDrops,
-    /// `sock.sk_drop_counters`, instead of the former where it is not null (Linux 6.18).
+    /// `sock.sk_drop_counters`, used instead of `sk_drops` if it is not null (Linux 6.18).
     SocketDropCounters,
     /// Bytes between the two counters of `numa_drop_counters`.
     SecondDropCounter,
     /// `file.f_inode`.
     FileInode,
-    /// `file.private_data`: of a socket's file, the `socket`.
+    /// `file.private_data`: the `socket` of a socket's file.
     FilePrivate,
     /// `inode.i_mode`.
     InodeMode,
@@ -150,7 +150,7 @@ pub enum Layout {
     TaskName,
     /// `task_struct.thread_pid`.
     TaskPid,
-    /// `pid.level`: how many process id namespaces lie above its own.
+    /// `pid.level`: nesting depth of its PID namespace.
     PidLevel,
     /// `pid.numbers[0].nr`.
     PidNumbers,
@@ -159,8 +159,8 @@ pub enum Layout {
 }
 
 impl Layout {
-    /// How many places there are.
+    /// Number of entries.
     pub const COUNT: usize = Self::PidNumberSize as usize + 1;
-    /// What the running kernel does not have, or does not tell.
+    /// Marks a member that the running kernel does not have or does not describe.
     pub const ABSENT: u32 = u32::MAX;
 }

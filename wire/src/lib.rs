@@ -1,8 +1,8 @@
-//! RTPS as ROS 2 speaks it, read without joining: zero-copy, bounded parsers, the walk that decides
-//! what the kernel filter keeps, and the layout of what kernel and user space exchange.
+//! RTPS as ROS 2 uses it, read without joining: zero-copy, bounded parsers, the walk that decides
+//! what the kernel filter keeps, and the binary layouts shared by kernel and user space.
 //!
-//! No I/O, no clock, no log, no `unsafe`: bytes and a caller-given time in, typed values out.
-//! The kernel program builds this crate without `alloc`.
+//! No I/O, no clock, no log, no `unsafe`: bytes and a caller-given time in, typed values out. The
+//! kernel program builds this crate without `alloc`.
 
 #![no_std]
 #![forbid(unsafe_code)]
@@ -11,7 +11,7 @@
 extern crate alloc;
 #[cfg(test)]
 extern crate std;
-// The oracle is included by tests here and elsewhere: it names this crate from outside.
+// The oracle is also included by tests of other crates, so it refers to this crate by name.
 #[cfg(test)]
 extern crate self as ros2probe_wire;
 

@@ -1,9 +1,9 @@
 //! ROS names and their DDS forms.
 //!
-//! The mapping of the ROS 2 design article 140, as `rmw_fastrtps` and `rmw_cyclonedds` implement
-//! it. ROS names and DDS names are different types, so that neither is used for the other; once
-//! they exist, all of them are plain text of at most [`MAX_LEN`] bytes. Nothing here judges whether
-//! a name is a *valid* ROS name: what is on the wire is shown.
+//! The mapping follows the ROS 2 design article 140, as `rmw_fastrtps` and `rmw_cyclonedds`
+//! implement it. ROS names and DDS names are different types, so neither can replace the other by
+//! mistake. All are plain text of at most [`MAX_LEN`] bytes. This module does not check whether a
+//! name is a *valid* ROS name: it shows what is on the wire.
 
 use alloc::borrow::ToOwned;
 use alloc::boxed::Box;
@@ -15,11 +15,11 @@ use core::fmt;
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::text;
 
-/// Longest name kept, in bytes. The mapping allows 256 characters; four times that is somebody
-/// else's DDS at best.
+/// Longest name kept, in bytes. The mapping allows 256 characters; a name four times as long is not
+/// ROS.
 pub const MAX_LEN: usize = 1024;
 
-/// A name of one kind, so that two kinds cannot be mixed up.
+/// Defines a name type, so that kinds of names cannot be mixed up.
 macro_rules! name {
     ($(#[$doc:meta])* $name:ident, $what:literal) => {
         $(#[$doc])*
@@ -27,11 +27,12 @@ macro_rules! name {
         pub struct $name(Box<str>);
 
         impl $name {
-            /// From text that is not empty, not longer than [`MAX_LEN`] and plain: no control
+            /// Parses text that is not empty, at most [`MAX_LEN`] bytes long and plain: no control
             /// characters, quotation marks or backslashes.
             ///
             /// # Errors
-            /// [`Reason::BadValue`], [`Reason::OverLimit`], [`Reason::BadText`], in this order.
+            /// Returns [`Reason::BadValue`], [`Reason::OverLimit`] or [`Reason::BadText`], in this
+            /// order.
             pub fn parse(text: &str) -> Result<Self, WireError> {
                 let reason = if text.is_empty() {
                     Reason::BadValue
@@ -45,7 +46,7 @@ macro_rules! name {
                 Err(WireError { what: $what, offset: 0, reason })
             }
 
-            /// As text.
+            /// Returns the name as text.
             #[must_use]
             pub fn as_str(&self) -> &str {
                 &self.0
@@ -89,15 +90,15 @@ name!(
     RosType, "ROS type"
 );
 
-/// What a DDS topic is to ROS.
+/// The role of a DDS topic in ROS.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Demangled {
-    /// A topic, also one that belongs to an action or a service's introspection.
+    /// A topic, including those of an action or of service introspection.
     Topic(RosName),
     /// `_buf_cpu` beside a topic (`rmw_fastrtps` 9.4.6 and later): the topic's messages for
-    /// subscribers that know buffers. The name is the topic's.
+    /// subscribers that support buffers. Holds the topic's name.
     CpuBuffer(RosName),
-    /// `_buf/<subscriber>` beside a topic: references to buffers, not CDR. The name is the topic's.
+    /// `_buf/<subscriber>` beside a topic: references to buffers, not CDR. Holds the topic's name.
     Buffer(RosName),
     /// Requests of a service.
     ServiceRequest(RosName),
@@ -105,12 +106,12 @@ pub enum Demangled {
     ServiceReply(RosName),
     /// `ros_discovery_info`.
     RosDiscovery,
-    /// Not made by ROS, or with `avoid_ros_namespace_conventions`.
+    /// Not created by ROS, or with `avoid_ros_namespace_conventions`.
     NotRos,
 }
 
 impl Demangled {
-    /// The ROS topic the samples belong to; `None` for services and what is not ROS.
+    /// Returns the ROS topic of the samples; `None` for services and topics outside of ROS.
     #[must_use]
     pub const fn topic(&self) -> Option<&RosName> {
         match self {
@@ -119,7 +120,7 @@ impl Demangled {
         }
     }
 
-    /// The service the samples belong to.
+    /// Returns the service of the samples.
     #[must_use]
     pub const fn service(&self) -> Option<&RosName> {
         match self {
@@ -134,14 +135,14 @@ const REQUEST: &str = "Request";
 const REPLY: &str = "Reply";
 
 impl DdsTopic {
-    /// From `PID_TOPIC_NAME`.
+    /// Reads `PID_TOPIC_NAME`.
     pub(crate) fn read(value: &mut Cursor<'_>) -> Result<Self, WireError> {
         let offset = value.offset();
         let text = text::string(value, "PID_TOPIC_NAME", MAX_LEN)?;
         Self::parse(text).map_err(|error| WireError { offset, ..error })
     }
 
-    /// What it is to ROS.
+    /// Returns the topic's role in ROS.
     #[must_use]
     pub fn demangle(&self) -> Demangled {
         let ros = |text: &str| RosName(text.into());
@@ -170,26 +171,26 @@ impl DdsTopic {
         }
     }
 
-    /// The DDS topic of a ROS topic.
+    /// Returns the DDS topic of a ROS topic.
     #[must_use]
     pub fn of_topic(topic: &RosName) -> Self {
         Self(format!("rt{topic}").into())
     }
 
-    /// The DDS topic of a service's requests.
+    /// Returns the DDS topic of a service's requests.
     #[must_use]
     pub fn of_requests(service: &RosName) -> Self {
         Self(format!("rq{service}{REQUEST}").into())
     }
 
-    /// The DDS topic of a service's replies.
+    /// Returns the DDS topic of a service's replies.
     #[must_use]
     pub fn of_replies(service: &RosName) -> Self {
         Self(format!("rr{service}{REPLY}").into())
     }
 }
 
-/// The topic a buffer topic stands beside, and whether it is the CPU one.
+/// Returns the topic that a buffer topic belongs to, and whether it is the CPU one.
 fn buffer_base(name: &str) -> Option<(&str, bool)> {
     if let Some(base) = name
         .strip_suffix("/_buf_cpu")
@@ -202,7 +203,7 @@ fn buffer_base(name: &str) -> Option<(&str, bool)> {
     (is_gid && !base.is_empty()).then_some((base, false))
 }
 
-/// Which part of an action a topic or service is.
+/// The part of an action that a topic or service implements.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum ActionPart {
     /// Service `send_goal`.
@@ -218,13 +219,14 @@ pub enum ActionPart {
 }
 
 impl RosName {
-    /// Whether any token begins with an underscore: `ros2` lists such names only when asked.
+    /// Returns whether any token begins with an underscore: `ros2` lists such names only on
+    /// request.
     #[must_use]
     pub fn is_hidden(&self) -> bool {
         self.as_str().split('/').any(|token| token.starts_with('_'))
     }
 
-    /// The action this topic or service belongs to.
+    /// Returns the action that this topic or service belongs to.
     #[must_use]
     pub fn action(&self) -> Option<(Self, ActionPart)> {
         let (action, part) = self.as_str().rsplit_once("/_action/")?;
@@ -239,7 +241,7 @@ impl RosName {
         (!action.is_empty()).then(|| (Self(action.into()), part))
     }
 
-    /// The service whose introspection events this topic carries.
+    /// Returns the service whose introspection events this topic carries.
     #[must_use]
     pub fn service_of_events(&self) -> Option<Self> {
         let service = self.as_str().strip_suffix("/_service_event")?;
@@ -248,21 +250,21 @@ impl RosName {
 }
 
 impl DdsType {
-    /// From `PID_TYPE_NAME`.
+    /// Reads `PID_TYPE_NAME`.
     pub(crate) fn read(value: &mut Cursor<'_>) -> Result<Self, WireError> {
         let offset = value.offset();
         let text = text::string(value, "PID_TYPE_NAME", MAX_LEN)?;
         Self::parse(text).map_err(|error| WireError { offset, ..error })
     }
 
-    /// The ROS type; what is not ROS's stays as it is.
+    /// Returns the ROS type; a type from outside of ROS is unchanged.
     #[must_use]
     pub fn message(&self) -> RosType {
         let text = self.demangled().unwrap_or_else(|| self.as_str().to_owned());
         RosType(text.into())
     }
 
-    /// The service's type from that of its requests or replies.
+    /// Returns the service's type, given that of its requests or replies.
     #[must_use]
     pub fn service(&self) -> RosType {
         let message = self.message();
@@ -273,8 +275,8 @@ impl DdsType {
         service.map_or_else(|| message.clone(), |service| RosType(service.into()))
     }
 
-    /// The action's type from that of any of its parts; `None` for the parts whose type says
-    /// nothing about the action (`cancel_goal`, `status`).
+    /// Returns the action's type, given that of one of its parts; `None` for the parts with a
+    /// generic type (`cancel_goal`, `status`).
     #[must_use]
     pub fn action(&self) -> Option<RosType> {
         const SUFFIXES: [&str; 5] = [
@@ -343,7 +345,7 @@ mod tests {
         ] {
             assert_eq!(demangle(name), Demangled::NotRos, "{name}");
         }
-        // A character boundary that is not at two bytes.
+        // The second byte is not a character boundary.
         assert_eq!(demangle("€t/a"), Demangled::NotRos);
     }
 

@@ -1,8 +1,8 @@
 //! Parameter lists (RTPS 2.5, 9.4.2.11 and 9.6.4): the form of inline QoS and of discovery data.
 //!
-//! An iterator over borrowed bytes. Unknown parameters are handed on with their length; whether
-//! they matter is the reader's business. "Must understand" is shown but never a reason to drop: an
-//! observer would rather see a participant partly than not at all.
+//! An iterator over borrowed bytes. It yields unknown parameters with their length; the caller
+//! decides whether they matter. "Must understand" is exposed but never a reason to reject a list:
+//! an observer prefers a partial participant to none.
 
 use core::fmt;
 
@@ -60,26 +60,27 @@ impl ParameterId {
     pub const ENDPOINT_SECURITY_INFO: Self = Self(0x1004);
     pub const PARTICIPANT_SECURITY_INFO: Self = Self(0x1005);
 
-    /// eProsima's; Cyclone DDS has no parameter of this number, ADLINK's stack had none either.
+    /// eProsima's; neither Cyclone DDS nor ADLINK's stack uses this number.
     pub const FAST_DATASHARING: Self = Self(0x8006);
-    /// eProsima's; for Cyclone DDS the same number is the subscription keys.
+    /// eProsima's; Cyclone DDS uses the same number for subscription keys.
     pub const FAST_RELATED_SAMPLE_IDENTITY: Self = Self(0x800f);
 }
 
 impl ParameterId {
-    /// Means something only together with the vendor.
+    /// Returns whether the meaning depends on the vendor.
     #[must_use]
     pub const fn is_vendor_specific(self) -> bool {
         self.0 & 0x8000 != 0
     }
 
-    /// Whoever does not know it should not use the list.
+    /// Returns the must-understand bit: a reader that does not know the parameter should ignore the
+    /// list.
     #[must_use]
     pub const fn must_understand(self) -> bool {
         self.0 & 0x4000 != 0
     }
 
-    /// Without the must-understand bit: the form to compare with the constants.
+    /// Returns the identifier without the must-understand bit, for comparison with the constants.
     #[must_use]
     pub const fn known(self) -> Self {
         Self(self.0 & !0x4000)
@@ -95,13 +96,13 @@ impl fmt::Debug for ParameterId {
 /// One parameter.
 #[derive(Clone, Copy, Debug)]
 pub struct Parameter<'a> {
-    /// Which one.
+    /// Identifier of the parameter.
     pub id: ParameterId,
-    /// Its value, exactly as long as the list says.
+    /// Its value, limited to the length in the list.
     pub value: Cursor<'a>,
 }
 
-/// A list of parameters; iterates over all but PAD and SENTINEL, ends after the first error.
+/// A list of parameters; iterates over all but PAD and SENTINEL, and ends after the first error.
 #[derive(Clone, Copy, Debug)]
 pub struct ParameterList<'a> {
     rest: Cursor<'a>,
@@ -110,7 +111,7 @@ pub struct ParameterList<'a> {
 }
 
 impl<'a> ParameterList<'a> {
-    /// Over bytes without encapsulation, as in inline QoS. The sentinel has to be there.
+    /// Wraps bytes without encapsulation, as in inline QoS. The sentinel is required.
     #[must_use]
     pub const fn inline(rest: Cursor<'a>) -> Self {
         Self {
@@ -120,16 +121,16 @@ impl<'a> ParameterList<'a> {
         }
     }
 
-    /// Over a serialized payload: checks its encapsulation (RTPS 2.5, 10.5). A list that ends
-    /// cleanly at the payload's end needs no sentinel.
+    /// Wraps a serialized payload and checks its encapsulation (RTPS 2.5, 10.5). A list that ends
+    /// exactly at the payload's end needs no sentinel.
     ///
     /// # Errors
-    /// [`Reason::BadMarker`] when the payload is not a parameter list.
+    /// Returns [`Reason::BadMarker`] if the payload is not a parameter list.
     pub fn encapsulated(payload: &'a [u8]) -> Result<Self, WireError> {
         let mut cursor = Cursor::new(payload, Endianness::Big);
         let error = cursor.error("encapsulation", Reason::BadMarker);
         let endianness = match cursor.u16("encapsulation")? {
-            // PL_CDR; PL_CDR2 is let through, for builtin topics it names the same form.
+            // PL_CDR. PL_CDR2 is accepted too: builtin topics have the same form under it.
             0x0002 | 0x000a => Endianness::Big,
             0x0003 | 0x000b => Endianness::Little,
             _ => return Err(error),
@@ -143,10 +144,10 @@ impl<'a> ParameterList<'a> {
         })
     }
 
-    /// Value of the first parameter of this identifier.
+    /// Returns the value of the first parameter with this identifier.
     ///
     /// # Errors
-    /// The list breaks off before it.
+    /// Fails if the list breaks off before it.
     pub fn find(self, id: ParameterId) -> Result<Option<Cursor<'a>>, WireError> {
         for parameter in self {
             let parameter = parameter?;
@@ -168,7 +169,7 @@ impl<'a> ParameterList<'a> {
                 return Ok(None);
             }
             let value = self.rest.sub("parameter", length)?;
-            // Lengths are multiples of four; whoever writes another one pads.
+            // Lengths are multiples of four; a writer with another length pads.
             self.rest
                 .take("parameter padding", length.wrapping_neg() & 3)?;
             if id.known() != ParameterId::PAD {

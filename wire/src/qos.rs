@@ -1,7 +1,7 @@
 //! Quality of service of endpoints, as discovery announces it.
 //!
-//! Absent means a default, and the defaults differ by role (DDS 1.4, 2.2.3): one table for both is
-//! wrong. What an implementation never announces is unknown, not a default.
+//! An absent policy has a default that depends on the role (DDS 1.4, 2.2.3), so one table for both
+//! is wrong. A policy that an implementation never announces is unknown, not a default.
 
 use alloc::boxed::Box;
 use alloc::vec::Vec;
@@ -13,7 +13,7 @@ use crate::rtps::VendorId;
 use crate::text;
 use crate::time::Duration;
 
-/// Which end an endpoint is.
+/// The side of an endpoint.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub enum Role {
     /// Publishes.
@@ -22,7 +22,7 @@ pub enum Role {
     Reader,
 }
 
-/// A policy's kind with the words ROS has for its values; an unknown value keeps its number.
+/// Defines a policy's kind with ROS's words for its values; an unknown value keeps its number.
 macro_rules! kind {
     ($(#[$doc:meta])* $name:ident { $($constant:ident = $value:literal),+ $(,)? }) => {
         $(#[$doc])*
@@ -33,7 +33,7 @@ macro_rules! kind {
         impl $name {
             $(pub const $constant: Self = Self($value);)+
 
-            /// The word ROS has for it; `None` for a value it does not know.
+            /// Returns ROS's word for the value; `None` for a value that ROS does not know.
             #[must_use]
             pub const fn name(self) -> Option<&'static str> {
                 match self {
@@ -52,7 +52,7 @@ macro_rules! kind {
             }
         }
 
-        /// `UNKNOWN` for a value ROS has no word for.
+        /// Formats a value without a ROS word as `UNKNOWN`.
         impl fmt::Display for $name {
             fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.pad(self.label())
@@ -62,16 +62,16 @@ macro_rules! kind {
 }
 
 kind!(
-    /// Wire values: alone among the policies this one counts from 1 (RTPS 2.5, 9.4.2.11.2; Fast
+    /// Wire values: unlike the other policies, this one counts from 1 (RTPS 2.5, 9.4.2.11.2; Fast
     /// DDS and Cyclone DDS agree).
     Reliability { BEST_EFFORT = 1, RELIABLE = 2 }
 );
 kind!(
-    /// How long samples live on for late joiners.
+    /// How long a writer keeps samples for late joiners.
     Durability { VOLATILE = 0, TRANSIENT_LOCAL = 1, TRANSIENT = 2, PERSISTENT = 3 }
 );
 kind!(
-    /// Who says that a writer is alive.
+    /// How a writer's liveliness is asserted.
     Liveliness { AUTOMATIC = 0, MANUAL_BY_PARTICIPANT = 1, MANUAL_BY_TOPIC = 2 }
 );
 kind!(
@@ -79,28 +79,28 @@ kind!(
     Ownership { SHARED = 0, EXCLUSIVE = 1 }
 );
 kind!(
-    /// By whose clock samples of several writers are put in order.
+    /// The clock that orders samples of several writers.
     DestinationOrder { BY_RECEPTION_TIMESTAMP = 0, BY_SOURCE_TIMESTAMP = 1 }
 );
 kind!(
-    /// How far changes belong together, narrowest first.
+    /// Scope in which changes are presented together, narrowest first.
     AccessScope { INSTANCE = 0, TOPIC = 1, GROUP = 2 }
 );
 kind!(
-    /// How many samples are kept.
+    /// Number of samples kept.
     HistoryKind { KEEP_LAST = 0, KEEP_ALL = 1 }
 );
 
 /// History policy.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct History {
-    /// All or the last ones.
+    /// Keep all samples or the last ones.
     pub kind: HistoryKind,
-    /// How many, for [`HistoryKind::KEEP_LAST`].
+    /// Number of samples, for [`HistoryKind::KEEP_LAST`].
     pub depth: i32,
 }
 
-/// As ROS says it: `KEEP_LAST (10)`, `KEEP_ALL`.
+/// Formats as ROS does: `KEEP_LAST (10)`, `KEEP_ALL`.
 impl fmt::Display for History {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.kind {
@@ -113,15 +113,15 @@ impl fmt::Display for History {
 /// How changes to several instances are presented together.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Presentation {
-    /// How far they belong together.
+    /// Scope in which changes belong together.
     pub access_scope: AccessScope,
-    /// All or none.
+    /// Whether a coherent set is presented whole or not at all.
     pub is_coherent: bool,
-    /// In the order of writing.
+    /// Whether changes are presented in the order of writing.
     pub is_ordered: bool,
 }
 
-/// How samples are encoded (XTypes 1.3, 7.6.3.1.1).
+/// Encoding of samples (XTypes 1.3, 7.6.3.1.1).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct DataRepresentation(pub i16);
 
@@ -132,25 +132,25 @@ impl DataRepresentation {
     pub const XCDR2: Self = Self(2);
 }
 
-/// Most representations kept of one endpoint; there are three.
+/// Most representations kept per endpoint; three are defined.
 const MAX_REPRESENTATIONS: u32 = 8;
-/// Most partitions kept of one endpoint; ROS 2 uses none.
+/// Most partitions kept per endpoint; ROS 2 uses none.
 const MAX_PARTITIONS: usize = 16;
 /// Longest partition name kept.
 const MAX_PARTITION_LEN: usize = 256;
 
-/// What an endpoint offers or asks for.
+/// The policies that an endpoint offers or requests.
 #[derive(Clone, PartialEq, Eq, Hash, Debug)]
 pub struct Qos {
     /// Reliability.
     pub reliability: Reliability,
     /// Durability.
     pub durability: Durability,
-    /// History; `None` where the implementation does not say (Fast DDS before 3.2).
+    /// History; `None` if the implementation does not announce it (Fast DDS before 3.2).
     pub history: Option<History>,
     /// Longest time between two samples.
     pub deadline: Duration,
-    /// Age at which samples become void; writers only.
+    /// Age at which samples expire; writers only.
     pub lifespan: Duration,
     /// Liveliness.
     pub liveliness: Liveliness,
@@ -158,22 +158,22 @@ pub struct Qos {
     pub liveliness_lease: Duration,
     /// Ownership.
     pub ownership: Ownership,
-    /// Least time between two samples a reader wants to see.
+    /// Least time between two samples that a reader accepts.
     pub minimum_separation: Duration,
-    /// Delay that may be added to save work.
+    /// Delay that the implementation may add to save work.
     pub latency_budget: Duration,
-    /// Order of several writers' samples.
+    /// Order of samples of several writers.
     pub destination_order: DestinationOrder,
-    /// What is presented together.
+    /// Presentation of coherent sets.
     pub presentation: Presentation,
-    /// A writer uses the first, a reader accepts any; empty is XCDR1.
+    /// Data representations: a writer uses the first, a reader accepts any; empty is XCDR1.
     pub representations: Vec<DataRepresentation>,
     /// Partitions; empty is the default one.
     pub partitions: Vec<Box<str>>,
 }
 
 impl Qos {
-    /// What holds for every policy that is not announced.
+    /// Returns the defaults of all policies for a role and vendor.
     #[must_use]
     pub const fn defaults(role: Role, vendor: VendorId) -> Self {
         Self {
@@ -182,7 +182,7 @@ impl Qos {
                 Role::Reader => Reliability::BEST_EFFORT,
             },
             durability: Durability::VOLATILE,
-            // Not part of the specification's discovery data. Cyclone DDS announces it when it
+            // Not part of the specification's discovery data. Cyclone DDS announces it if it
             // differs from KEEP_LAST 1; Fast DDS 2.x never does, 3.2 and later always.
             history: match vendor {
                 VendorId::CYCLONE => Some(History {
@@ -209,7 +209,7 @@ impl Qos {
         }
     }
 
-    /// Takes one parameter over; `false` when it is not a QoS policy kept here.
+    /// Applies one parameter; returns `false` if it is not a QoS policy kept here.
     pub(crate) fn apply(
         &mut self,
         id: ParameterId,
@@ -217,7 +217,7 @@ impl Qos {
     ) -> Result<bool, WireError> {
         match id {
             ParameterId::RELIABILITY => {
-                // Old texts had 3 for reliable.
+                // Old versions of the specification had 3 for reliable.
                 self.reliability = match value.u32("PID_RELIABILITY")? {
                     3 => Reliability::RELIABLE,
                     kind => Reliability(kind),
@@ -263,7 +263,7 @@ impl Qos {
     }
 }
 
-/// Seconds and 2^-32 fractions.
+/// Reads seconds and 2^-32 fractions.
 pub(crate) fn duration(value: &mut Cursor<'_>, what: &'static str) -> Result<Duration, WireError> {
     let seconds = value.i32(what)?;
     Ok(Duration::from_wire(seconds, value.u32(what)?))
@@ -282,7 +282,7 @@ fn partitions(value: &mut Cursor<'_>) -> Result<Vec<Box<str>>, WireError> {
     Ok(partitions)
 }
 
-/// The first ones: what is beyond the limit says nothing new.
+/// Reads the first representations; those beyond the limit are redundant.
 fn representations(value: &mut Cursor<'_>) -> Result<Vec<DataRepresentation>, WireError> {
     let count = value.u32("PID_DATA_REPRESENTATION")?;
     let mut representations = Vec::new();

@@ -1,11 +1,11 @@
-//! What the kernel filter tells user space about one submessage: the shared binary layout.
+//! The kernel filter's report of one submessage: the binary layout shared with user space.
 //!
-//! The same [`Record`]s come out of the kernel's ring buffer and out of the user-space walk over
-//! captured, replayed or shared-memory datagrams; the model cannot tell the difference. Words are
-//! in the host's byte order except where they hold wire bytes (GUIDs, addresses).
+//! The kernel's ring buffer and the user-space walk over captured, replayed or shared-memory
+//! datagrams yield the same [`Record`]s; the model does not distinguish them. Words are in the
+//! host's byte order unless they hold wire bytes (GUIDs, addresses).
 //!
-//! The kinds share the words of a record. [`Record::body`] reads them as the kind has it; only the
-//! walk and the kernel program, which write them, use the fields themselves.
+//! All kinds share the words of a record. [`Record::body`] reads them according to the kind; only
+//! the walk and the kernel program, which write them, use the fields directly.
 
 mod body;
 
@@ -16,77 +16,75 @@ use crate::time::{RtpsTime, Timestamp};
 
 pub use body::{AckNack, Body, Data, DataFrag, Gap, Heartbeat, Sample, SequenceNumberSet};
 
-/// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and the two that only this ABI knows.
+/// Submessage kinds (RTPS 2.5, 9.4.5.1.1) and those specific to this ABI.
 pub mod kind {
     use crate::rtps::SubmessageId;
 
-    /// ACKNACK: reader acknowledges and asks again.
+    /// ACKNACK: a reader acknowledges samples and requests missing ones.
     pub const ACKNACK: u8 = SubmessageId::ACKNACK.0;
-    /// HEARTBEAT: writer says what it has.
+    /// HEARTBEAT: a writer announces the samples that it has.
     pub const HEARTBEAT: u8 = SubmessageId::HEARTBEAT.0;
-    /// GAP: writer says what will never come.
+    /// GAP: a writer announces samples that it will not send.
     pub const GAP: u8 = SubmessageId::GAP.0;
     /// DATA: one sample.
     pub const DATA: u8 = SubmessageId::DATA.0;
     /// DATA_FRAG: some fragments of one sample.
     pub const DATA_FRAG: u8 = SubmessageId::DATA_FRAG.0;
-    /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, all
-    /// records that were sent ahead for it now count.
+    /// Not a submessage: the fragmented datagram [`super::Record::datagram`] is complete, and all
+    /// records written ahead for it are valid.
     pub const COMPLETE: u8 = 0xf0;
-    /// Not a submessage: from `offset` on, user space has to walk this fragmented datagram itself;
-    /// its remaining IP fragments are captured. See [`super::Record::handover`].
+    /// Not a submessage: user space must walk this fragmented datagram itself from `offset`; its
+    /// remaining IP fragments are captured. See [`super::Record::handover`].
     pub const HANDOVER: u8 = 0xf1;
-    /// Not a submessage: the captured datagram [`super::Record::datagram`] was not delivered to
-    /// [`super::Record::socket`], which had no room for it.
+    /// Not a submessage: the captured datagram [`super::Record::datagram`] was dropped at the full
+    /// buffer of [`super::Record::socket`].
     pub const UNDELIVERED: u8 = 0xf2;
 }
 
 /// Bits of [`Record::flags`].
 pub mod flag {
-    /// The datagram came in several IP fragments.
+    /// The datagram arrived in several IP fragments.
     pub const FRAGMENTED: u16 = 1 << 0;
-    /// The datagram was not complete yet when this was written: it counts once the
-    /// [`super::kind::COMPLETE`] record or a later record of the same datagram without this bit
-    /// has come.
+    /// Written before the datagram was complete: valid after the [`super::kind::COMPLETE`] record
+    /// or a later record of the same datagram without this bit.
     pub const AHEAD: u16 = 1 << 1;
     /// Sent by this host.
     pub const OUTGOING: u16 = 1 << 2;
     /// `destination` is IPv6 (otherwise IPv4-mapped).
     pub const IPV6: u16 = 1 << 3;
-    /// `payload_len` is an upper bound: the inline QoS was longer than the walk follows.
+    /// `payload_len` is an upper bound: the inline QoS exceeded the walk's limit.
     pub const INLINE_QOS_UNREAD: u16 = 1 << 4;
     /// `stamp_seconds` and `stamp_nanoseconds` hold the payload's bytes 4..12.
     pub const STAMP: u16 = 1 << 5;
-    /// Seen at a socket of this host, as a whole datagram, not on an interface: on its way out
-    /// with [`OUTGOING`], otherwise on its way into the receive buffer of
-    /// [`super::Record::socket`].
+    /// Seen at a socket of this host as a whole datagram, not on an interface: sent if [`OUTGOING`]
+    /// is set, otherwise just before the receive buffer of [`super::Record::socket`].
     pub const HOST: u16 = 1 << 6;
-    /// A copy of a record of the same time: the socket had no room, the datagram was not delivered
-    /// to it. DATA and DATA_FRAG only.
+    /// A copy of a record with the same time: the datagram was dropped at the socket's full buffer.
+    /// DATA and DATA_FRAG only.
     pub const NO_ROOM: u16 = 1 << 7;
-    /// The datagram never became complete: the kernel gave up waiting for IP fragments. Written
-    /// when it does (`net.ipv4.ipfrag_time`, 30 s), for what its first fragment shows. DATA and
-    /// DATA_FRAG only; `socket` is 0.
+    /// The datagram never became complete: the kernel gave up waiting for IP fragments. Written at
+    /// that time (after `net.ipv4.ipfrag_time`, 30 s) for the submessages in its first fragment.
+    /// DATA and DATA_FRAG only; `socket` is 0.
     pub const NOT_REASSEMBLED: u16 = 1 << 8;
-    /// Read from shared memory between processes of this host: a sampled view, in which what is
-    /// missing may have been sent all the same, unless [`EXACT`] is set.
+    /// Read from shared memory between processes of this host: a sampled view. Missing samples may
+    /// have been sent, unless [`EXACT`] is set.
     pub const SHM: u16 = 1 << 9;
-    /// With [`SHM`]: not read there, but seen in the process that put it there, as every message of
-    /// that process is: what is missing was not sent. Written by the kernel program.
+    /// With [`SHM`]: read in the sending process, which shows every message of that process, so
+    /// missing samples were not sent. Written by the kernel program.
     pub const EXACT: u16 = 1 << 10;
 }
 
 /// One submessage of one writer or reader. 136 bytes.
 ///
 /// The fields from `payload_len` to `status_info`, and `sequence_number`, are named for DATA and
-/// DATA_FRAG. Other kinds keep other numbers there: [`Record::body`] names them.
+/// DATA_FRAG. Other kinds store other numbers there: [`Record::body`] names them.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
 #[repr(C)]
 pub struct Record {
-    /// Nanoseconds: from the kernel filter CLOCK_MONOTONIC at the frame that completed the datagram
-    /// (converted to the Unix epoch before the model sees it), elsewhere the Unix epoch.
+    /// Nanoseconds. From the kernel filter: CLOCK_MONOTONIC of the frame that completed the
+    /// datagram, converted to the Unix epoch before the model reads it. Elsewhere: the Unix epoch.
     pub time: u64,
     /// Writer GUID, 16 wire bytes.
     pub writer: [u32; 4],
@@ -104,7 +102,7 @@ pub struct Record {
     pub datagram_len: u16,
     /// Interface index the frame was seen on; 0 = unknown.
     pub interface: u32,
-    /// Names one fragmented datagram among those of the last seconds; 0 when not fragmented.
+    /// Token of a fragmented datagram, unique for some seconds; 0 if not fragmented.
     pub datagram: u32,
     /// One of [`kind`].
     pub kind: u8,
@@ -115,14 +113,14 @@ pub struct Record {
     /// DATA, DATA_FRAG: bytes of serialized payload in this submessage, encapsulation included.
     /// HEARTBEAT: lastSN high word. GAP: gapList base high word. HANDOVER: walk offset.
     pub payload_len: u32,
-    /// DATA, DATA_FRAG: encapsulation identifier and options, as a big-endian number; 0 where the
+    /// DATA, DATA_FRAG: encapsulation identifier and options, as a big-endian number; 0 if the
     /// payload's first bytes are not in this submessage. HEARTBEAT: lastSN low. GAP: base low.
     /// HANDOVER: IP identification.
     pub encapsulation: u32,
-    /// Payload bytes 4..8 as a number in the encapsulation's byte order: `Header.stamp.sec` where
-    /// the type begins with a header. HEARTBEAT: count. GAP, ACKNACK: numBits.
+    /// Payload bytes 4..8 as a number in the encapsulation's byte order: `Header.stamp.sec` if the
+    /// type begins with a header. HEARTBEAT: count. GAP, ACKNACK: numBits.
     pub stamp_seconds: u32,
-    /// Payload bytes 8..12 likewise: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap word 0.
+    /// Payload bytes 8..12 in the same form: `Header.stamp.nanosec`. GAP, ACKNACK: bitmap word 0.
     pub stamp_nanoseconds: u32,
     /// DATA_FRAG: fragmentStartingNum, 1-based. GAP, ACKNACK: bitmap word 1.
     pub fragment_start: u32,
@@ -134,8 +132,8 @@ pub struct Record {
     pub status_info: u32,
     /// Cookie of the socket that receives or sends the datagram (`SO_COOKIE`); 0 = unknown.
     pub socket: u64,
-    /// DATA_FRAG: nanoseconds from the first datagram that this record speaks for to the last, which
-    /// is at `time`; `u32::MAX` = that or more.
+    /// DATA_FRAG: nanoseconds from the first datagram of this record to the last, which is at
+    /// `time`; `u32::MAX` = that or more.
     pub elapsed: u32,
     /// Source UDP port; 0 = unknown.
     pub source_port: u16,
@@ -146,11 +144,11 @@ pub struct Record {
 const _: () = assert!(size_of::<Record>() == 136 && align_of::<Record>() == 8);
 
 impl Record {
-    /// Sequence numbers a GAP's or ACKNACK's bitmap can hold in a record; longer sets (up to 256)
-    /// make the walk ask for the whole datagram instead.
+    /// Most bits of a GAP's or ACKNACK's bitmap in a record; for longer sets (up to 256) the walk
+    /// requires the whole datagram.
     pub const BITMAP_BITS: u32 = 160;
 
-    /// The participant that sent it: the writer's, of an ACKNACK the reader's.
+    /// Returns the participant that sent it: the reader's for an ACKNACK, otherwise the writer's.
     #[must_use]
     pub fn sender(&self) -> GuidPrefix {
         if self.is_acknack() {
@@ -160,7 +158,7 @@ impl Record {
         }
     }
 
-    /// The participant that it is for; unknown for all matched readers.
+    /// Returns the participant that it is sent to; unknown if it is sent to all matched readers.
     #[must_use]
     pub fn addressee(&self) -> GuidPrefix {
         if self.is_acknack() {
@@ -170,43 +168,43 @@ impl Record {
         }
     }
 
-    /// The writer.
+    /// Returns the writer.
     #[must_use]
     pub fn writer(&self) -> Guid {
         zerocopy::transmute!(self.writer)
     }
 
-    /// The reader, or unknown for all matched readers.
+    /// Returns the reader, or unknown if it is sent to all matched readers.
     #[must_use]
     pub fn reader(&self) -> Guid {
         zerocopy::transmute!(self.reader)
     }
 
-    /// When the first datagram that it reports came, where it reports fragments of several.
+    /// Returns the time of the first datagram, for a record of fragments from several datagrams.
     #[must_use]
     pub const fn began(&self) -> Timestamp {
         Timestamp(self.time.saturating_sub(self.elapsed as u64))
     }
 
-    /// INFO_TS in force.
+    /// Returns the INFO_TS in force.
     #[must_use]
     pub const fn source_timestamp(&self) -> RtpsTime {
         RtpsTime(self.source_timestamp)
     }
 
-    /// DATA_FRAG: how many consecutive fragments this submessage holds.
+    /// DATA_FRAG: returns the number of consecutive fragments in this submessage.
     #[must_use]
     pub const fn fragments_in_submessage(&self) -> u32 {
         self.fragments >> 16
     }
 
-    /// DATA_FRAG: size of every fragment but the sample's last.
+    /// DATA_FRAG: returns the size in bytes of every fragment but the sample's last.
     #[must_use]
     pub const fn fragment_size(&self) -> u32 {
         self.fragments & 0xffff
     }
 
-    /// DATA_FRAG: whether it holds the sample's last fragment.
+    /// DATA_FRAG: returns whether it holds the sample's last fragment.
     #[inline(always)]
     #[must_use]
     pub const fn ends_sample(&self) -> bool {
@@ -217,11 +215,11 @@ impl Record {
         let end = self
             .fragment_start
             .wrapping_add(self.fragments_in_submessage());
-        // The last fragment begins within the sample, and its end reaches the sample's.
+        // The last fragment begins within the sample and reaches its end.
         end as u64 > (self.sample_size as u64).div_ceil(size as u64)
     }
 
-    /// DATA_FRAG: whether `next` goes on where this one ends, for the same sample and reader.
+    /// DATA_FRAG: returns whether `next` continues this one, for the same sample and reader.
     #[inline(always)]
     #[must_use]
     pub const fn is_followed_by(&self, next: &Self) -> bool {
@@ -240,8 +238,8 @@ impl Record {
             && (self.flags ^ next.flags) & !OF_THE_DATAGRAM == 0
     }
 
-    /// Takes `next` into this DATA_FRAG when it follows: one record then speaks for fragments of
-    /// several datagrams, with the time of the last. `false` when it does not.
+    /// Merges `next` into this DATA_FRAG if it follows: one record then covers fragments of several
+    /// datagrams, with the time of the last. Returns `false` if it does not follow.
     #[inline(always)]
     pub const fn extend(&mut self, next: &Self) -> bool {
         let count = self.fragments_in_submessage() + next.fragments_in_submessage();
@@ -258,18 +256,18 @@ impl Record {
         self.fragments = count << 16 | self.fragment_size();
         self.payload_len = self.payload_len.wrapping_add(next.payload_len);
         if self.source_timestamp == 0 {
-            // Cyclone DDS says INFO_TS with the first fragment only, others with each.
+            // Cyclone DDS sends INFO_TS with the first fragment only, others with each.
             self.source_timestamp = next.source_timestamp;
         }
         true
     }
 
-    /// HEARTBEAT's lastSN, GAP's gapList base.
+    /// Returns HEARTBEAT's lastSN or GAP's gapList base.
     const fn long(&self) -> u64 {
         (self.payload_len as u64) << 32 | self.encapsulation as u64
     }
 
-    /// [`kind::HANDOVER`]'s context.
+    /// Returns the context of a [`kind::HANDOVER`].
     #[must_use]
     pub fn handover(&self) -> Handover {
         Handover {
@@ -291,7 +289,7 @@ impl Record {
     }
 }
 
-/// Where and with which receiver state (RTPS 2.5, 8.3.4) a handed-over walk goes on.
+/// Position and receiver state (RTPS 2.5, 8.3.4) from which user space continues a walk.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Handover {
     /// Source GUID prefix in force.
@@ -302,14 +300,14 @@ pub struct Handover {
     pub source_address: [u8; 16],
     /// IPv4 identification or IPv6 fragment identification.
     pub identification: u32,
-    /// Offset in the UDP payload of the next submessage header.
+    /// Offset of the next submessage header in the UDP payload.
     pub offset: u32,
     /// INFO_TS in force: seconds and fraction; zero = none.
     pub timestamp: [u32; 2],
 }
 
-/// How the kernel filter treats a writer or reader: the value of its interest map. No entry means
-/// unknown: its first datagrams are captured, within a budget.
+/// Treatment of a writer or reader by the kernel filter: the value of its interest map. Without an
+/// entry it is unknown, and its first datagrams are captured within a budget.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 #[repr(u32)]
 pub enum Verdict {
@@ -317,11 +315,11 @@ pub enum Verdict {
     Ignore = 0,
     /// One record per submessage, nothing copied.
     Meter = 1,
-    /// Whole datagrams to user space.
+    /// Whole datagrams go to user space.
     Capture = 2,
 }
 
-/// GUID in the words of [`Record`] and of the interest map's key.
+/// Returns the GUID in the words of [`Record`] and of the interest map's key.
 #[must_use]
 pub fn guid_words(guid: Guid) -> [u32; 4] {
     zerocopy::transmute!(guid)

@@ -1,4 +1,4 @@
-//! What the parsers' tests share: datagrams from captures, an encoder, and two ways to hurt bytes.
+//! Shared by the parsers' tests: captured datagrams, an encoder, and two ways to damage bytes.
 
 use std::string::ToString;
 use std::vec::Vec;
@@ -16,7 +16,7 @@ macro_rules! captured {
     ($($name:ident = $file:literal;)+) => {
         $(pub(crate) const $name: &[u8] =
             include_bytes!(concat!("../tests/data/datagrams/", $file, ".bin"));)+
-        /// All of them.
+        /// Every captured datagram.
         pub(crate) const CAPTURED: &[&[u8]] = &[$($name),+];
     };
 }
@@ -48,7 +48,7 @@ captured! {
     JAZZY_ENTITIES = "jazzy-entities";
 }
 
-/// The DATA submessages of a datagram.
+/// Returns the DATA submessages of a datagram.
 pub(crate) fn data(datagram: &[u8]) -> Vec<(VendorId, InlineQos, Data<'_>)> {
     Message::parse(datagram)
         .unwrap()
@@ -89,7 +89,7 @@ pub(crate) fn hurt(bytes: &[u8], mut read: impl FnMut(&[u8])) {
     }
 }
 
-/// Writes what the parsers read. Alignment counts from the first byte written.
+/// Encodes what the parsers read. Alignment counts from the first byte written.
 #[derive(Clone)]
 pub(crate) struct Encoder {
     pub(crate) bytes: Vec<u8>,
@@ -139,13 +139,13 @@ impl Encoder {
         self.raw((text.to_string() + "\0").as_bytes()).align()
     }
 
-    /// One parameter; pads its value.
+    /// Writes one parameter and pads its value.
     pub(crate) fn parameter(&mut self, id: u16, value: &[u8]) -> &mut Self {
         let length = u16::try_from(value.len().next_multiple_of(4)).unwrap();
         self.u16(id).u16(length).raw(value).align()
     }
 
-    /// A submessage around what `body` writes.
+    /// Writes a submessage around the output of `body`.
     pub(crate) fn submessage(
         &mut self,
         id: u8,
@@ -160,7 +160,7 @@ impl Encoder {
             .raw(&inner.bytes)
     }
 
-    /// A message header with prefix `01 02 .. 0c`.
+    /// Writes a message header with prefix `01 02 .. 0c`.
     pub(crate) fn header(&mut self, vendor: [u8; 2]) -> &mut Self {
         self.raw(b"RTPS\x02\x03")
             .raw(&vendor)

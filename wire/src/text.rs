@@ -1,13 +1,13 @@
-//! Text that somebody else wrote: read within a limit, and refused when it could break out of a
-//! log line, a label or a terminal.
+//! Untrusted text: read within a limit, and refused if it could break out of a log line, a label or
+//! a terminal.
 
 use crate::cursor::{Cursor, Reason, WireError};
 
-/// A CDR string: `u32` length including the terminating NUL, the bytes, padding to four. What it
-/// says is not checked; see [`checked`].
+/// Reads a CDR string: `u32` length including the terminating NUL, the bytes, padding to four. The
+/// characters are not checked; see [`checked`].
 ///
-/// More than one NUL at the end is tolerated (Fast DDS counts one into some lengths), a length of
-/// zero is an empty string. The limit is in bytes of text.
+/// Accepts more than one NUL at the end (Fast DDS includes one in some lengths); a length of zero
+/// is an empty string. The limit is in bytes of text.
 pub(crate) fn string<'a>(
     cursor: &mut Cursor<'a>,
     what: &'static str,
@@ -26,7 +26,7 @@ pub(crate) fn string<'a>(
     Ok(text)
 }
 
-/// A CDR octet sequence: `u32` length, the bytes, padding to four.
+/// Reads a CDR octet sequence: `u32` length, the bytes, padding to four.
 pub(crate) fn octets<'a>(
     cursor: &mut Cursor<'a>,
     what: &'static str,
@@ -40,9 +40,9 @@ pub(crate) fn octets<'a>(
     Ok(bytes)
 }
 
-/// Whether a name can stand unquoted on a terminal, in a label and in a log line: no control
-/// characters and none that ends or escapes a quotation. DDS and ROS names never have them
-/// (DDS 1.4, annex B: letters, digits, underscore; slashes in ROS's mapping).
+/// Returns whether a name can stand unquoted on a terminal, in a label and in a log line: no
+/// control characters, quotation marks or escapes. DDS and ROS names never have them (DDS 1.4,
+/// annex B: letters, digits, underscore; slashes in ROS's mapping).
 pub(crate) fn is_plain(text: &str) -> bool {
     !text.chars().any(|c| {
         c.is_control()
@@ -52,7 +52,7 @@ pub(crate) fn is_plain(text: &str) -> bool {
     })
 }
 
-/// [`string`] that [`is_plain`].
+/// Reads a [`string`] and requires it to be plain, see [`is_plain`].
 pub(crate) fn name<'a>(
     cursor: &mut Cursor<'a>,
     what: &'static str,

@@ -1,22 +1,22 @@
-//! Points in time and spans, as RTPS writes them and as the agent keeps them.
+//! Points in time and durations, as RTPS encodes them and as the agent keeps them.
 
 /// One second in nanoseconds, the unit of [`Timestamp`].
 pub const SECOND: u64 = 1_000_000_000;
 /// One millisecond in nanoseconds.
 pub const MILLISECOND: u64 = 1_000_000;
 
-/// Nanoseconds since the Unix epoch. The agent's only clock reading; always passed in.
+/// Nanoseconds since the Unix epoch. The only clock reading of the agent, always passed in.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Timestamp(pub u64);
 
 impl Timestamp {
-    /// `self - earlier` in nanoseconds; negative when `earlier` is in fact later.
+    /// Returns `self - earlier` in nanoseconds; negative if `earlier` is later.
     #[must_use]
     pub const fn nanoseconds_since(self, earlier: Self) -> i64 {
         self.0.wrapping_sub(earlier.0).cast_signed()
     }
 
-    /// Seconds with fraction, for people and for Prometheus.
+    /// Returns seconds with a fraction, for people and for Prometheus.
     #[must_use]
     #[expect(
         clippy::cast_precision_loss,
@@ -28,12 +28,12 @@ impl Timestamp {
 }
 
 /// RTPS `Time_t` and `Duration_t` (RTPS 2.5, 9.3.2): seconds and a fraction of 2^-32 seconds, kept
-/// as `seconds << 32 | fraction`. Zero stands for "no time" where INFO_TS is absent or invalid.
+/// as `seconds << 32 | fraction`. Zero means "no time": INFO_TS is absent or invalid.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct RtpsTime(pub u64);
 
 impl RtpsTime {
-    /// As nanoseconds since the Unix epoch; `None` when no time was given.
+    /// Returns nanoseconds since the Unix epoch; `None` for "no time".
     #[must_use]
     pub const fn timestamp(self) -> Option<Timestamp> {
         if self.0 == 0 {
@@ -41,7 +41,7 @@ impl RtpsTime {
         }
         let seconds = self.0 >> 32;
         let fraction = self.0 & 0xffff_ffff;
-        // Rounded to nearest: 2^-32 s is finer than a nanosecond, so writers' values survive.
+        // Rounds to nearest: 2^-32 s is finer than a nanosecond, so writers' values survive.
         let nanoseconds = (fraction * 1_000_000_000 + (1 << 31)) >> 32;
         Some(Timestamp(seconds * 1_000_000_000 + nanoseconds))
     }
@@ -57,9 +57,9 @@ pub enum Duration {
 }
 
 impl Duration {
-    /// From the wire's `i32` seconds and `u32` fraction. 7fffffff seconds with any fraction of at
-    /// least 7fffffff means infinite (Fast DDS and Cyclone DDS both send ffffffff). Negative
-    /// durations do not exist; they read as zero.
+    /// Converts the wire's `i32` seconds and `u32` fraction. 7fffffff seconds with any fraction of
+    /// at least 7fffffff is infinite (Fast DDS and Cyclone DDS both send ffffffff). Negative
+    /// durations read as zero.
     #[must_use]
     pub const fn from_wire(seconds: i32, fraction: u32) -> Self {
         if seconds == i32::MAX && fraction >= 0x7fff_ffff {

@@ -1,12 +1,12 @@
 //! The walk over one datagram's submessages that decides what happens to it.
 //!
 //! Written once: the kernel filter compiles [`step`] and [`fate`] for the BPF target and reads from
-//! a socket buffer; user space reads from a slice. So what the unit tests, the fuzzer and the
-//! replays exercise is what runs in the kernel. That target dictates the style: reads of fixed
-//! size, state in one plain struct, masks instead of branches for the byte order, no formatting.
+//! a socket buffer; user space reads from a slice. So the unit tests, the fuzzer and the replays
+//! exercise the code that runs in the kernel. That target dictates the style: reads of fixed size,
+//! state in one plain struct, masks instead of branches for the byte order, no formatting.
 //!
-//! It follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips what it
-//! does not know by its length. It does not look inside payloads beyond their first twelve bytes.
+//! It follows the receiver state of RTPS 2.5, 8.3.4 (INFO_SRC, INFO_DST, INFO_TS) and skips unknown
+//! submessages by their length. It reads at most twelve bytes of a payload.
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
@@ -15,11 +15,11 @@ use crate::parameters::ParameterId;
 use crate::record::{Record, flag, kind};
 use crate::rtps::{SubmessageFlags, SubmessageId};
 
-/// Where a walk reads from: a slice, or a socket buffer in the kernel.
+/// Source of a walk's bytes: a slice, or a socket buffer in the kernel.
 pub trait Bytes {
-    /// `N` words of wire bytes at `offset` of the UDP payload, in memory order; `None` when they
-    /// are not all here. Every read of the walk is 4-aligned relative to the payload's start, as
-    /// submessages are (RTPS 2.5, 9.4.5.1).
+    /// Returns `N` words of wire bytes at `offset` of the UDP payload, in memory order; `None` if
+    /// some of them are not present. Every read of the walk is 4-aligned relative to the payload's
+    /// start, as submessages are (RTPS 2.5, 9.4.5.1).
     fn words<const N: usize>(&self, offset: u32) -> Option<[u32; N]>;
 }
 
@@ -32,15 +32,15 @@ impl Bytes for &[u8] {
     }
 }
 
-/// Size of the RTPS message header, where the first submessage begins.
+/// Size of the RTPS message header, behind which the first submessage begins.
 pub const HEADER_LEN: u32 = 20;
-/// Longest message that is walked. A datagram has 65,507 bytes at most; in shared memory a transport
-/// may be configured to hand over longer ones.
+/// Longest message that is walked. A datagram has at most 65,507 bytes; a shared-memory transport
+/// may be configured for longer messages.
 pub const MAX_MESSAGE: u32 = 32 << 20;
 /// `RTPS` as it lies in memory.
 pub const MAGIC: u32 = u32::from_ne_bytes(*b"RTPS");
 
-/// Parameters of one inline QoS that the walk reads before it gives up on its length.
+/// Parameters of one inline QoS that the walk reads before it stops looking for the end.
 const INLINE_QOS_PARAMETERS: u32 = 12;
 const PID_SENTINEL: u32 = ParameterId::SENTINEL.0 as u32;
 const PID_STATUS_INFO: u32 = ParameterId::STATUS_INFO.0 as u32;
@@ -50,17 +50,17 @@ const INFO_SRC: u32 = SubmessageId::INFO_SRC.0 as u32;
 const INFO_DST: u32 = SubmessageId::INFO_DST.0 as u32;
 const PAD: u32 = SubmessageId::PAD.0 as u32;
 
-/// [`SubmessageFlags`] as the walk holds them.
+/// [`SubmessageFlags`] in the form that the walk uses.
 const ENDIANNESS: u32 = SubmessageFlags::ENDIANNESS.0 as u32;
 const INVALIDATE: u32 = SubmessageFlags::INVALIDATE.0 as u32;
 const INLINE_QOS: u32 = SubmessageFlags::INLINE_QOS.0 as u32;
 const DATA_OR_KEY: u32 = SubmessageFlags::DATA.with(SubmessageFlags::KEY).0 as u32;
 
-/// One datagram on its way through [`step`].
+/// State of the walk over one datagram, advanced by [`step`].
 #[derive(Clone, Copy, Default, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
 #[repr(C)]
 pub struct Walk {
-    /// The current submessage; what concerns the whole datagram is set once.
+    /// The current submessage; the fields of the whole datagram are set once.
     pub record: Record,
     /// Source GUID prefix in force.
     pub source: [u32; 3],
@@ -74,7 +74,7 @@ pub struct Walk {
     pub timestamp: [u32; 2],
 }
 
-/// What one step found.
+/// Result of one step.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Step {
@@ -82,11 +82,11 @@ pub enum Step {
     End = 0,
     /// The next submessage header begins beyond the bytes at hand.
     Later = 1,
-    /// The next submessage begins here, but what the walk needs of it does not end here.
+    /// The next submessage begins here, but the bytes that the walk needs are not all at hand.
     Split = 2,
     /// A submessage contradicts the datagram's length; the rest is unreadable.
     Malformed = 3,
-    /// Nothing that becomes a record.
+    /// A submessage that yields no record.
     Passed = 4,
     /// [`Walk::record`] holds a submessage of an endpoint.
     Endpoint = 5,
@@ -94,12 +94,12 @@ pub enum Step {
     LongGap = 6,
 }
 
-/// Picks a byte order without branching: `word` was read from memory as it lay on the wire.
+/// Selects a byte order without branching: `word` is in memory order, as on the wire.
 #[derive(Clone, Copy)]
 struct Order(u32);
 
 impl Order {
-    /// From a submessage's flags: E set means little-endian.
+    /// Returns the order of a submessage's flags: E set means little-endian.
     #[inline(always)]
     const fn of(flags: u32) -> Self {
         Self((flags & ENDIANNESS).wrapping_neg())
@@ -111,7 +111,7 @@ impl Order {
         (big & !self.0) | (big.swap_bytes() & self.0)
     }
 
-    /// The `u16` pair in one word: `(first, second)`.
+    /// Returns the `u16` pair in one word: `(first, second)`.
     #[inline(always)]
     const fn halves(self, wire: u32) -> (u32, u32) {
         let big = u32::from_be(wire);
@@ -132,8 +132,8 @@ impl Order {
 }
 
 impl Walk {
-    /// At the first submessage of a message whose header's GUID prefix is `source`. The caller has
-    /// checked the magic.
+    /// Starts at the first submessage of a message whose header's GUID prefix is `source`. The
+    /// caller has checked the magic.
     #[inline(always)]
     pub fn begin(&mut self, source: [u32; 3], datagram_len: u32) {
         let zero = zero();
@@ -145,7 +145,8 @@ impl Walk {
         self.record.datagram_len = datagram_len as u16;
     }
 
-    /// Whether `len` bytes at `offset` lie in the datagram and among the first `present` bytes.
+    /// Returns whether `len` bytes at `offset` lie in the datagram and among the first `present`
+    /// bytes.
     #[inline(always)]
     const fn reach(&self, offset: u32, len: u32, present: u32) -> Reach {
         // Offsets stay below 2^27: a 16-bit length from a position below `MAX_MESSAGE`.
@@ -167,7 +168,7 @@ enum Reach {
     Outside,
 }
 
-/// Reads `N` words at `offset` or leaves [`step`] with what is wrong.
+/// Reads `N` words at `offset`, or returns from [`step`] with the failure.
 macro_rules! read {
     ($walk:expr, $bytes:expr, $present:expr, $offset:expr, $count:literal) => {{
         let offset: u32 = $offset;
@@ -182,8 +183,9 @@ macro_rules! read {
     }};
 }
 
-/// Reads the submessage at `walk.offset`, of which bytes up to `present` of the payload are at
-/// hand. Moves the offset on unless it returns [`Step::Later`], [`Step::Split`] or [`Step::End`].
+/// Reads the submessage at `walk.offset`, given that the first `present` bytes of the payload are
+/// at hand. Advances the offset unless it returns [`Step::Later`], [`Step::Split`] or
+/// [`Step::End`].
 #[inline(always)]
 pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     let start = walk.offset;
@@ -229,7 +231,7 @@ pub fn step<B: Bytes>(walk: &mut Walk, bytes: &B, present: u32) -> Step {
     found
 }
 
-/// INFO_TS, INFO_SRC, INFO_DST; anything else is passed over by its length.
+/// Handles INFO_TS, INFO_SRC and INFO_DST; skips any other kind by its length.
 #[inline(always)]
 #[expect(
     clippy::too_many_arguments,
@@ -271,7 +273,8 @@ fn receiver_state<B: Bytes>(
     Step::Passed
 }
 
-/// Sets what all endpoint submessages share. `reader` and `writer` are entity ids as read.
+/// Sets the fields shared by all endpoint submessages. `reader` and `writer` are entity ids as
+/// read.
 #[inline(always)]
 fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     let (source, destination) = (walk.source, walk.destination);
@@ -293,7 +296,7 @@ fn endpoint(walk: &mut Walk, id: u32, flags: u32, writer: u32, reader: u32) {
     record.status_info = zero;
 }
 
-/// A zero that the compiler does not know to be one: rows of plain zeros would become a call of
+/// Returns a zero that the compiler cannot see: it would turn rows of plain zeros into a call of
 /// `memset`, which for the BPF target is a loop over bytes.
 #[inline(always)]
 fn zero() -> u32 {
@@ -303,16 +306,16 @@ fn zero() -> u32 {
 /// Length of extraFlags and octetsToInlineQos, which begin a DATA or DATA_FRAG.
 const EXTRA_LEN: u32 = 4;
 
-/// octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from behind
-/// itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may put fields
-/// behind those of this one, so the offset is followed, not assumed.
+/// Returns octetsToInlineQos of a DATA or DATA_FRAG whose first word is `extra`. It counts from
+/// behind itself to the inline QoS, or to the payload (RTPS 2.5, 9.4.5.4). Later versions may
+/// insert fields, so the walk follows the offset.
 #[inline(always)]
 const fn octets_to_inline_qos(order: Order, extra: u32) -> u32 {
     let (_extra_flags, octets) = order.halves(extra);
     octets
 }
 
-/// DATA and DATA_FRAG (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
+/// Reads DATA and DATA_FRAG (RTPS 2.5, 9.4.5.4 and 9.4.5.5).
 #[inline(always)]
 #[expect(
     clippy::too_many_arguments,
@@ -366,7 +369,7 @@ fn data<B: Bytes>(
                     return Step::Malformed;
                 }
                 let [status] = read!(walk, bytes, present, at + 4, 1);
-                // Big-endian whatever E says (RTPS 2.5, 9.6.4.9).
+                // Big-endian regardless of E (RTPS 2.5, 9.6.4.9).
                 walk.record.status_info = u32::from_be(status);
             }
             at += 4;
@@ -380,12 +383,12 @@ fn data<B: Bytes>(
             seen += 1;
         }
     }
-    // Neither Data nor Key: a disposal that says everything inline (Fast DDS).
+    // Neither Data nor Key: a disposal described by its inline QoS (Fast DDS).
     if !fragment && flags & DATA_OR_KEY == 0 {
         return Step::Endpoint;
     }
     walk.record.payload_len = end - at;
-    // The payload's head: in every DATA, and in the first fragment only.
+    // The payload's first bytes are in every DATA, but only in the first fragment.
     if (!fragment || walk.record.fragment_start == 1) && at + 12 <= end {
         let [encapsulation, seconds, nanoseconds] = read!(walk, bytes, present, at, 3);
         let encapsulation = u32::from_be(encapsulation);
@@ -399,7 +402,7 @@ fn data<B: Bytes>(
     Step::Endpoint
 }
 
-/// HEARTBEAT (RTPS 2.5, 9.4.5.7).
+/// Reads HEARTBEAT (RTPS 2.5, 9.4.5.7).
 #[inline(always)]
 fn heartbeat<B: Bytes>(
     walk: &mut Walk,
@@ -430,7 +433,8 @@ fn heartbeat<B: Bytes>(
     Step::Endpoint
 }
 
-/// GAP and ACKNACK (RTPS 2.5, 9.4.5.6 and 9.4.5.3): both end in a SequenceNumberSet (9.4.2.6).
+/// Reads GAP and ACKNACK (RTPS 2.5, 9.4.5.6 and 9.4.5.3): both end in a SequenceNumberSet
+/// (9.4.2.6).
 #[inline(always)]
 #[expect(
     clippy::too_many_arguments,
@@ -464,7 +468,7 @@ fn sequence_set<B: Bytes>(
         walk.record.payload_len = order.word(base_high);
         walk.record.encapsulation = order.word(base_low);
     } else {
-        // An ACKNACK's sender is the reader; its writer is INFO_DST's.
+        // A reader sends an ACKNACK; its writer belongs to INFO_DST's participant.
         endpoint(walk, id, flags, writer, reader);
         walk.record.reader = [walk.source[0], walk.source[1], walk.source[2], reader];
         walk.record.writer = [
@@ -499,23 +503,23 @@ fn sequence_set<B: Bytes>(
     }
 }
 
-/// What to do with a submessage before the interest map is asked.
+/// What to do with a submessage before the interest map is consulted.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Fate {
-    /// Of no interest to anybody, ever.
+    /// Never of interest.
     Ignore = 0,
     /// Discovery: the datagram goes to user space whole.
     Capture = 1,
-    /// As the interest map says for the record's writer; not in it: unknown, capture at first.
+    /// As the interest map decides for the record's writer; an unknown writer is captured at first.
     Writer = 2,
-    /// As the interest map says for the record's reader; not in it: ignore.
+    /// As the interest map decides for the record's reader; an unknown reader is ignored.
     Reader = 3,
 }
 
-/// The part of the verdict that needs no state. Discovery is SPDP and SEDP and what can be read of
-/// their secure variants; other builtin traffic (liveliness, type lookup, authentication) is not
-/// looked at.
+/// Returns the part of the verdict that needs no state. Discovery is SPDP, SEDP and the readable
+/// parts of their secure variants; other builtin traffic (liveliness, type lookup, authentication)
+/// is ignored.
 #[inline(always)]
 #[must_use]
 pub const fn fate(record: &Record) -> Fate {

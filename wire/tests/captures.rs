@@ -1,7 +1,7 @@
-//! Real captures against what an independent decoder found in them.
+//! Compares the parsers with an independent decoder on real captures.
 //!
-//! Runs on the captures in `tests/data`, and on every one in `../shared/fixtures` beside the
-//! workspace where that exists.
+//! Runs on the captures in `tests/data`, and on those in `../shared/fixtures` beside the workspace
+//! if that exists.
 
 #![expect(
     clippy::unwrap_used,
@@ -30,7 +30,7 @@ use serde_json::{Value, json};
 
 use entry::oracle::{Body, Message};
 
-/// What this crate finds in one capture.
+/// Results of this crate for one capture.
 #[derive(Default)]
 struct Found {
     submessages: BTreeMap<String, u64>,
@@ -96,7 +96,7 @@ impl Found {
                         _ if self.discovery_info_writers.contains(&data.writer) => {
                             let entities = ParticipantEntities::parse(data.payload.bytes());
                             let key = (data.writer.to_string(), data.sequence_number.0);
-                            // The facts have each sample once.
+                            // The facts list each sample once.
                             if !self.entities.iter().any(|(known, _)| *known == key) {
                                 self.entities.push((key, entities.unwrap()));
                             }
@@ -157,7 +157,8 @@ struct Parts {
     end: Option<u32>,
 }
 
-/// Every whole datagram of a little-endian classic capture; whether all of it was captured.
+/// Visits every whole datagram of a little-endian classic capture; returns whether all of it was
+/// captured.
 fn datagrams(capture: &[u8], mut each: impl FnMut(&[u8])) -> bool {
     let link = Link(u16::try_from(word(&capture[20..]) & 0xffff).unwrap());
     let mut parts: HashMap<([u8; 16], [u8; 16], u32), Parts> = HashMap::new();
@@ -203,11 +204,11 @@ fn datagrams(capture: &[u8], mut each: impl FnMut(&[u8])) -> bool {
     is_whole
 }
 
-/// Captures with their facts under a directory.
+/// Adds the captures with facts under a directory to `found`.
 fn captures(directory: &Path, found: &mut Vec<(PathBuf, PathBuf)>) {
     for entry in fs::read_dir(directory).unwrap() {
         let path = entry.unwrap().path();
-        // What Zenoh sends is no RTPS.
+        // Zenoh traffic is not RTPS.
         if path.ends_with("zenoh") {
             continue;
         }
@@ -248,7 +249,7 @@ fn locators(locators: &[Locator]) -> Value {
     locators.iter().map(text).collect()
 }
 
-/// Compares where the facts say something; what they leave out was not on the wire.
+/// Compares `ours` with the facts under `key`; facts absent there were not on the wire.
 fn check(context: &str, facts: &Value, key: &str, ours: &Value) {
     if let Some(theirs) = facts.get(key) {
         assert_eq!(theirs, ours, "{context}: {key}");
@@ -476,7 +477,7 @@ fn check_writers(facts: &Value, found: &Found) {
                 size.to_string()
             );
         } else {
-            // The facts name the most frequent sizes only.
+            // The facts list the most frequent sizes only.
             for (size, count) in theirs["payload_sizes"].as_object().unwrap() {
                 let ours = writer.payload_sizes.get(size);
                 assert_eq!(*count, json!(ours), "{context}: {size}");
@@ -499,10 +500,11 @@ fn captures_read_as_the_independent_decoder_read_them() {
         println!("{}", capture.display());
         let facts: Value = serde_json::from_slice(&read(&facts)).unwrap();
         let capture = read(&capture);
-        // Twice: a sample may be on the wire before its writer's announcement.
+        // Two passes: a sample may precede its writer's announcement.
         let mut first = Found::default();
         datagrams(&capture, |bytes| {
-            // What must hold for any bytes, the agreement with the kernel filter's walk included.
+            // Checks the invariants for any bytes, including the agreement with the kernel filter's
+            // walk.
             entry::datagram(bytes);
             first.datagram(bytes);
         });

@@ -23,16 +23,24 @@ pub mod endpoints;
 pub mod events;
 pub mod graph;
 pub mod health;
+pub mod live;
 pub mod measurement;
+pub mod messages;
 pub mod names;
 pub mod nodes;
 mod open;
 pub mod participants;
 pub mod path;
 pub mod problem;
+pub mod recording_report;
+pub mod recordings;
 pub mod samples;
 pub mod services;
+pub mod snapshots;
 pub mod topics;
 pub mod watches;
 
 pub use open::Open;
+
+/// The highest domain id of DDS for which RTPS has ports (RTPS 2.5, 9.6.2.3).
+pub const MAX_DOMAIN_ID: u32 = 232;

@@ -1,4 +1,4 @@
-//! How fast bags are written: bytes of messages a second, for each preset.
+//! Speed of writing bags: bytes of messages per second, for each preset.
 #![expect(clippy::unwrap_used, reason = "a benchmark may panic")]
 
 use std::collections::BTreeMap;
@@ -11,7 +11,7 @@ use ros2probe_wire::Timestamp;
 
 const CLOUDS: usize = 24;
 
-/// A lidar's points: x, y, z, intensity as floats, noisy in their low bits.
+/// Points of a lidar: x, y, z, intensity as floats, noisy in their low bits.
 fn cloud() -> Vec<u8> {
     let mut data = vec![0, 1, 0, 0];
     let mut noise = 0x1234_5678_u32;

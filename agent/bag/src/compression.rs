@@ -1,7 +1,7 @@
 //! Compression of chunks and of whole files, in pure Rust.
 //!
-//! Knows one zstd level, the fastest: `ruzstd` has no other. Zstd frames carry their content size,
-//! without which rosbag2 refuses to decompress a file.
+//! Supports one zstd level, the fastest: `ruzstd` implements no other. Zstd frames carry their
+//! content size; rosbag2 refuses to decompress a file without it.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -9,10 +9,10 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use ruzstd::encoding::CompressionLevel;
 
-/// What a chunk or a file is compressed with.
+/// Compression of a chunk or a file.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub enum Compression {
-    /// Not at all.
+    /// No compression.
     #[default]
     None,
     /// LZ4 frames.
@@ -21,8 +21,8 @@ pub enum Compression {
     Zstd,
 }
 
-/// How far the compression of a file is, and whether it is to be given up: shared between the
-/// thread that compresses and the one that waits.
+/// Progress of compressing a file, and a flag to cancel it: shared between the compressing thread
+/// and the waiting one.
 #[derive(Debug, Default)]
 pub struct Progress {
     read: AtomicU64,
@@ -30,18 +30,18 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Bytes of the file that were read so far.
+    /// Returns the bytes of the file that were read so far.
     #[must_use]
     pub fn read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
     }
 
-    /// Has the compression end at its next read; the file stays as it is.
+    /// Cancels the compression at its next read; the file stays as it is.
     pub fn give_up(&self) {
         self.given_up.store(true, Ordering::Relaxed);
     }
 
-    /// Whether [`Self::give_up`] was called.
+    /// Returns whether [`Self::give_up`] was called.
     #[must_use]
     pub fn is_given_up(&self) -> bool {
         self.given_up.load(Ordering::Relaxed)
@@ -49,7 +49,7 @@ impl Progress {
 }
 
 impl Compression {
-    /// As MCAP, metadata.yaml and file names spell it.
+    /// Returns the name in MCAP, metadata.yaml and file names.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -59,7 +59,7 @@ impl Compression {
         }
     }
 
-    /// From that spelling.
+    /// Parses that name.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         let all = [Self::None, Self::Lz4, Self::Zstd];
@@ -67,7 +67,8 @@ impl Compression {
             .find(|compression| compression.name() == name)
     }
 
-    /// `bytes` compressed; `None` where that is not asked for or does not make them smaller.
+    /// Returns `bytes` compressed; `None` without compression, or if that does not make them
+    /// smaller.
     #[must_use]
     pub fn compressed(self, bytes: &[u8]) -> Option<Vec<u8>> {
         let compressed = match self {
@@ -86,7 +87,7 @@ impl Compression {
         (compressed.len() < bytes.len()).then_some(compressed)
     }
 
-    /// What was compressed to `bytes`, if it is at most `limit` bytes.
+    /// Decompresses `bytes`; fails if the result exceeds `limit` bytes.
     pub fn decompressed(self, bytes: &[u8], limit: u64) -> io::Result<Vec<u8>> {
         let mut out = Vec::new();
         self.reader(bytes)?.take(limit + 1).read_to_end(&mut out)?;
@@ -99,7 +100,7 @@ impl Compression {
         Ok(out)
     }
 
-    /// Reads `source` decompressed.
+    /// Returns a reader that decompresses `source`.
     pub fn reader<'a>(self, source: impl Read + 'a) -> io::Result<Box<dyn Read + 'a>> {
         Ok(match self {
             Self::None => Box::new(source),
@@ -110,7 +111,7 @@ impl Compression {
         })
     }
 
-    /// Compresses one file into another, as one frame. Fails where `progress` is given up.
+    /// Compresses one file into another, as one frame. Fails if `progress` is cancelled.
     pub fn compress_file(self, source: &File, into: &File, progress: &Progress) -> io::Result<()> {
         let size = source.metadata()?.len();
         let source = BufReader::with_capacity(1 << 17, source);
@@ -140,7 +141,7 @@ impl Compression {
     }
 }
 
-/// Remembers an error and ends, for `ruzstd` takes none.
+/// Stores an error and ends the stream, because `ruzstd` accepts no errors.
 struct ProgressReader<'a, R> {
     inner: R,
     progress: &'a Progress,
@@ -185,21 +186,21 @@ impl<R: Read> Read for ProgressReader<'_, R> {
     }
 }
 
-/// Takes a zstd frame that does not say its content's size, and says it (RFC 8878, 3.1.1.1).
-/// Remembers an error, for `ruzstd` takes none.
+/// Adds the content size to a zstd frame that lacks it (RFC 8878, 3.1.1.1). Stores an error,
+/// because `ruzstd` accepts none.
 struct SizedFrame<W> {
     inner: W,
     size: u64,
-    /// Magic number, descriptor and window: what precedes the size.
+    /// Magic number, descriptor and window: the bytes before the size.
     head: Vec<u8>,
     failed: Option<io::Error>,
 }
 
 impl<W: Write> SizedFrame<W> {
     const HEAD: usize = 6;
-    /// A size of 8 bytes follows.
+    /// Descriptor flag: a size of 8 bytes follows.
     const SIZE_FLAG: u8 = 0b1100_0000;
-    /// A size, a dictionary or no window: not what `ruzstd` writes.
+    /// Descriptor flags that `ruzstd` does not set: a size, a dictionary or no window.
     const OTHERWISE: u8 = 0b1110_0011;
 
     fn new(inner: W, size: u64) -> Self {

@@ -1,9 +1,9 @@
-//! One MCAP file while it is written: chunks, indexes, summary.
+//! One MCAP file during writing: chunks, indexes, summary.
 //!
-//! Records come in the order of rosbag2's files. A file only ever grows by whole pieces: what could
-//! not be written whole is cut off again, and before a piece is written, room is reserved for it
-//! and for the summary behind it, so that a full disk is noticed while the file can still be
-//! finished. Knows nothing of topics beyond their channel.
+//! Records have the order of rosbag2's files. A file grows by whole pieces only: an incomplete
+//! write is cut off again. Before a piece is written, space is reserved for it and for the summary,
+//! so that a full disk is noticed while the file can still be completed. Knows only the channels of
+//! topics.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -21,13 +21,13 @@ use super::mcap::{
 use super::options::Storage;
 use super::read::Scan;
 
-/// What a file's header names as its writer.
+/// Name of the writer in a file's header.
 pub(super) const LIBRARY: &str = concat!("ros2probe ", env!("CARGO_PKG_VERSION"));
-/// Of the metadata records.
+/// Name of the metadata records.
 pub(super) const METADATA_NAME: &str = "rosbag2";
-/// Without chunks, records are handed to the system in pieces of this size.
+/// Without chunks, records are written to the system in pieces of this size.
 const PIECE_BYTES: u64 = 256 << 10;
-/// Room for metadata.yaml, its record, and what the report at the end adds to them.
+/// Space for metadata.yaml, its record, and the additions of the final report.
 const SPARE_BYTES: u64 = 64 << 10;
 
 /// A file that is being written.
@@ -36,9 +36,9 @@ pub(super) struct FileWriter {
     path: PathBuf,
     file: File,
     storage: Storage,
-    /// Bytes in the file, every record of them whole.
+    /// Bytes in the file; every record in them is complete.
     position: u64,
-    /// A checksum of those bytes, where it is asked for.
+    /// Checksum of those bytes, if the options include it.
     data_crc: Option<Crc>,
     pending: Pending,
     schemas: BTreeMap<u16, Schema>,
@@ -48,23 +48,23 @@ pub(super) struct FileWriter {
     /// Offset and length of metadata records.
     metadata: Vec<(u64, u64)>,
     statistics: Statistics,
-    /// The file system can reserve room.
+    /// Whether the file system can reserve space.
     reserves: bool,
 }
 
-/// What is not in the file yet: a chunk's records, or just records.
+/// Records that are not in the file yet: the current chunk's, or plain ones.
 #[derive(Debug, Default)]
 struct Pending {
     records: Vec<u8>,
     start: u64,
     end: u64,
     messages: u64,
-    /// Of each channel: log time and offset in the chunk.
+    /// Per channel: log time and offset in the chunk.
     index: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
 impl FileWriter {
-    /// Makes the file, which must not exist, and writes what it begins with.
+    /// Creates the file, which must not exist, and writes its start.
     pub(super) fn create(path: &Path, storage: Storage, metadata: &Metadata) -> io::Result<Self> {
         let file = super::new_file(path)?;
         let mut writer = Self {
@@ -89,7 +89,7 @@ impl FileWriter {
         Ok(writer)
     }
 
-    /// Begins `path` with what is whole of `source`, to be gone on with and finished.
+    /// Starts `path` with the complete part of `source`, to continue and finish it.
     pub(super) fn resume(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Self> {
         source.rewind()?;
         let mut file = super::new_file(path)?;
@@ -146,14 +146,14 @@ impl FileWriter {
         Ok(writer)
     }
 
-    /// Takes one message. On an error it was not taken; what was taken before is in the file or
-    /// still waits.
+    /// Accepts one message. On an error it was not accepted; earlier messages are in the file or
+    /// still wait.
     pub(super) fn write(
         &mut self,
         message: &Message<'_>,
         channel: impl FnOnce() -> (Schema, Channel),
     ) -> io::Result<()> {
-        // Written as it is, and not kept in memory once more.
+        // Written directly, without another copy in memory.
         let is_large = self.storage.compression == Compression::None
             && message.data.len() as u64 >= self.piece_bytes();
         if self.pending.records.len() as u64 >= self.piece_bytes()
@@ -190,7 +190,7 @@ impl FileWriter {
         }
         let written = self.write_pending(message.data);
         if written.is_err() {
-            // Its channel waits for the next try.
+            // Its channel record waits for the next attempt.
             let mut records = std::mem::take(&mut self.pending.records);
             records.truncate(usize::try_from(offset).unwrap_or(usize::MAX));
             self.pending = Pending {
@@ -201,7 +201,7 @@ impl FileWriter {
         written
     }
 
-    /// Hands everything taken to the system: it survives the end of this process.
+    /// Writes everything accepted to the system: it survives the end of this process.
     pub(super) fn flush(&mut self) -> io::Result<()> {
         if self.pending.records.is_empty() {
             return Ok(());
@@ -209,12 +209,12 @@ impl FileWriter {
         self.write_pending(&[])
     }
 
-    /// Waits until everything flushed is on the disk: it survives the loss of power.
+    /// Waits until everything flushed is on disk: it survives a loss of power.
     pub(super) fn sync(&self) -> io::Result<()> {
         self.file.sync_data()
     }
 
-    /// Appends a metadata record behind everything taken.
+    /// Appends a metadata record after everything accepted.
     pub(super) fn write_metadata(&mut self, metadata: &Metadata) -> io::Result<()> {
         self.flush()?;
         let mut record = Vec::new();
@@ -226,8 +226,7 @@ impl FileWriter {
         Ok(())
     }
 
-    /// Forgets what is not in the file, and says how many messages of which channel that was, and
-    /// how many bytes those had.
+    /// Discards what is not in the file, and returns the number of messages and bytes per channel.
     pub(super) fn discard(&mut self) -> BTreeMap<u16, (u64, u64)> {
         let pending = std::mem::take(&mut self.pending);
         let length = |offset: u64| {
@@ -242,7 +241,7 @@ impl FileWriter {
         counts.collect()
     }
 
-    /// Writes summary and footer. `channels` are all that are known, also without messages.
+    /// Writes summary and footer. `channels` are all known ones, including those without messages.
     pub(super) fn finish(
         &mut self,
         channels: impl Iterator<Item = (Schema, Channel)>,
@@ -261,16 +260,16 @@ impl FileWriter {
         end.extend_from_slice(&summary);
         end.extend_from_slice(&mcap::MAGIC);
         self.append(&[&end])?;
-        // Gives back what is still reserved behind the end.
+        // Releases the space reserved behind the end.
         self.file.set_len(self.position)
     }
 
-    /// Bytes in the file.
+    /// Returns the bytes in the file.
     pub(super) fn position(&self) -> u64 {
         self.position
     }
 
-    /// Bytes in the file, and those that wait as far as their size is known.
+    /// Returns the bytes in the file, and the waiting ones if their size is known.
     pub(super) fn expected_bytes(&self) -> u64 {
         match self.storage.compression {
             Compression::None => self.position + self.pending.records.len() as u64,
@@ -278,22 +277,22 @@ impl FileWriter {
         }
     }
 
-    /// Bytes of its index in memory.
+    /// Returns the bytes of its index in memory.
     pub(super) fn index_bytes(&self) -> u64 {
         self.chunk_indexes.len() as u64
     }
 
-    /// Messages taken.
+    /// Returns the number of accepted messages.
     pub(super) fn messages(&self) -> u64 {
         self.statistics.message_count + self.pending.messages
     }
 
-    /// Messages of each channel in the file.
+    /// Returns the number of messages in the file, per channel.
     pub(super) fn counts(&self) -> &BTreeMap<u16, u64> {
         &self.statistics.channel_message_counts
     }
 
-    /// Earliest and latest log time in the file and of what waits.
+    /// Returns the earliest and latest log time, including waiting messages.
     pub(super) fn times(&self) -> Option<(u64, u64)> {
         let written = self.statistics.message_count > 0;
         let written = written.then_some((self.statistics.start, self.statistics.end));
@@ -317,9 +316,10 @@ impl FileWriter {
         }
     }
 
-    /// `tail`: the data of the last message, where it is not among the records.
+    /// Writes the waiting records. `tail`: the data of the last message, if it is not among the
+    /// records.
     fn write_pending(&mut self, tail: &[u8]) -> io::Result<()> {
-        // Taken out while it is written; put back where that fails.
+        // Taken out during the write; restored if it fails.
         let mut pending = std::mem::take(&mut self.pending);
         let written = if self.storage.chunked {
             self.write_chunk(&pending, tail)
@@ -347,7 +347,7 @@ impl FileWriter {
                 .or_default();
             *count += index.len() as u64;
         }
-        // The memory is used again, but not that of a message far beyond the usual.
+        // Keeps the memory, except for that of an unusually large message.
         pending.records.clear();
         let usual = usize::try_from(self.piece_bytes()).unwrap_or(usize::MAX);
         pending.records.shrink_to(usual.saturating_mul(2));
@@ -404,7 +404,7 @@ impl FileWriter {
         Ok(())
     }
 
-    /// All pieces or nothing.
+    /// Appends all pieces or none.
     fn append(&mut self, pieces: &[&[u8]]) -> io::Result<()> {
         let length: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
         for piece in pieces {
@@ -420,13 +420,13 @@ impl FileWriter {
         Ok(())
     }
 
-    /// Back to the last whole record.
+    /// Truncates the file to the last complete record.
     fn cut(&mut self) -> io::Result<()> {
         self.file.set_len(self.position)?;
         self.file.seek(io::SeekFrom::Start(self.position)).map(drop)
     }
 
-    /// Room for this much more, and for the end of the file.
+    /// Reserves space for this many bytes, and for the end of the file.
     fn reserve(&mut self, length: u64) -> io::Result<()> {
         if !self.reserves {
             return Ok(());
@@ -436,7 +436,7 @@ impl FileWriter {
             let metadata = channel.metadata.values().map(String::len);
             metadata.sum::<usize>() + channel.topic.len() + 128
         });
-        // Channels come again in metadata.yaml and in its record.
+        // Channels are repeated in metadata.yaml and in its record.
         let channels = channels.sum::<usize>() * 3;
         let summary = definitions.sum::<usize>() + channels + self.chunk_indexes.len();
         match allocate(
@@ -455,7 +455,8 @@ impl FileWriter {
         }
     }
 
-    /// Schemas, channels, statistics, indexes, offsets of these groups, footer.
+    /// Returns the summary: schemas, channels, statistics, indexes, offsets of these groups,
+    /// footer.
     fn summary(&self, start: u64) -> Vec<u8> {
         let mut out = Vec::new();
         let mut groups = Vec::new();
@@ -518,7 +519,7 @@ impl FileWriter {
     }
 }
 
-/// Reserves room behind `offset` without changing the file's length.
+/// Reserves space behind `offset` without changing the file's length.
 fn allocate(file: &File, offset: u64, length: u64) -> io::Result<()> {
     retry_on_intr(|| fallocate(file, FallocateFlags::KEEP_SIZE, offset, length))?;
     Ok(())

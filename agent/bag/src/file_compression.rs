@@ -1,4 +1,4 @@
-//! Compressing the complete files of a bag as a whole, which takes long: work for another thread.
+//! Compression of the complete files of a bag, which is slow and meant for another thread.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::compression::Progress;
 use super::{Compression, Error, new_file, open_file, with_suffix};
 
-/// Work for another thread: one complete file to compress.
+/// The task of compressing one complete file.
 #[derive(Clone, Debug)]
 pub struct FileCompression {
     pub(super) path: PathBuf,
@@ -14,7 +14,7 @@ pub struct FileCompression {
     pub(super) index: usize,
 }
 
-/// That work, done; for [`super::Writer::compressed`].
+/// A finished task, for [`super::Writer::compressed`].
 #[derive(Debug)]
 pub struct Compressed {
     pub(super) index: usize,
@@ -23,7 +23,7 @@ pub struct Compressed {
 }
 
 impl FileCompression {
-    /// For a file that is complete already.
+    /// Creates the task for a complete file.
     pub(super) fn of(path: &Path, compression: Compression) -> Self {
         Self {
             path: path.to_owned(),
@@ -32,18 +32,19 @@ impl FileCompression {
         }
     }
 
-    /// Bytes of the file.
+    /// Returns the size of the file in bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         fs::metadata(&self.path).map_or(0, |metadata| metadata.len())
     }
 
-    /// Compresses the file beside itself, then removes it. Takes long; needs room for both.
+    /// Compresses the file beside itself, then removes it. Slow; needs space for both.
     pub fn run(&self) -> Result<Compressed, Error> {
         self.run_watched(&Progress::default())
     }
 
-    /// As [`Self::run`]. Fails where `progress` is given up; the file then stays as it was.
+    /// Does the same as [`Self::run`]. Fails if `progress` is cancelled; the file is then
+    /// unchanged.
     pub fn run_watched(&self, progress: &Progress) -> Result<Compressed, Error> {
         let into = with_suffix(&self.path, self.compression.name());
         let part = with_suffix(&into, "part");

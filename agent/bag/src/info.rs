@@ -1,7 +1,7 @@
-//! What a bag is and holds: the facts that `ros2 bag info` prints.
+//! Content of a bag: the facts that `ros2 bag info` prints.
 //!
-//! From metadata.yaml alone where there is one, as the original does, so that bags of another
-//! storage are known as well; only [`Bag::details`] reads the files. Writes nothing.
+//! Reads only metadata.yaml if it exists, as the original does, so that bags of other storages are
+//! supported as well; only [`Bag::details`] reads the files. Writes nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -17,47 +17,47 @@ use super::read::{self, Contents, ReadError};
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Bag {
     path: PathBuf,
-    /// As metadata.yaml has it, or as a single file would.
+    /// Content of metadata.yaml, or the equivalent for a single file.
     pub metadata: Metadata,
-    /// Of all files in the directory.
+    /// Size of all files in the directory.
     pub bytes: u64,
 }
 
-/// Why nothing is known of a bag.
+/// Why a bag cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum InfoError {
-    /// A directory that is no bag, or a recording that never began.
+    /// A directory that is not a bag, or a recording that never started.
     #[error(
         "Could not find metadata in bag directory {}: `rp bag reindex` makes it from the files",
         .0.display()
     )]
     NoMetadata(PathBuf),
-    /// metadata.yaml is none.
+    /// metadata.yaml is invalid.
     #[error("Exception on parsing info file: {0}")]
     Metadata(#[from] metadata::MetadataError),
-    /// Another storage.
+    /// The bag uses another storage.
     #[error(
         "{} is in the sqlite3 storage, which rp does not read: `ros2 bag convert` makes an MCAP bag of it",
         .0.display()
     )]
     Sqlite3(PathBuf),
-    /// No bag at all.
+    /// The path is not a bag.
     #[error("No plugin detected that could open file {}", .0.display())]
     Unknown(PathBuf),
-    /// A file of it.
+    /// A file of the bag cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
 }
 
-/// How the name of a topic with service events ends.
+/// Suffix of a topic with service events.
 pub const SERVICE_EVENT: &str = "/_service_event";
 
-/// Facts that are in the files of a bag and not in its metadata.
+/// Facts that are in the files of a bag but not in its metadata.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Details {
-    /// Bytes of each topic's messages.
+    /// Bytes of messages, per topic.
     sizes: BTreeMap<String, u64>,
-    /// Of each topic with service events.
+    /// Calls per topic with service events.
     calls: BTreeMap<String, Calls>,
 }
 
@@ -72,7 +72,7 @@ impl Bag {
     /// Opens a directory with metadata.yaml, or one file.
     ///
     /// # Errors
-    /// Nothing there can be read, or it is no bag.
+    /// Fails if nothing there can be read, or if it is not a bag.
     pub fn open(path: &Path) -> Result<Self, InfoError> {
         let wrong = |source| ReadError::Io {
             path: path.to_owned(),
@@ -131,7 +131,7 @@ impl Bag {
     /// Reads all messages, as `ros2 bag info -v` does.
     ///
     /// # Errors
-    /// The bag has another storage, or a file cannot be read.
+    /// Fails if the bag uses another storage, or if a file cannot be read.
     pub fn details(&self) -> Result<Details, InfoError> {
         if self.metadata.storage_identifier != "mcap" {
             return Err(InfoError::Sqlite3(self.path.clone()));
@@ -167,7 +167,7 @@ impl Bag {
     }
 }
 
-/// The text of metadata.yaml; of one that is too large, enough to see that.
+/// Returns the text of metadata.yaml; for one that is too large, enough of it to detect that.
 pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
     let mut text = String::new();
     let file = open_file(path)?;
@@ -176,7 +176,7 @@ pub(super) fn read_text(path: &Path) -> std::io::Result<String> {
     Ok(text)
 }
 
-/// A single file's, as metadata.yaml would have it.
+/// Returns metadata.yaml's equivalent for a single file.
 pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
     let mut said = None;
     let mut ros_distro = String::new();
@@ -233,13 +233,13 @@ pub(super) fn of_contents(contents: &Contents, path: &str) -> Metadata {
 }
 
 impl Details {
-    /// Bytes of the messages of a topic; 0 for an unknown one.
+    /// Returns the bytes of a topic's messages; 0 for an unknown topic.
     #[must_use]
     pub fn size(&self, topic: &str) -> u64 {
         self.sizes.get(topic).copied().unwrap_or(0)
     }
 
-    /// How many requests and how many responses the events of a service hold, by the name of their topic.
+    /// Returns the numbers of requests and responses of a service, by the name of its event topic.
     #[must_use]
     pub fn calls(&self, topic: &str) -> (usize, usize) {
         let calls = self.calls.get(topic);
@@ -249,7 +249,8 @@ impl Details {
     }
 }
 
-/// A service event begins with `service_msgs/msg/ServiceEventInfo`: kind, time, client, number.
+/// Records a service event, which begins with `service_msgs/msg/ServiceEventInfo`: kind, time,
+/// client, number.
 fn note_call(calls: &mut Calls, message: &Message<'_>) {
     let Some((header, body)) = message.data.split_first_chunk::<4>() else {
         return;

@@ -3,12 +3,12 @@
 //! A bag is a directory with metadata.yaml and files that `ros2 bag play`, Foxglove and the PyPI
 //! readers open.
 //!
-//! - [`Writer`] makes a bag; [`Options`] choose form, compression and the size of files.
-//! - [`info::Bag`] opens a bag and knows what it holds; [`read`] walks over the records of a file.
+//! - [`Writer`] writes a bag; [`Options`] choose form, compression and the size of files.
+//! - [`info::Bag`] opens a bag and describes its content; [`read`] visits the records of a file.
 //! - [`reindex::reindex`] completes the files of a bag whose writer was killed.
 //!
-//! Nothing here has a thread, reads a clock, subscribes, decodes or chooses topics: callers pass
-//! times, payloads and the text of schemas. sqlite3 bags are neither written nor read.
+//! This crate starts no thread, reads no clock, and neither subscribes, decodes nor selects topics:
+//! callers pass times, payloads and the text of schemas. sqlite3 bags are neither written nor read.
 //!
 //! ```
 //! use std::collections::BTreeMap;
@@ -69,45 +69,46 @@ pub use writer::{Schema, Summary, TopicDescription, TopicId, TopicSummary, Write
 /// Why a bag cannot be written. After an error a file is valid up to its last flushed chunk.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    /// Nothing is written into what exists.
+    /// The directory exists; existing ones are never written to.
     #[error("Output folder '{}' already exists.", .0.display())]
     Exists(PathBuf),
-    /// File names are made of the directory's, and metadata.yaml is text.
+    /// The name is not UTF-8, but names of files and metadata.yaml derive from it.
     #[error("the bag's name must be text: {}", .0.display())]
     Name(PathBuf),
-    /// The directory or a file in it cannot be made.
+    /// The directory or a file in it cannot be created.
     #[error("cannot create {}", path.display())]
     Create {
-        /// What.
+        /// Path of the file or directory.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: io::Error,
     },
     /// The file system is full, or the quota is used up.
     #[error("no space left to write {}", path.display())]
     DiskFull {
-        /// What.
+        /// Path of the file.
         path: PathBuf,
-        /// As the system says it.
+        /// Error of the system.
         source: io::Error,
     },
-    /// The file system or a limit of the process allows no larger file: splitting helps.
+    /// The file has the largest size that the file system or a process limit allows; a smaller
+    /// `max_file_bytes` avoids this.
     #[error("{} has the largest size allowed", path.display())]
     FileTooLarge {
-        /// What.
+        /// Path of the file.
         path: PathBuf,
-        /// As the system says it.
+        /// Error of the system.
         source: io::Error,
     },
-    /// What a recording may take is used up.
+    /// The recording's quota is used up.
     #[error("{0}")]
     Limit(String),
-    /// Anything else that writing can meet.
+    /// Any other write error.
     #[error("cannot write {}", path.display())]
     Write {
-        /// What.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: io::Error,
     },
     /// MCAP counts channels with 16 bits.
@@ -116,11 +117,11 @@ pub enum Error {
     /// A topic has one type in a bag.
     #[error("{topic} has the types {first} and {second}: a bag holds one of them")]
     TypeConflict {
-        /// Its name.
+        /// Name of the topic.
         topic: String,
-        /// The one in the bag.
+        /// Type in the bag.
         first: String,
-        /// The one refused.
+        /// Rejected type.
         second: String,
     },
 }
@@ -132,14 +133,14 @@ fn with_suffix(path: &Path, suffix: &str) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// Makes a file of a bag, which must not exist: for its owner, and for the group to read.
+/// Creates a file of a bag, which must not exist: writable by its owner, readable by the group.
 fn new_file(path: &Path) -> io::Result<File> {
     let mut options = OpenOptions::new();
     options.write(true).create_new(true).mode(0o640).open(path)
 }
 
-/// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
-/// open file is checked, so nothing can take its place in between.
+/// Opens a regular file for reading. The open never blocks, as it would on a pipe without a writer;
+/// the check is made on the open file, so the path cannot be swapped in between.
 fn open_file(path: &Path) -> io::Result<File> {
     let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
     let flags = flags.bits().cast_signed();

@@ -1,8 +1,8 @@
-//! MCAP records: their bytes, both ways (MCAP specification, "Records").
+//! MCAP records, encoding and decoding (MCAP specification, "Records").
 //!
-//! Exists because chunks have to be compressed without C, cut where a recording is flushed, and
-//! read again from files that were never finished. Knows nothing of files or of ROS. Reading is
-//! bounded: a length is believed only when its bytes are there.
+//! Exists because chunks must be compressed without C, cut when a recording is flushed, and read
+//! from files that were never finished. Knows neither files nor ROS. Decoding is bounded: a length
+//! counts only if its bytes exist.
 
 mod fields;
 
@@ -10,12 +10,12 @@ use std::collections::BTreeMap;
 
 use fields::{Cursor, length, numbers, text, texts};
 
-/// Begins and ends a file.
+/// Starts and ends a file.
 pub const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 /// Opcode and length.
 pub const RECORD_HEADER: usize = 9;
 
-/// What kind of record follows.
+/// Kind of a record.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub struct Opcode(pub u8);
 
@@ -36,7 +36,7 @@ impl Opcode {
     pub const DATA_END: Self = Self(0x0f);
 }
 
-/// Writes one record: its header, then what `content` appends.
+/// Writes one record: its header, then the output of `content`.
 pub fn record(out: &mut Vec<u8>, opcode: Opcode, content: impl FnOnce(&mut Vec<u8>)) {
     out.push(opcode.0);
     let length_at = out.len();
@@ -49,50 +49,50 @@ pub fn record(out: &mut Vec<u8>, opcode: Opcode, content: impl FnOnce(&mut Vec<u
     }
 }
 
-/// How messages of one type look.
+/// Definition of a message type.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Schema {
-    /// Never 0.
+    /// Id in this file; never 0.
     pub id: u16,
-    /// `pkg/msg/Type`.
+    /// Name of the type: `pkg/msg/Type`.
     pub name: String,
-    /// `ros2msg`; empty where the definition is unknown (rosbag2 also writes `unknown`).
+    /// `ros2msg`; empty if the definition is unknown (rosbag2 also writes `unknown`).
     pub encoding: String,
-    /// The definition.
+    /// Text of the definition.
     pub data: Vec<u8>,
 }
 
-/// One topic.
+/// A topic.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Channel {
-    /// Its number in this file.
+    /// Id in this file.
     pub id: u16,
-    /// Its schema's number; 0 for none.
+    /// Id of its schema; 0 for none.
     pub schema_id: u16,
-    /// With leading `/`.
+    /// Name of the topic, with leading `/`.
     pub topic: String,
-    /// `cdr`.
+    /// Encoding of its messages: `cdr`.
     pub message_encoding: String,
-    /// Sorted, so that one channel always has one spelling.
+    /// Sorted, so that a channel always has the same bytes.
     pub metadata: BTreeMap<String, String>,
 }
 
 /// One message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Message<'a> {
-    /// On which channel.
+    /// Id of its channel.
     pub channel_id: u16,
-    /// The publisher's.
+    /// The publisher's sequence number.
     pub sequence: u32,
-    /// When it was received, nanoseconds since the epoch.
+    /// Time of reception, in nanoseconds since the epoch.
     pub log_time: u64,
-    /// When it was sent.
+    /// Time of sending, in nanoseconds since the epoch.
     pub publish_time: u64,
-    /// With the encapsulation header.
+    /// Payload, including the encapsulation header.
     pub data: &'a [u8],
 }
 
-/// A chunk's frame.
+/// Header of a chunk, and its records.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Chunk<'a> {
     /// Earliest log time.
@@ -101,7 +101,7 @@ pub struct Chunk<'a> {
     pub end: u64,
     /// Length of the records before compression.
     pub uncompressed_size: u64,
-    /// Of the records before compression; 0 for none.
+    /// Checksum of the records before compression; 0 for none.
     pub uncompressed_crc: u32,
     /// Empty, `lz4` or `zstd`.
     pub compression: &'a str,
@@ -109,69 +109,69 @@ pub struct Chunk<'a> {
     pub records: &'a [u8],
 }
 
-/// Where a chunk lies and what is in it.
+/// Position and content of a chunk.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct ChunkIndex {
     /// Earliest log time.
     pub start: u64,
     /// Latest log time.
     pub end: u64,
-    /// Where the chunk's record begins.
+    /// Offset of the chunk's record.
     pub offset: u64,
-    /// Length of the chunk's record with its header.
+    /// Length of the chunk's record, including its header.
     pub length: u64,
-    /// Where each channel's message index begins.
+    /// Offset of each channel's message index.
     pub message_indexes: BTreeMap<u16, u64>,
-    /// Length of all message indexes with their headers.
+    /// Length of all message indexes, including their headers.
     pub message_indexes_length: u64,
-    /// As in the chunk.
+    /// Compression, as in the chunk.
     pub compression: String,
-    /// Of the records.
+    /// Length of the compressed records.
     pub compressed_size: u64,
-    /// Of the records before compression.
+    /// Length of the records before compression.
     pub uncompressed_size: u64,
 }
 
-/// What the file holds.
+/// Statistics of a file.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Statistics {
-    /// All messages.
+    /// Number of messages.
     pub message_count: u64,
-    /// Schemas of messages.
+    /// Number of schemas.
     pub schema_count: u16,
-    /// Channels with messages.
+    /// Number of channels with messages.
     pub channel_count: u32,
-    /// Attachments; none is ever written here.
+    /// Number of attachments; this crate writes none.
     pub attachment_count: u32,
-    /// Metadata records.
+    /// Number of metadata records.
     pub metadata_count: u32,
-    /// Chunks.
+    /// Number of chunks.
     pub chunk_count: u32,
     /// Earliest log time, 0 without messages.
     pub start: u64,
     /// Latest log time, 0 without messages.
     pub end: u64,
-    /// Of each channel with messages.
+    /// Number of messages, per channel with messages.
     pub channel_message_counts: BTreeMap<u16, u64>,
 }
 
 /// A named map.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Metadata {
-    /// `rosbag2`.
+    /// Name of the map: `rosbag2`.
     pub name: String,
-    /// What it says.
+    /// Entries of the map.
     pub entries: BTreeMap<String, String>,
 }
 
-/// Where the summary begins.
+/// Position of the summary.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Footer {
-    /// 0 for none.
+    /// Offset of the summary; 0 for none.
     pub summary_start: u64,
-    /// 0 for none.
+    /// Offset of the summary offsets; 0 for none.
     pub summary_offset_start: u64,
-    /// 0 for none.
+    /// Checksum of the summary; 0 for none.
     pub summary_crc: u32,
 }
 
@@ -195,7 +195,7 @@ impl Schema {
         });
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -220,7 +220,7 @@ impl Channel {
         });
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -235,7 +235,7 @@ impl Channel {
 }
 
 impl<'a> Message<'a> {
-    /// Bytes of a message's record beside its data.
+    /// Bytes of a message's record in addition to its data.
     pub const OVERHEAD: usize = RECORD_HEADER + 22;
 
     /// Appends the record.
@@ -245,7 +245,7 @@ impl<'a> Message<'a> {
         out.extend_from_slice(self.data);
     }
 
-    /// Appends the record up to where [`Self::data`] follow.
+    /// Appends the record up to [`Self::data`], which the caller appends.
     pub fn write_head(&self, out: &mut Vec<u8>) {
         out.push(Opcode::MESSAGE.0);
         let content = Self::OVERHEAD - RECORD_HEADER + self.data.len();
@@ -256,7 +256,7 @@ impl<'a> Message<'a> {
         out.extend_from_slice(&self.publish_time.to_le_bytes());
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &'a [u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -271,8 +271,8 @@ impl<'a> Message<'a> {
 }
 
 impl<'a> Chunk<'a> {
-    /// Appends the record up to where [`Self::records`] follow, and `more` bytes of records behind
-    /// them; both are written by themselves.
+    /// Appends the record up to [`Self::records`], with `more` bytes of records after them; the
+    /// caller appends both.
     pub fn write_head(&self, out: &mut Vec<u8>, more: usize) {
         out.push(Opcode::CHUNK.0);
         let records = self.records.len() + more;
@@ -286,7 +286,7 @@ impl<'a> Chunk<'a> {
         out.extend_from_slice(&(records as u64).to_le_bytes());
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &'a [u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -331,7 +331,7 @@ impl ChunkIndex {
         });
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -370,7 +370,7 @@ impl Statistics {
         });
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -397,7 +397,7 @@ impl Metadata {
         });
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -408,7 +408,7 @@ impl Metadata {
     }
 }
 
-/// Appends where a metadata record lies; `length` counts its header.
+/// Appends the index entry of a metadata record; `length` includes its header.
 pub fn metadata_index(out: &mut Vec<u8>, offset: u64, length: u64, name: &str) {
     record(out, Opcode::METADATA_INDEX, |out| {
         out.extend_from_slice(&offset.to_le_bytes());
@@ -417,20 +417,20 @@ pub fn metadata_index(out: &mut Vec<u8>, offset: u64, length: u64, name: &str) {
     });
 }
 
-/// Offset and length, from the content of such a record.
+/// Returns offset and length, given the content of such a record.
 #[must_use]
 pub fn read_metadata_index(content: &[u8]) -> Option<(u64, u64)> {
     let mut cursor = Cursor(content);
     Some((cursor.u64()?, cursor.u64()?))
 }
 
-/// The profile, from the first record's content.
+/// Returns the profile, given the first record's content.
 #[must_use]
 pub fn read_header(content: &[u8]) -> Option<String> {
     Cursor(content).text().map(str::to_owned)
 }
 
-/// Compression and what is there of the records, from a chunk's content that was cut.
+/// Returns the compression and the available records, given the content of a truncated chunk.
 #[must_use]
 pub fn cut_chunk(content: &[u8]) -> Option<(&str, &[u8])> {
     let mut cursor = Cursor(content);
@@ -440,7 +440,7 @@ pub fn cut_chunk(content: &[u8]) -> Option<(&str, &[u8])> {
     Some((compression, cursor.0))
 }
 
-/// Appends where the summary has its records of one kind.
+/// Appends the position of the summary's records of one kind.
 pub fn summary_offset(out: &mut Vec<u8>, group: Opcode, start: u64, length: u64) {
     record(out, Opcode::SUMMARY_OFFSET, |out| {
         out.push(group.0);
@@ -460,7 +460,7 @@ impl Footer {
     /// Length of its record.
     pub const LENGTH: usize = RECORD_HEADER + 20;
 
-    /// Appends the record without its last field, the checksum, which covers what is before it.
+    /// Appends the record without its last field: the checksum of everything before it.
     pub fn write_without_crc(&self, out: &mut Vec<u8>) {
         out.push(Opcode::FOOTER.0);
         out.extend_from_slice(&20_u64.to_le_bytes());
@@ -468,7 +468,7 @@ impl Footer {
         out.extend_from_slice(&self.summary_offset_start.to_le_bytes());
     }
 
-    /// From a record's content.
+    /// Parses a record's content; `None` if it is malformed.
     #[must_use]
     pub fn read(content: &[u8]) -> Option<Self> {
         let mut cursor = Cursor(content);
@@ -480,8 +480,8 @@ impl Footer {
     }
 }
 
-/// The next record of `bytes`: opcode, content, and what follows it. `None` when it is not all
-/// there.
+/// Returns the next record of `bytes`: opcode, content, and the bytes after it. `None` if it is
+/// incomplete.
 #[must_use]
 pub fn next_record(bytes: &[u8]) -> Option<(Opcode, &[u8], &[u8])> {
     let mut cursor = Cursor(bytes);

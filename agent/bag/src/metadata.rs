@@ -1,7 +1,7 @@
-//! metadata.yaml: what a bag directory says about its files.
+//! metadata.yaml: a bag directory's description of its files.
 //!
 //! Written byte for byte as rosbag2 does (yaml-cpp's layout, no newline at the end), read in every
-//! version. Knows nothing of MCAP; the same text stands in the files' own metadata records.
+//! version. Knows nothing of MCAP; the files' metadata records hold the same text.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -9,98 +9,98 @@ use std::fmt::Write as _;
 use saphyr_parser::{Event, Parser};
 use serde::Deserialize;
 
-/// The file in every bag directory.
+/// Name of the file in every bag directory.
 pub const FILE_NAME: &str = "metadata.yaml";
-/// Larger than that of a bag with thousands of files and topics.
+/// Largest file accepted: more than a bag with thousands of files and topics needs.
 pub const MAX_BYTES: u64 = 64 << 20;
-/// A bag's own goes 8 levels deep.
+/// Deepest nesting accepted; a real file has 8 levels.
 const MAX_DEPTH: usize = 32;
-/// Keys, values, lists and maps: some 40 for each topic, 15 for each file.
+/// Most keys, values, lists and maps: some 40 per topic and 15 per file.
 const MAX_EVENTS: usize = 1_000_000;
 /// `starting_time` of a bag without messages.
 pub const NO_START: u64 = i64::MAX.cast_unsigned();
 
-/// Why a text is none.
+/// Why a text is not a metadata.yaml.
 #[derive(Debug, thiserror::Error)]
 pub enum MetadataError {
-    /// Other YAML, or none.
+    /// The YAML has another structure.
     #[error(transparent)]
     Yaml(#[from] serde_yaml::Error),
-    /// No YAML, or much deeper than that.
+    /// The text is not YAML.
     #[error(transparent)]
     Scan(#[from] saphyr_parser::ScanError),
-    /// No bag's.
+    /// The text is too long.
     #[error("it is larger than {MAX_BYTES} bytes")]
     TooLarge,
-    /// No bag's.
+    /// The text is nested too deeply.
     #[error("it is nested more than {MAX_DEPTH} levels deep")]
     TooDeep,
-    /// No bag's.
+    /// The text has too many keys and values.
     #[error("it has more than {MAX_EVENTS} keys and values")]
     TooMany,
 }
 
-/// What metadata.yaml holds.
+/// Content of metadata.yaml.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Metadata {
-    /// 5 is Humble's, 9 that of Jazzy and later.
+    /// Version: 5 is Humble's, 9 that of Jazzy and later.
     pub version: u32,
-    /// `mcap` or `sqlite3`.
+    /// Storage: `mcap` or `sqlite3`.
     pub storage_identifier: String,
-    /// From the first to the last message, nanoseconds.
+    /// Time from the first to the last message, in nanoseconds.
     pub duration: u64,
-    /// Of the first message; [`NO_START`] without any.
+    /// Time of the first message; [`NO_START`] without any.
     pub starting_time: u64,
-    /// Of all topics.
+    /// Number of messages of all topics.
     pub message_count: u64,
-    /// Also those without messages.
+    /// Topics, including those without messages.
     pub topics: Vec<Topic>,
-    /// Empty or `zstd`.
+    /// Compression format: empty or `zstd`.
     pub compression_format: String,
-    /// Empty, `FILE` or `MESSAGE`.
+    /// Compression mode: empty, `FILE` or `MESSAGE`.
     pub compression_mode: String,
-    /// Within the directory.
+    /// Paths of the files within the directory.
     pub relative_file_paths: Vec<String>,
-    /// One for each file.
+    /// One entry per file.
     pub files: Vec<File>,
-    /// What the recorder wants to say.
+    /// Additional entries of the recorder.
     pub custom_data: BTreeMap<String, String>,
-    /// Empty when unknown.
+    /// Distribution of ROS; empty if unknown.
     pub ros_distro: String,
 }
 
 /// One topic.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Topic {
-    /// With leading `/`.
+    /// Name, with leading `/`.
     pub name: String,
-    /// `pkg/msg/Type`.
+    /// Type: `pkg/msg/Type`.
     pub type_name: String,
-    /// `cdr`.
+    /// Serialization: `cdr`.
     pub serialization_format: String,
-    /// The text of `super::qos::profiles`; not read back from version 9, whose form is another.
+    /// The text of `super::qos::profiles`; not read back from version 9, which has another form.
     pub offered_qos_profiles: String,
-    /// `RIHS01_...` or empty.
+    /// Type hash: `RIHS01_...` or empty.
     pub type_description_hash: String,
-    /// Of this topic.
+    /// Number of messages of this topic.
     pub message_count: u64,
 }
 
 /// One file.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct File {
-    /// Within the directory; where files are compressed, without that suffix, as rosbag2 writes it.
+    /// Path within the directory; without the suffix of a compressed file, as rosbag2 writes it.
     pub path: String,
-    /// Of its first message.
+    /// Time of its first message.
     pub starting_time: u64,
-    /// To its last message.
+    /// Time from its first to its last message.
     pub duration: u64,
-    /// In it.
+    /// Number of its messages.
     pub message_count: u64,
 }
 
 impl Metadata {
-    /// The file's text.
+    /// Returns the file's text.
     #[must_use]
     pub fn file_text(&self) -> String {
         let mut text = "rosbag2_bagfile_information:".to_owned();
@@ -110,7 +110,7 @@ impl Metadata {
         text
     }
 
-    /// The same map without its outer key, as in an MCAP metadata record.
+    /// Returns the same map without its outer key, as in an MCAP metadata record.
     #[must_use]
     pub fn record_text(&self) -> String {
         let mut text = String::new();
@@ -210,14 +210,14 @@ impl Metadata {
         line(&format!("    message_count: {}", topic.message_count));
     }
 
-    /// Reads the file's text.
+    /// Parses the file's text.
     pub fn read(text: &str) -> Result<Self, MetadataError> {
         check(text)?;
         let file: shape::File = serde_yaml::from_str(text)?;
         Ok(file.rosbag2_bagfile_information.into())
     }
 
-    /// Reads the text of a metadata record.
+    /// Parses the text of a metadata record.
     pub fn read_record(text: &str) -> Result<Self, MetadataError> {
         check(text)?;
         let information: shape::Information = serde_yaml::from_str(text)?;
@@ -225,8 +225,8 @@ impl Metadata {
     }
 }
 
-/// Looks at a text event by event before it is read at once: what reads it takes time by the square of
-/// its depth, and memory for each event.
+/// Checks the bounds of a text event by event, before it is parsed as a whole: the parser's time
+/// grows with the square of the depth, and its memory with the number of events.
 fn check(text: &str) -> Result<(), MetadataError> {
     if text.len() as u64 > MAX_BYTES {
         return Err(MetadataError::TooLarge);
@@ -248,7 +248,7 @@ fn check(text: &str) -> Result<(), MetadataError> {
     Ok(())
 }
 
-/// A YAML scalar: plain where nothing can be misread, else in double quotes.
+/// Formats a YAML scalar: plain if it is unambiguous, else in double quotes.
 fn scalar(text: &str) -> String {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"/_-.".contains(&byte);
     let begins = |byte: u8| byte.is_ascii_alphabetic() || b"/_".contains(&byte);
@@ -268,7 +268,7 @@ fn scalar(text: &str) -> String {
             '\n' => quoted.push_str("\\n"),
             '\t' => quoted.push_str("\\t"),
             '\r' => quoted.push_str("\\r"),
-            // Control characters, and what YAML takes for the end of a line or does not print.
+            // Control characters, line ends of YAML, and characters that YAML does not print.
             '\0'..='\u{1f}'
             | '\u{7f}'..='\u{a0}'
             | '\u{2028}'
@@ -285,7 +285,7 @@ fn scalar(text: &str) -> String {
     quoted
 }
 
-/// What stands in the file, key by key.
+/// The structure of the file, key by key.
 mod shape {
     use super::{BTreeMap, Deserialize};
 

@@ -1,4 +1,4 @@
-//! Replacing a bag's metadata.yaml as a whole.
+//! Atomic replacement of a bag's metadata.yaml.
 
 use std::fs;
 use std::io::{self, Write as _};
@@ -7,16 +7,16 @@ use std::path::Path;
 use super::metadata::{self, Metadata};
 use super::{Error, new_file, with_suffix};
 
-/// What a metadata.yaml has to survive.
+/// The failure that a new metadata.yaml must survive.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Durability {
     /// The end of this process.
     Process,
-    /// The loss of power.
+    /// A loss of power.
     Power,
 }
 
-/// Writes the new text beside the file, then takes its place.
+/// Writes the new text beside the file, then renames it over the file.
 pub(super) fn write_metadata(
     directory: &Path,
     metadata: &Metadata,
@@ -25,7 +25,7 @@ pub(super) fn write_metadata(
     let path = directory.join(metadata::FILE_NAME);
     let part = with_suffix(&path, "part");
     let write = || {
-        // Left behind by one that was killed; made anew, so that nothing is written through a link.
+        // Left behind by a killed process; recreated, so that nothing is written through a link.
         match fs::remove_file(&part) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
             _ => {}

@@ -1,7 +1,7 @@
-//! How a bag is written: form, chunks, compression, limits of a file.
+//! Options of writing a bag: form, chunks, compression, limits of a file.
 //!
-//! The presets and the keys of a storage configuration file are those of rosbag2's MCAP plugin. What
-//! has no effect here is refused rather than ignored.
+//! The presets and the keys of a storage configuration file are those of rosbag2's MCAP plugin.
+//! Options without an effect here are rejected rather than ignored.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -11,42 +11,42 @@ use serde::Deserialize;
 use super::compression::Compression;
 use super::qos::Spelling;
 
-/// Everything that can be chosen about a bag.
+/// All options of a bag.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Options {
-    /// Of metadata.yaml and of QoS.
+    /// Form of metadata.yaml and of QoS.
     pub form: Form,
     /// As in `ROS_DISTRO`; may be empty.
     pub ros_distro: String,
-    /// Inside a file.
+    /// Layout of the MCAP files.
     pub storage: Storage,
-    /// Of whole files, once they are complete.
+    /// Compression of whole files after they are complete.
     pub file_compression: Compression,
-    /// A file is split before the message that would come after this many bytes.
+    /// Splits a file before the message that would exceed this many bytes.
     pub max_file_bytes: Option<u64>,
-    /// A file is split before the message that is later than its first by more than this.
+    /// Splits a file before the message that is later than its first by more than this.
     pub max_file_duration: Option<Duration>,
-    /// A file is split when its index, which is kept in memory, takes this many bytes.
+    /// Splits a file when its index, which is kept in memory, takes this many bytes.
     pub max_index_bytes: Option<u64>,
-    /// Also written into metadata.yaml.
+    /// Entries that are added to metadata.yaml.
     pub custom_data: BTreeMap<String, String>,
 }
 
-/// Which distributions can read metadata.yaml and the QoS of topics.
+/// The distributions that can read metadata.yaml and the QoS of topics.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
 pub enum Form {
-    /// Version 5 and QoS as numbers: read by every distribution from Humble on. What later versions
-    /// added stands beside it, where Humble does not look.
+    /// Version 5 and QoS as numbers: readable by every distribution since Humble. Additions of
+    /// later versions are placed where Humble does not read them.
     #[default]
     Compatible,
-    /// As Humble itself writes.
+    /// Exactly as Humble writes.
     Humble,
     /// Version 9 and QoS as names: Jazzy and later.
     Named,
 }
 
 impl Form {
-    /// What this distribution would write.
+    /// Returns the form that this distribution writes.
     #[must_use]
     pub fn of(distro: &str) -> Self {
         match distro {
@@ -55,7 +55,7 @@ impl Form {
         }
     }
 
-    /// Of metadata.yaml.
+    /// Returns the version of metadata.yaml.
     #[must_use]
     pub const fn version(self) -> u32 {
         match self {
@@ -64,7 +64,7 @@ impl Form {
         }
     }
 
-    /// Of QoS.
+    /// Returns the spelling of QoS.
     #[must_use]
     pub const fn spelling(self) -> Spelling {
         match self {
@@ -74,25 +74,25 @@ impl Form {
     }
 }
 
-/// How an MCAP file is written.
+/// Layout of an MCAP file.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Storage {
-    /// Messages are collected in chunks, which are indexed and may be compressed.
+    /// Collect messages in chunks, which are indexed and may be compressed.
     pub chunked: bool,
-    /// A chunk ends with the message that fills it to this.
+    /// Size at which a chunk ends, before compression.
     pub chunk_bytes: u64,
-    /// Of chunks that it makes smaller.
+    /// Compression of chunks, if it makes them smaller.
     pub compression: Compression,
-    /// Of chunks, before compression.
+    /// Write a checksum of each chunk's records before compression.
     pub chunk_crc: bool,
-    /// Of the summary.
+    /// Write a checksum of the summary.
     pub summary_crc: bool,
-    /// Of everything before the summary.
+    /// Write a checksum of everything before the summary.
     pub data_crc: bool,
 }
 
 impl Default for Storage {
-    /// rosbag2's: no compression, no checksum of chunks, 768 KiB.
+    /// Returns rosbag2's defaults: no compression, no checksum of chunks, 768 KiB.
     fn default() -> Self {
         Self {
             chunked: true,
@@ -105,34 +105,34 @@ impl Default for Storage {
     }
 }
 
-/// Why options are none.
+/// Why options are invalid.
 #[derive(Clone, PartialEq, Eq, Debug, thiserror::Error)]
 pub enum OptionsError {
-    /// Not a preset.
+    /// The preset does not exist.
     #[error(
         "unknown MCAP storage preset profile \
         (valid options are 'none', 'fastwrite', 'zstd_fast', 'zstd_small'): {0}"
     )]
     Preset(String),
-    /// The configuration file cannot be used.
+    /// The configuration file is invalid.
     #[error("{0}")]
     Configuration(String),
-    /// Not possible with MCAP.
+    /// The mode is not possible with MCAP.
     #[error(
         "MCAP storage plugin does not support message compression, consider using chunk compression \
         by setting `compression: 'Zstd'` in storage config"
     )]
     MessageCompression,
-    /// Not a mode.
+    /// The mode does not exist.
     #[error("invalid compression mode '{0}': one of none, file, message")]
     Mode(String),
-    /// Not a format.
+    /// The format does not exist.
     #[error("Requested compression format '{0}' unavailable: one of zstd, lz4, none")]
     Format(String),
-    /// `file` without a format.
+    /// Mode `file` without a format.
     #[error("Invalid choice: Cannot specify compression mode without a compression format.")]
     ModeWithoutFormat,
-    /// A limit that no file can keep.
+    /// The limit is smaller than any file.
     #[error(
         "Invalid bag splitting size given. Please provide a value greater than 1024. Specified value \
         of {0}"
@@ -141,7 +141,7 @@ pub enum OptionsError {
 }
 
 impl Storage {
-    /// `--storage-preset-profile`.
+    /// Returns the layout of a `--storage-preset-profile`.
     pub fn preset(name: &str) -> Result<Self, OptionsError> {
         let usual = Self::default();
         Ok(match name {
@@ -155,7 +155,7 @@ impl Storage {
                 compression: Compression::Zstd,
                 ..usual
             },
-            // The plugin's level is the slowest there is; here only the fastest exists.
+            // The plugin uses the slowest level; only the fastest is implemented here.
             "zstd_small" => Self {
                 compression: Compression::Zstd,
                 chunk_bytes: 4 << 20,
@@ -166,7 +166,7 @@ impl Storage {
         })
     }
 
-    /// `--storage-config-file`: its text laid over the preset.
+    /// Applies the text of a `--storage-config-file` to the preset.
     pub fn overlaid(self, yaml: &str) -> Result<Self, OptionsError> {
         let wrong = |what: String| OptionsError::Configuration(what);
         if yaml.trim().is_empty() {
@@ -217,11 +217,11 @@ impl Storage {
     }
 }
 
-/// A chunk is held in memory until it is full.
+/// Largest chunk accepted: a chunk is held in memory until it is full.
 const MAX_CHUNK_BYTES: u64 = 64 << 20;
 
-/// Keys of a storage configuration file. Attachments are never written, so theirs change nothing;
-/// the one zstd level is the fastest.
+/// Keys of a storage configuration file. Attachments are never written, so their keys have no
+/// effect; the only zstd level is the fastest.
 #[derive(Default, Deserialize)]
 #[serde(default, deny_unknown_fields, rename_all = "camelCase")]
 struct Keys {
@@ -265,7 +265,7 @@ impl Keys {
     }
 }
 
-/// `--compression-mode` and `--compression-format`, as compression of whole files.
+/// Parses `--compression-mode` and `--compression-format` as compression of whole files.
 pub fn file_compression(mode: &str, format: &str) -> Result<Compression, OptionsError> {
     let format = match format {
         "" | "none" => Compression::None,
@@ -280,11 +280,11 @@ pub fn file_compression(mode: &str, format: &str) -> Result<Compression, Options
     }
 }
 
-/// `--max-bag-size`: 0 is none.
+/// Parses `--max-bag-size`: 0 is no limit.
 pub fn max_file_bytes(bytes: u64) -> Result<Option<u64>, OptionsError> {
     match bytes {
         0 => Ok(None),
-        // What the MCAP plugin calls its least size.
+        // The smallest size that the MCAP plugin accepts.
         1..1024 => Err(OptionsError::FileBytes(bytes)),
         _ => Ok(Some(bytes)),
     }

@@ -1,25 +1,25 @@
 //! `offered_qos_profiles`: the QoS of a topic's publishers as rosbag2 writes it.
 //!
-//! Two spellings. Humble writes and reads the numbers of `rmw_qos_profile_t`; Jazzy and later write
-//! names and read both, by looking whether `history` is a number. No publisher is `[]` in Jazzy
-//! and an empty text here: the one that every distribution takes (Humble's own `~` ends Jazzy's
-//! reader). Knows nothing of what a player makes of it.
+//! Two spellings exist. Humble writes and reads the numbers of `rmw_qos_profile_t`; Jazzy and later
+//! write names and read both, depending on whether `history` is a number. A topic without
+//! publishers is `[]` in Jazzy and an empty text here, which every distribution accepts (Humble's
+//! own `~` ends Jazzy's reader). This module does not interpret profiles as a player would.
 
 use std::fmt::Write as _;
 
 use ros2probe_wire::Duration;
 use ros2probe_wire::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};
 
-/// How policies are spelled.
+/// Spelling of policies.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Spelling {
-    /// As Humble reads them; read by all.
+    /// As Humble reads them; every distribution reads them.
     Numbers,
     /// As Jazzy and later write them; Humble cannot read them.
     Names,
 }
 
-/// The text for these publishers.
+/// Returns the text for these publishers.
 #[must_use]
 pub fn profiles(publishers: &[Qos], spelling: Spelling) -> String {
     if publishers.is_empty() {
@@ -66,7 +66,7 @@ fn profile(text: &mut String, qos: &Qos, spelling: Spelling) {
     duration(text, "lifespan", qos.lifespan);
     let _ = writeln!(text, "  liveliness: {}", one(liveliness(qos.liveliness)));
     duration(text, "liveliness_lease_duration", qos.liveliness_lease);
-    // Observed endpoints are of ROS topics, whose names follow the conventions.
+    // Observed endpoints belong to ROS topics, whose names follow the conventions.
     text.push_str("  avoid_ros_namespace_conventions: false");
 }
 

@@ -1,8 +1,8 @@
-//! Reading MCAP files: by their summary, or record by record where there is none.
+//! Reads MCAP files by their summary, or record by record without one.
 //!
-//! A file that was never finished is read as far as its records go, into the chunk that was cut.
-//! Memory is bounded by the largest record, and by what a file of this size may expand to. Nothing is
-//! believed to be there that is not, and nothing is written.
+//! A file that was never finished is read to its last record, including the truncated chunk. Memory
+//! is bounded by the largest record, and by a factor of the file's size for compressed content.
+//! Lengths are not trusted, and nothing is written.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -15,71 +15,71 @@ use super::mcap::{
 };
 use super::{Compression, open_file};
 
-/// No record is longer: a length beyond this is damage.
+/// Longest record; a length beyond this is damage.
 const MAX_RECORD: u64 = 1 << 30;
-/// What is compressed in a file may expand to so many bytes, and to [`EXPANSION`] times the file's: much
-/// more than recordings do, for which a few megabytes of the same byte are rare.
+/// Compressed content may expand to this many bytes, and to [`EXPANSION`] times the file's size.
+/// Recordings stay far below: a few megabytes of the same byte are rare.
 const EXPANDED: u64 = 64 << 20;
 const EXPANSION: u64 = 1024;
 
-/// What a file holds.
+/// Content of a file.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Contents {
-    /// `ros2`.
+    /// Profile: `ros2`.
     pub profile: String,
-    /// All, by number.
+    /// Schemas by id.
     pub schemas: BTreeMap<u16, Schema>,
-    /// All, by number.
+    /// Channels by id.
     pub channels: BTreeMap<u16, Channel>,
-    /// Messages of each channel.
+    /// Number of messages per channel.
     pub counts: BTreeMap<u16, u64>,
     /// Earliest and latest log time.
     pub times: Option<(u64, u64)>,
-    /// In order.
+    /// Metadata records in order.
     pub metadata: Vec<Metadata>,
 }
 
-/// What a file is found to be, record by record.
+/// Result of reading a file record by record.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
 pub struct Scan {
-    /// What it holds; messages of a cut chunk are in [`Self::cut`] only.
+    /// Content; messages of a truncated chunk are in [`Self::cut`] only.
     pub contents: Contents,
-    /// Bytes of each channel's messages.
+    /// Bytes of messages per channel.
     pub sizes: BTreeMap<u16, u64>,
-    /// The data section ends as it should.
+    /// Whether the data section is complete.
     pub is_ended: bool,
-    /// Where the data section's last whole record ends.
+    /// End of the data section's last complete record.
     pub end: u64,
-    /// Its chunks, as an index would have them.
+    /// Its chunks, as in an index.
     pub chunks: Vec<ChunkIndex>,
     /// Offset and length of metadata records.
     pub metadata_places: Vec<(u64, u64)>,
-    /// What the last chunk's missing indexes would say, where the file ends before them.
+    /// The last chunk's indexes that are missing because the file ends before them.
     pub last_chunk_index: BTreeMap<u16, Vec<(u64, u64)>>,
-    /// Records at the beginning of a chunk that was cut, whole ones only.
+    /// Complete records at the beginning of a truncated chunk.
     pub cut: Vec<u8>,
-    /// Chunks that cannot be looked into.
+    /// Number of chunks that cannot be decompressed or parsed.
     pub unreadable_chunks: u64,
 }
 
 /// Why a file cannot be read at all.
 #[derive(Debug, thiserror::Error)]
 pub enum ReadError {
-    /// It is not there, or not allowed, or broken.
+    /// The file does not exist, or cannot be opened or read.
     #[error("cannot read {}", path.display())]
     Io {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: io::Error,
     },
-    /// It begins otherwise.
+    /// The file does not begin with MCAP's magic.
     #[error("{} is not an MCAP file", .0.display())]
     NotMcap(PathBuf),
 }
 
 impl Contents {
-    /// From the summary at the file's end; `None` where it has none that says all.
+    /// Reads the summary at the file's end; `None` if it is missing or incomplete.
     pub fn of_summary(path: &Path) -> Result<Option<Self>, ReadError> {
         let wrong = |source| ReadError::Io {
             path: path.to_owned(),
@@ -93,7 +93,7 @@ impl Contents {
         read_summary(&mut file).map_err(wrong)
     }
 
-    /// From the summary, or else from all records.
+    /// Reads the summary, or else all records.
     pub fn of_file(path: &Path) -> Result<Self, ReadError> {
         if compression(path) == Compression::None
             && let Some(contents) = Self::of_summary(path)?
@@ -106,7 +106,8 @@ impl Contents {
         Ok(scan.contents)
     }
 
-    /// Messages of all channels. A summary may say any numbers.
+    /// Returns the number of messages of all channels, saturating: a summary may contain any
+    /// numbers.
     pub(super) fn messages(&self) -> u64 {
         self.counts
             .values()
@@ -197,10 +198,10 @@ fn read_at(file: &mut File, offset: u64, length: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// What is called for every message, with what is known of its channel by then.
+/// Called for every message, with the content read before it.
 pub type Visitor<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
 
-/// Reads a file record by record, `.zstd` and `.lz4` decompressed.
+/// Reads a file record by record, decompressing `.zstd` and `.lz4`.
 pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
     let wrong = |source| ReadError::Io {
         path: path.to_owned(),
@@ -230,7 +231,7 @@ pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
     scan_records(&mut records, each).map_err(wrong)
 }
 
-/// Of the whole file, by its name.
+/// Returns the compression of the whole file, by its name.
 pub(super) fn compression(path: &Path) -> Compression {
     let suffix = path.extension().and_then(|suffix| suffix.to_str());
     suffix.and_then(Compression::named).unwrap_or_default()
@@ -268,7 +269,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
             scan.end = records.position;
             continue;
         }
-        // Where nothing was written to, after the loss of power, zeros may stand.
+        // After a loss of power, unwritten parts may be zeros.
         let at_end = matches!(opcode, Opcode(0) | Opcode::DATA_END | Opcode::FOOTER);
         finish_chunk(indexed.take(), &mut scan, at_end);
         match opcode {
@@ -295,7 +296,7 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
             Opcode::HEADER => {
                 scan.contents.profile = mcap::read_header(&content).unwrap_or_default();
             }
-            // Not in a data section: whatever follows is no record either.
+            // Not in a data section: no record follows.
             Opcode(0) | Opcode::FOOTER => return Ok(scan),
             _ => scan.contents.take(opcode, &content),
         }
@@ -308,12 +309,13 @@ struct IndexedChunk {
     chunk: ChunkIndex,
     offsets: BTreeMap<u16, u64>,
     length: u64,
-    /// What they should say.
+    /// The expected content of its indexes.
     index: BTreeMap<u16, Vec<(u64, u64)>>,
 }
 
 impl IndexedChunk {
-    /// Of a record from `start` to `end`, before its message indexes.
+    /// Creates the entry of a chunk whose record extends from `start` to `end`, before its message
+    /// indexes.
     fn new(chunk: &Chunk<'_>, start: u64, end: u64, index: BTreeMap<u16, Vec<(u64, u64)>>) -> Self {
         Self {
             chunk: ChunkIndex {
@@ -334,13 +336,14 @@ impl IndexedChunk {
     }
 }
 
-/// `at_end`: the file ends here, and indexes that are missing can still be written.
+/// Completes the last chunk. `at_end`: the file ends here, and missing indexes can still be
+/// written.
 fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     let Some(mut indexed) = indexed else {
         return;
     };
     if at_end && indexed.offsets.len() < indexed.index.len() {
-        // All of them again, behind the chunk.
+        // All indexes are written again behind the chunk.
         scan.end = indexed.chunk.offset + indexed.chunk.length;
         scan.last_chunk_index = indexed.index;
     } else {
@@ -350,7 +353,7 @@ fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     scan.chunks.push(indexed.chunk);
 }
 
-/// Of what may still be expanded, `left` goes down; a chunk beyond that ends the reading.
+/// Reads a chunk. Subtracts its expanded size from `left`; a chunk beyond that ends the reading.
 fn read_chunk(
     chunk: &Chunk<'_>,
     left: &mut u64,
@@ -389,7 +392,7 @@ fn expands_too_far() -> io::Error {
     )
 }
 
-/// Takes a chunk's records, and says what its message indexes are.
+/// Adds a chunk's records, and returns its expected message indexes.
 fn take_chunk(
     records: &[u8],
     scan: &mut Scan,
@@ -420,7 +423,7 @@ fn take_message(message: &Message<'_>, scan: &mut Scan, each: &mut Visitor<'_>) 
     each(message, &scan.contents);
 }
 
-/// The whole records at the beginning of a chunk's record that was cut.
+/// Returns the complete records at the beginning of a truncated chunk's record.
 fn whole_records(content: &[u8], limit: u64) -> Vec<u8> {
     let Some((compression, records)) = mcap::cut_chunk(content) else {
         return Vec::new();
@@ -430,7 +433,7 @@ fn whole_records(content: &[u8], limit: u64) -> Vec<u8> {
         Some(Compression::None) => bytes.extend_from_slice(records),
         Some(compression) => {
             if let Ok(reader) = compression.reader(records) {
-                // Up to where it was cut, which is an error here.
+                // Reads up to the truncation, which is an error here.
                 let _ = reader.take(limit).read_to_end(&mut bytes);
             }
         }
@@ -447,19 +450,19 @@ fn whole_records(content: &[u8], limit: u64) -> Vec<u8> {
     bytes
 }
 
-/// Records one after the other.
+/// Reads records one after the other.
 struct Records<'a> {
     reader: Box<dyn Read + 'a>,
     position: u64,
-    /// How much the reader may still give.
+    /// Bytes that may still be read.
     left: u64,
-    /// How much compressed chunks may still expand to.
+    /// Bytes to which compressed chunks may still expand.
     expands: u64,
 }
 
 enum Next {
     Whole(Opcode),
-    /// The file ends within it; what is there of its content was read.
+    /// The file ends within this record; the available content was read.
     Cut(Opcode),
     End,
 }
@@ -487,7 +490,8 @@ impl Records<'_> {
         })
     }
 
-    /// Reads at most this much: allocated as it comes. A compressed stream that was cut just ends.
+    /// Reads at most this many bytes, allocating as they arrive. A truncated compressed stream just
+    /// ends.
     fn read(&mut self, length: u64, into: &mut Vec<u8>) -> io::Result<u64> {
         let before = into.len();
         let limit = length.min(self.left);

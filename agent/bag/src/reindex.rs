@@ -1,9 +1,9 @@
-//! Making a bag whole again: files that were never finished get their summary, metadata.yaml is
-//! made from the files.
+//! Completes a bag: adds the summary to unfinished files, and regenerates metadata.yaml from the
+//! files.
 //!
-//! A file is rewritten beside itself and takes its place when it is on the disk; whatever of it is
-//! no whole record is kept in a file of its own. What is complete is not touched, and what is no
-//! MCAP file is left alone and said.
+//! A file is rewritten beside itself and replaced once the copy is on disk; its incomplete rest is
+//! kept in a separate file. Complete files are not touched; files that are not MCAP are left alone
+//! and reported.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -18,59 +18,59 @@ use super::metadata_file::{Durability, write_metadata};
 use super::read::{self, Contents, ReadError, Scan};
 use super::{Compression, Error, FileCompression, info, open_file, with_suffix};
 
-/// What was found and done.
+/// Result of completing a bag.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Report {
     /// Each file, in order.
     pub files: Vec<FileReport>,
-    /// What metadata.yaml says now.
+    /// The new content of metadata.yaml.
     pub metadata: Metadata,
 }
 
-/// One file.
+/// Result for one file.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct FileReport {
-    /// Its name.
+    /// Name of the file.
     pub name: String,
-    /// In it now.
+    /// Number of messages in the file afterwards.
     pub messages: u64,
-    /// How it was found.
+    /// State of the file before.
     pub found: Found,
 }
 
-/// How a file was found.
+/// State of a file before it was completed.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Found {
-    /// With its summary: not touched.
+    /// It has its summary and was not touched.
     Complete,
-    /// Without: completed.
+    /// It had no summary and was completed.
     Unfinished {
-        /// Of these messages, so many were in a chunk that was cut.
+        /// Messages among them that were in a truncated chunk.
         salvaged: u64,
-        /// Bytes that were no whole record.
+        /// Bytes that formed no complete record.
         cut: u64,
-        /// Where those lie, if they were not only zeros.
+        /// File with those bytes, unless they were all zeros.
         kept: Option<String>,
-        /// Chunks that cannot be looked into; they are still there.
+        /// Chunks that cannot be decompressed or parsed; they were kept.
         unreadable_chunks: u64,
     },
-    /// Not one: left alone, and not in metadata.yaml.
+    /// Not an MCAP file: left alone, and not in metadata.yaml.
     NotMcap,
 }
 
-/// Why nothing, or not everything, was done.
+/// Why a bag could not be completed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReindexError {
-    /// Nothing to make a bag of.
+    /// The directory contains no files of a bag.
     #[error("No storage files found for reindexing in {}", .0.display())]
     NoFiles(PathBuf),
-    /// Another storage.
+    /// The bag uses another storage.
     #[error("{} is in the sqlite3 storage, which rp does not read: use `ros2 bag reindex`", .0.display())]
     Sqlite3(PathBuf),
     /// A file cannot be read.
     #[error(transparent)]
     Read(#[from] ReadError),
-    /// A file cannot be written; the one it was made of is as it was.
+    /// A file cannot be written; its original is unchanged.
     #[error(transparent)]
     Write(#[from] Error),
 }
@@ -93,7 +93,7 @@ pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
             && read::compression(&path) == Compression::None
             && found != Found::NotMcap
         {
-            // In a bag all files are compressed, or none is.
+            // In a bag, either all files are compressed or none.
             FileCompression::of(&path, compression).run()?;
             name.push('.');
             name.push_str(compression.name());
@@ -115,7 +115,7 @@ pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
     })
 }
 
-/// Names of a bag's files by their number.
+/// Returns the names of a bag's files, in order of their number.
 fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     let wrong = |source| ReadError::Io {
         path: directory.to_owned(),
@@ -136,7 +136,7 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
             names.push(name.to_owned());
         }
     }
-    // One that was killed between compressing a file and removing it left both.
+    // A process killed between compressing a file and removing the original left both.
     let all = names.clone();
     names.retain(|name| {
         let is_compressed = |suffix| all.contains(&format!("{name}.{suffix}"));
@@ -152,7 +152,7 @@ fn files(directory: &Path) -> Result<Vec<String>, ReindexError> {
     Ok(names)
 }
 
-/// `12` of `bag_12.mcap`; what has none comes first.
+/// Returns the number of a file, `12` for `bag_12.mcap`; files without one come first.
 fn number(name: &str) -> Option<u64> {
     let (stem, _) = name.split_once(".mcap")?;
     stem.rsplit_once('_')?.1.parse().ok()
@@ -229,7 +229,7 @@ fn definition(known: &Contents, message: &Message<'_>) -> Option<(mcap::Schema, 
     Some((schema.clone(), channel.clone()))
 }
 
-/// Bytes behind the last whole record that were a record once.
+/// Returns the bytes behind the last complete record that once were a record.
 fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
     let length = source.metadata()?.len();
     if scan.is_ended || is_zero(source, scan.end)? {
@@ -238,7 +238,7 @@ fn cut_bytes(source: &mut File, scan: &Scan) -> io::Result<u64> {
     Ok(length - scan.end)
 }
 
-/// Copies what is no whole record beside the file: it may be of use to somebody.
+/// Copies the incomplete rest of a file beside it, for manual recovery.
 fn keep_aside(path: &Path, source: &mut File, scan: &Scan) -> io::Result<Option<String>> {
     if cut_bytes(source, scan)? == 0 {
         return Ok(None);
@@ -300,7 +300,7 @@ fn metadata_of(
                 message_count: 0,
                 ..topic.clone()
             });
-            // Of a topic without messages a later file may know more.
+            // For a topic without messages, a later file may have a better description.
             if known.message_count == 0 {
                 *known = Topic {
                     message_count: 0,
@@ -353,7 +353,7 @@ fn metadata_of(
     }
 }
 
-/// In one line, names as they are: they may hold any character but a slash.
+/// Formats one line with unescaped names, which may contain any character but a slash.
 impl fmt::Display for FileReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self {

@@ -1,9 +1,9 @@
-//! Writing a bag: its directory, its files one after the other, its metadata.yaml.
+//! Writes a bag: its directory, its files one after the other, its metadata.yaml.
 //!
-//! No thread and no clock: the caller says when to flush, and the messages' times say when to split.
-//! metadata.yaml is there from the beginning and follows at each flush and split, so that a bag whose
-//! writer was killed is one that `ros2 bag info` still opens. What takes long, compressing whole
-//! files, is handed out as work for another thread.
+//! Starts no thread and reads no clock: the caller decides when to flush, and the messages' times
+//! decide when to split. metadata.yaml exists from the beginning and is updated at each flush and
+//! split, so that `ros2 bag info` opens a bag whose writer was killed. Compressing whole files is
+//! slow, so the caller receives it as a task for another thread.
 
 mod contents;
 
@@ -24,31 +24,31 @@ use super::metadata_file::{Durability, write_metadata};
 use super::{Compressed, Compression, Error, FileCompression, Form, Options, qos};
 use contents::{DoneFile, Topic, times};
 
-/// What a bag says about a topic.
+/// Description of a topic in a bag.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct TopicDescription {
-    /// With leading `/`.
+    /// Name, with leading `/`.
     pub name: String,
-    /// `pkg/msg/Type`.
+    /// Type: `pkg/msg/Type`.
     pub type_name: String,
-    /// `RIHS01_...`, if somebody announced it.
+    /// Type hash `RIHS01_...`, if a publisher announced it.
     pub type_hash: Option<String>,
-    /// Of every publisher seen.
+    /// QoS of every publisher seen.
     pub publishers: Vec<Qos>,
-    /// How its messages look, if that is known.
+    /// Definition of its messages, if known.
     pub schema: Option<Schema>,
 }
 
-/// A definition, as `message::MessageType::schema_text` gives it.
+/// A definition, as returned by `message::MessageType::schema_text`.
 #[derive(Clone, PartialEq, Eq, Hash, Debug)]
 pub struct Schema {
-    /// `ros2msg` or `ros2idl`.
+    /// Encoding of the text: `ros2msg` or `ros2idl`.
     pub encoding: String,
-    /// With everything nested; many topics have the same.
+    /// Text with all nested types; topics of the same type share it.
     pub text: Arc<str>,
 }
 
-/// A topic of one [`Writer`].
+/// Identifies a topic of one [`Writer`].
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct TopicId(u16);
 
@@ -56,51 +56,51 @@ pub struct TopicId(u16);
 #[derive(Debug)]
 pub struct Writer {
     directory: PathBuf,
-    /// The directory's name, which its files bear.
+    /// Name of the directory, which is part of its files' names.
     name: String,
     options: Options,
     topics: Vec<Topic>,
     by_name: HashMap<String, TopicId>,
     schemas: HashMap<(String, Option<Schema>), u16>,
-    /// Complete files; `current` comes after them.
+    /// Complete files; `current` follows them.
     done: Vec<DoneFile>,
     current: Option<FileWriter>,
-    /// Files that wait to be compressed.
+    /// Files to be compressed.
     uncompressed: Vec<FileCompression>,
-    /// Taken, but never in a file: messages and bytes of each channel.
+    /// Accepted messages that were never written: number and bytes per channel.
     unwritten: BTreeMap<u16, (u64, u64)>,
 }
 
-/// What became of a bag.
+/// Result of writing a bag.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Summary {
-    /// Where it lies.
+    /// Path of the directory.
     pub directory: PathBuf,
-    /// Files in it, in order, without metadata.yaml.
+    /// Its files, in order, without metadata.yaml.
     pub files: Vec<PathBuf>,
-    /// Their size.
+    /// Size of the files in bytes.
     pub bytes: u64,
-    /// Messages in them.
+    /// Number of messages in the files.
     pub messages: u64,
     /// Earliest and latest log time.
     pub times: Option<(Timestamp, Timestamp)>,
-    /// In the order in which they were described.
+    /// Topics, in the order of their description.
     pub topics: Vec<TopicSummary>,
 }
 
-/// What a bag has of a topic.
+/// Result for one topic.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct TopicSummary {
-    /// Its name.
+    /// Name of the topic.
     pub name: String,
-    /// In the files.
+    /// Number of messages in the files.
     pub messages: u64,
-    /// Taken by [`Writer::write`], and lost since the storage took no more.
+    /// Number of messages accepted by [`Writer::write`] but lost because the storage failed.
     pub unwritten: u64,
 }
 
 impl Writer {
-    /// Makes the directory, which must not exist, the first file and a metadata.yaml without
+    /// Creates the directory, which must not exist, the first file and a metadata.yaml without
     /// messages.
     pub fn create(directory: &Path, options: Options) -> Result<Self, Error> {
         let name = directory.file_name().and_then(|name| name.to_str());
@@ -132,8 +132,9 @@ impl Writer {
         };
         let begun = writer.open_file();
         if let Err(error) = begun.and_then(|()| writer.write_metadata_file()) {
-            // Nothing is in it, and the next try would leave another one. One by one: listing the
-            // directory would take a descriptor, which may be what is lacking.
+            // Removes the empty bag, since the next attempt would leave another one. One file by
+            // one: listing the directory would take a descriptor, which may be the missing
+            // resource.
             let file = directory.join(writer.file_name(0));
             drop(writer);
             let _ = fs::remove_file(file);
@@ -144,16 +145,16 @@ impl Writer {
         Ok(writer)
     }
 
-    /// Where the bag lies.
+    /// Returns the path of the bag.
     #[must_use]
     pub fn directory(&self) -> &Path {
         &self.directory
     }
 
-    /// Describes a topic before its first message, or again when its publishers changed. What was
-    /// said last before the first message stays in all files and in metadata.yaml: readers find a
-    /// topic's messages by comparing both (PyPI `rosbags` leaves out what differs). Publishers that
-    /// come later are named in the custom data.
+    /// Describes a topic before its first message, or again when its publishers change. The last
+    /// description before the first message stays in all files and in metadata.yaml: readers find a
+    /// topic's messages by comparing both (PyPI `rosbags` omits differing ones). Later publishers
+    /// are listed in the custom data.
     pub fn topic(&mut self, mut description: TopicDescription) -> Result<TopicId, Error> {
         let known = self.by_name.get(&description.name).copied();
         if let Some(known) = known
@@ -169,7 +170,7 @@ impl Writer {
             if topic.is_written {
                 topic.later = Some(description.publishers);
             } else {
-                // The schema has its number already.
+                // The schema already has its id.
                 let schema = topic.description.schema.take();
                 topic.description = TopicDescription {
                     schema,
@@ -207,9 +208,9 @@ impl Writer {
         Ok(TopicId(index))
     }
 
-    /// Takes one message: its bytes with the encapsulation header, when it was received, when it was
-    /// sent, and its publisher's sequence number. On an error it was not taken; everything before
-    /// is in a file or still waits to be, and the next call tries again.
+    /// Accepts one message: its bytes with the encapsulation header, its times of reception and
+    /// sending, and its publisher's sequence number. On an error it was not accepted; earlier
+    /// messages are in a file or still wait, and the next call tries again.
     pub fn write(
         &mut self,
         topic: TopicId,
@@ -228,12 +229,12 @@ impl Writer {
             self.topics.get_mut(usize::from(topic.0)),
             self.current.as_mut(),
         ) else {
-            // Not a topic of this bag: there is no place for it.
+            // Not a topic of this bag.
             return Ok(());
         };
         let message = Message {
             channel_id: topic.channel_id,
-            // The record has the low half.
+            // The record holds the low 32 bits.
             sequence: (sequence & u64::from(u32::MAX)) as u32,
             log_time: log_time.0,
             publish_time: publish_time.0,
@@ -245,7 +246,7 @@ impl Writer {
         written.map_err(|error| Error::writing(current.path(), error))
     }
 
-    /// Hands everything taken so far to the system, and brings metadata.yaml up to it: all of it
+    /// Writes everything accepted so far to the system and updates metadata.yaml: all of it
     /// survives the end of this process.
     pub fn flush(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
@@ -256,7 +257,7 @@ impl Writer {
         write_metadata(&self.directory, &self.metadata(), Durability::Process)
     }
 
-    /// Flushes, and waits until it is on the disk: all of it survives the loss of power.
+    /// Flushes, and waits until everything is on disk: all of it survives a loss of power.
     pub fn sync(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
             let synced = current.flush().and_then(|()| current.sync());
@@ -267,7 +268,7 @@ impl Writer {
         synced.map_err(|error| Error::writing(&self.directory, error))
     }
 
-    /// Completes the file and begins the next one; not where it has no messages.
+    /// Completes the current file and begins the next one, unless the file has no messages.
     pub fn split(&mut self) -> Result<(), Error> {
         if self
             .current
@@ -281,8 +282,8 @@ impl Writer {
         self.write_metadata_file()
     }
 
-    /// Hands over what waits, or gives it up where the storage takes no more: from then on
-    /// [`Self::unwritten`] is what is lost.
+    /// Writes the waiting messages, or discards them if the storage fails: then [`Self::unwritten`]
+    /// counts them as lost.
     pub fn settle(&mut self) {
         let full = matches!(
             self.current.as_mut().map(FileWriter::flush),
@@ -293,7 +294,8 @@ impl Writer {
         }
     }
 
-    /// Messages that were taken and given up, by topic, and their bytes.
+    /// Iterates over topics with messages that were accepted but discarded, with their number and
+    /// bytes.
     pub fn unwritten(&self) -> impl Iterator<Item = (&str, u64, u64)> {
         self.topics.iter().filter_map(|topic| {
             let (messages, bytes) = self.unwritten.get(&topic.channel_id)?;
@@ -301,15 +303,15 @@ impl Writer {
         })
     }
 
-    /// Completes the bag. `custom_data` stands in metadata.yaml and in the last file: what was lost
-    /// or left out belongs there. Where the storage takes no more, what waits is given up, counted in
-    /// the summary, and the file completed in the room that was kept for that.
+    /// Completes the bag. `custom_data` is added to metadata.yaml and to the last file: for losses
+    /// and omissions. If the storage fails, waiting messages are discarded and counted in the
+    /// summary, and the file is completed in the reserved space.
     pub fn close(self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
         self.close_with(custom_data, |work| work.run().map(Some))
     }
 
-    /// As [`Self::close`], with files compressed by `compress`. Where it returns `None` the file
-    /// stays uncompressed, as [`super::reindex`] finds it.
+    /// Does the same as [`Self::close`], compressing files with `compress`. If it returns `None`,
+    /// the file stays uncompressed, as [`super::reindex`] accepts it.
     pub fn close_with(
         mut self,
         custom_data: BTreeMap<String, String>,
@@ -320,7 +322,7 @@ impl Writer {
         match self.finish_file() {
             Err(error @ (Error::DiskFull { .. } | Error::FileTooLarge { .. })) => {
                 self.give_up_waiting();
-                // Without the summary a file can still be read, and completed by `rp bag reindex`.
+                // Without the summary a file is still readable, and `rp bag reindex` completes it.
                 if self.finish_file().is_err() {
                     self.abandon_file();
                 }
@@ -340,12 +342,12 @@ impl Writer {
         Ok(self.summary())
     }
 
-    /// Complete files to compress, each once. What is not taken is done by [`Self::close`].
+    /// Returns the complete files to compress, each once. [`Self::close`] compresses the others.
     pub fn take_file_compressions(&mut self) -> Vec<FileCompression> {
         std::mem::take(&mut self.uncompressed)
     }
 
-    /// Takes note that a file is compressed.
+    /// Records that a file is compressed.
     pub fn compressed(&mut self, done: &Compressed) -> Result<(), Error> {
         if let Some(file) = self.done.get_mut(done.index) {
             file.compression = done.compression;
@@ -354,21 +356,21 @@ impl Writer {
         self.write_metadata_file()
     }
 
-    /// Bytes in the bag's files so far.
+    /// Returns the bytes in the bag's files so far.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::position);
         current + self.done.iter().map(|file| file.bytes).sum::<u64>()
     }
 
-    /// As [`Self::bytes`], with what waits to be written.
+    /// Returns the same as [`Self::bytes`], plus the bytes that wait to be written.
     #[must_use]
     pub fn expected_bytes(&self) -> u64 {
         let current = self.current.as_ref().map_or(0, FileWriter::expected_bytes);
         current + self.done.iter().map(|file| file.bytes).sum::<u64>()
     }
 
-    /// Files begun so far.
+    /// Returns the number of files begun so far.
     #[must_use]
     pub fn files(&self) -> usize {
         self.done.len() + usize::from(self.current.is_some())
@@ -401,14 +403,14 @@ impl Writer {
                 Ok(())
             }
             Err(error) => {
-                // A file that could not even begin would be in nobody's list.
+                // The file could not be started and is on no list: remove it.
                 let _ = fs::remove_file(&path);
                 Err(Error::creating(&path, error))
             }
         }
     }
 
-    /// Keeps the file where it fails: what waits may still find room.
+    /// Completes the current file. Keeps it if that fails: waiting messages may still find space.
     fn finish_file(&mut self) -> Result<(), Error> {
         if let Some(current) = &mut self.current {
             current
@@ -433,7 +435,7 @@ impl Writer {
         Ok(())
     }
 
-    /// Counts the file as it is among the complete ones.
+    /// Adds the file as it is to the complete ones.
     fn abandon_file(&mut self) {
         let Some(current) = self.current.take() else {
             return;
@@ -534,7 +536,7 @@ impl Writer {
         data
     }
 
-    /// What stands in the files themselves.
+    /// Returns the metadata record for the files themselves.
     fn metadata_record(&self) -> MetadataRecord {
         let mut entries = BTreeMap::new();
         if self.options.form != Form::Named {

@@ -1,7 +1,6 @@
-//! What the kernel filter takes of a host's time for one datagram, by verdict, and the same walk in
-//! user space. The kernel itself measures (BPF_PROG_TEST_RUN); a datagram of many IP fragments runs
-//! the program once for each, as on a link of MTU 1500, and every run counts about 25 ns too many.
-//! Needs root.
+//! CPU time of the kernel filter per datagram, by verdict, and of the same walk in user space. The
+//! kernel measures it (BPF_PROG_TEST_RUN). A datagram of many IP fragments runs the program once
+//! per fragment, as on a link of MTU 1500, and every run counts about 25 ns too many. Needs root.
 
 #![expect(
     clippy::unwrap_used,
@@ -21,14 +20,14 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 /// IP payload of a frame at MTU 1500.
 const FRAME: usize = 1480;
-/// Runs of the program between two emptyings of the record ring, which must not run full.
+/// Runs of the program before the record ring is emptied: it must not fill up.
 const BATCH: u32 = 1000;
 const WRITER: Guid = Guid::new(
     GuidPrefix(*b"\x01\x0fbenchbench"),
     EntityId([0, 0, 0x11, 3]),
 );
 
-/// As the stacks send them.
+/// Datagrams as the DDS implementations send them.
 fn datagrams() -> [(&'static str, Vec<u8>); 3] {
     [
         ("320 B DATA", program_run::message(WRITER, 1..=1, 320)),
@@ -77,7 +76,8 @@ fn in_the_kernel(criterion: &mut Criterion) {
     }
 }
 
-/// The hooks side by side on what passes most: a datagram in one frame, and what is not RTPS.
+/// Compares the hooks on the most frequent traffic: a datagram in one frame, and packets that are
+/// not RTPS.
 fn by_hook(criterion: &mut Criterion) {
     let writer = program_run::message(WRITER, 1..=1, 320);
     let mut tcp = program_run::datagram(&[0; 400]);
@@ -119,7 +119,7 @@ fn by_hook(criterion: &mut Criterion) {
     }
 }
 
-/// The time that `iterations` datagrams take, without what happens between them.
+/// Returns the time of `iterations` datagrams, without the pauses between them.
 fn time(
     kernel: &mut Kernel,
     frames: &mut [Vec<u8>],

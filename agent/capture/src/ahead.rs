@@ -1,8 +1,8 @@
-//! Holds what the kernel filter reports of a fragmented datagram before all of it has come.
+//! Holds the kernel filter's records of a fragmented datagram until the datagram is complete.
 //!
-//! A datagram with a missing IP fragment was never delivered, so nothing in it may count. The filter
-//! cannot go back to earlier fragments; it sends their records ahead, marked, and says later that
-//! the datagram is complete. Until then they wait here, bounded in number and time.
+//! A datagram with a missing IP fragment is not delivered, so nothing in it may count. The filter
+//! cannot return to earlier fragments: it sends their records ahead, marked, and reports later that
+//! the datagram is complete. Until then the records wait here, bounded in number and time.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -12,16 +12,16 @@ use ros2probe_wire::record::{Body, Record, flag};
 use super::reassembly::Reassembled;
 use ros2probe_model::size::Size;
 
-/// Datagrams waited for; more push out the oldest.
+/// Most waiting datagrams; the oldest makes room for another.
 const DATAGRAMS: usize = 1024;
-/// Records held of one datagram. A UDP payload has room for at most 2,047 empty submessages.
+/// Most records held per datagram. A UDP payload has room for at most 2,047 empty submessages.
 const RECORDS_PER_DATAGRAM: usize = 2048;
-/// Bytes of all of them together, records and rests.
+/// Most bytes of all datagrams together, records and rests.
 const BYTES: usize = 4 << 20;
 /// Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
 const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
-/// What may be taken in now.
+/// A complete item for the model.
 #[derive(Debug)]
 pub enum Ready {
     /// A record of a complete datagram.
@@ -39,7 +39,7 @@ pub struct Ahead {
     given_up: u64,
 }
 
-/// One datagram of one source.
+/// A datagram's source and token.
 type Token = (u32, u32);
 
 #[derive(Debug, Default)]
@@ -52,10 +52,10 @@ struct Waiting {
 }
 
 impl Ahead {
-    /// Entries, or bytes, and cap of every table.
+    /// Returns entries, or bytes, and cap of every table.
     #[must_use]
     pub fn sizes(&self) -> [Size; 3] {
-        // A new table does not compile before it has a place here.
+        // A new table does not compile until it is listed here.
         let Self {
             waiting,
             oldest,
@@ -70,8 +70,8 @@ impl Ahead {
         ]
     }
 
-    /// Takes in a record of source `namespace`. Handovers are the caller's to pass on to the
-    /// reassembly; here they only say that a rest will come.
+    /// Accepts a record of source `namespace`. The caller passes handovers to the reassembly; here
+    /// they only announce a rest.
     pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
         let mut ready = ready;
         if record.datagram == 0 {
@@ -79,7 +79,7 @@ impl Ahead {
         }
         let token = (namespace, record.datagram);
         if record.flags & flag::AHEAD == 0 && !self.waiting.contains_key(&token) {
-            // The usual case: one record, written when the datagram was complete.
+            // The usual case: a single record of a complete datagram.
             if !matches!(record.body(), Body::Complete) {
                 ready(Ready::Record(record));
             }
@@ -99,7 +99,7 @@ impl Ahead {
         self.settle(token, ready);
     }
 
-    /// Takes in the rest of a handed-over datagram.
+    /// Accepts the rest of a handed-over datagram.
     pub fn rest(&mut self, namespace: u32, rest: Reassembled, ready: impl FnMut(Ready)) {
         let Some(handover) = rest.handover else {
             return;
@@ -112,7 +112,7 @@ impl Ahead {
         self.settle(token, ready);
     }
 
-    /// Gives up what can no longer become complete.
+    /// Discards datagrams that can no longer become complete.
     pub fn advance(&mut self, now: Timestamp) {
         while let Some((born, token)) = self.oldest.front().copied()
             && now.nanoseconds_since(born) > LIFETIME_NANOSECONDS
@@ -122,13 +122,13 @@ impl Ahead {
         }
     }
 
-    /// Datagrams that were begun and never became complete, or had no room.
+    /// Returns the number of datagrams that never became complete or did not fit.
     #[must_use]
     pub const fn given_up(&self) -> u64 {
         self.given_up
     }
 
-    /// Changes what is held of a datagram, and makes room for it.
+    /// Changes the waiting datagram, making room for it if needed.
     fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
             if self.oldest.len() >= DATAGRAMS {
@@ -182,9 +182,9 @@ impl Ahead {
 }
 
 impl Waiting {
-    /// Bytes held.
+    /// Returns the bytes held.
     fn bytes(&self) -> usize {
-        // A new list does not compile before it has a place here.
+        // A new list does not compile until it is listed here.
         let Self {
             records,
             handed_over: _,

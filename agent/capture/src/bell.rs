@@ -1,11 +1,11 @@
-//! Wakes a thread that waits for packets: a descriptor that is readable from a ring on until it is
-//! silenced. It says that something waits, never what.
+//! Wakes a thread that waits for packets: a descriptor that is readable after [`Bell::ring`] until
+//! [`Bell::silence`]. It signals that something waits, not what.
 
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
-/// One bell, rung and heard from any thread.
+/// A bell that any thread may ring or wait for.
 #[derive(Debug)]
 pub struct Bell {
     ringer: UnixStream,
@@ -13,10 +13,10 @@ pub struct Bell {
 }
 
 impl Bell {
-    /// A silent one.
+    /// Creates a silent bell.
     ///
     /// # Errors
-    /// There can be no more descriptors.
+    /// Fails if no more descriptors are available.
     pub fn new() -> io::Result<Self> {
         let (ringer, listener) = UnixStream::pair()?;
         ringer.set_nonblocking(true)?;
@@ -24,18 +24,18 @@ impl Bell {
         Ok(Self { ringer, listener })
     }
 
-    /// Readable while it rings.
+    /// Returns a descriptor that is readable while the bell rings.
     #[must_use]
     pub fn descriptor(&self) -> BorrowedFd<'_> {
         self.listener.as_fd()
     }
 
-    /// Rings. One that was rung more often than its buffer holds rings already.
+    /// Rings. If its buffer is full, it rings already.
     pub fn ring(&self) {
         let _ = (&self.ringer).write(&[1]);
     }
 
-    /// Takes back what it was rung, 64 times at most: after more it rings on.
+    /// Silences the bell after at most 64 rings; after more it keeps ringing.
     pub fn silence(&self) {
         let _ = (&self.listener).read(&mut [0; 64]);
     }

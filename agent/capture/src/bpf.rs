@@ -1,4 +1,4 @@
-//! The bpf system call, for the commands that aya does not offer as they are needed here.
+//! The bpf system call, for commands that aya does not offer in the form needed here.
 
 use std::io;
 use std::os::fd::{FromRawFd as _, OwnedFd};
@@ -10,10 +10,11 @@ const MAP_LOOKUP_ELEM: c_int = 1;
 const LINK_CREATE: c_int = 28;
 const ITER_CREATE: c_int = 33;
 
-/// Links a program to a target, for an attach type, without flags. The link goes with its descriptor.
+/// Links a program to a target for an attach type, without flags. Closing the descriptor removes
+/// the link.
 ///
 /// # Errors
-/// The kernel refuses.
+/// Fails if the kernel refuses the link.
 pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Result<OwnedFd> {
     descriptor(LINK_CREATE, &[program, target, attach_type, 0])
 }
@@ -21,16 +22,16 @@ pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Re
 /// Starts one run of a linked iterator.
 ///
 /// # Errors
-/// The kernel refuses.
+/// Fails if the kernel refuses the iterator.
 pub(crate) fn create_iterator(link: u32) -> io::Result<OwnedFd> {
     descriptor(ITER_CREATE, &[link, 0])
 }
 
-/// Looks up an element of a map that does not exist. Returns the error: `EPERM` if the calling thread
-/// may not use maps, which the kernel checks first, otherwise `EBADF`.
+/// Looks up an element of a map that does not exist. Returns the error: `EPERM`, which the kernel
+/// checks first, if the calling thread may not use maps, otherwise `EBADF`.
 #[must_use]
 pub fn failed_lookup() -> io::Error {
-    // No descriptor has the number -1; key and value are null.
+    // -1 is never a valid descriptor; key and value are null.
     let attributes = [u32::MAX, 0, 0, 0, 0, 0, 0, 0];
     match call(MAP_LOOKUP_ELEM, &attributes) {
         Ok(_) => io::Error::other("a map that does not exist was found"),
@@ -44,9 +45,9 @@ fn descriptor(command: c_int, attributes: &[u32]) -> io::Result<OwnedFd> {
     Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
 }
 
-/// For commands whose attributes are words, and none of them a pointer other than null.
+/// Calls a command whose attributes are words without pointers other than null.
 fn call(command: c_int, attributes: &[u32]) -> io::Result<c_int> {
-    // SAFETY: the attributes' size is given, and the kernel takes what lies beyond as zero.
+    // SAFETY: the attributes' size is passed, and the kernel treats attributes beyond it as zero.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,

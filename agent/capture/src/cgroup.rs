@@ -1,6 +1,6 @@
-//! Where the control group hierarchy (v2) is, to which the host hook is attached.
+//! Finds the control group hierarchy (v2) to which the host hook is attached.
 //!
-//! Read from `/proc/self/mountinfo` (`man 5 proc_pid_mountinfo`). Nothing is mounted or created.
+//! Reads `/proc/self/mountinfo` (`man 5 proc_pid_mountinfo`). Mounts and creates nothing.
 
 use std::ffi::OsString;
 use std::fs::{self, File};
@@ -10,30 +10,30 @@ use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
 const MOUNTS: &str = "/proc/self/mountinfo";
-/// Inode of the topmost group: its id, the same on every host.
+/// Inode of the topmost group, which is its id and the same on every host.
 const ROOT_INODE: u64 = 1;
 
-/// Why there is no control group to attach to.
+/// Why a control group cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum CgroupError {
-    /// The list of mounts.
+    /// The list of mounts cannot be read.
     #[error("cannot read {MOUNTS}")]
     Mounts(#[source] io::Error),
-    /// Only v1, or nothing.
+    /// Only v1 is mounted, or no hierarchy at all.
     #[error("no cgroup v2 hierarchy is mounted: `mount -t cgroup2 none /sys/fs/cgroup`")]
     NotMounted,
-    /// The directory.
+    /// The directory cannot be opened.
     #[error("cannot open the control group {}", path.display())]
     Open {
-        /// Which.
+        /// Path of the control group.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: io::Error,
     },
-    /// It is something else.
+    /// The path is not a control group.
     #[error("{} is not a control group of the hierarchy v2", path.display())]
     Other {
-        /// Which.
+        /// The path.
         path: PathBuf,
     },
 }
@@ -47,18 +47,18 @@ pub struct Cgroup {
 }
 
 impl Cgroup {
-    /// The topmost one that this process can see.
+    /// Opens the topmost group that this process can see.
     ///
     /// # Errors
-    /// None is mounted.
+    /// Fails if no hierarchy is mounted.
     pub fn topmost() -> Result<Self, CgroupError> {
         Self::open(&mount_point()?)
     }
 
-    /// The one at `path`.
+    /// Opens the group at `path`.
     ///
     /// # Errors
-    /// It does not exist or is none.
+    /// Fails if it does not exist or is not a control group.
     pub fn open(path: &Path) -> Result<Self, CgroupError> {
         let failed = |source| CgroupError::Open {
             path: path.to_path_buf(),
@@ -66,8 +66,8 @@ impl Cgroup {
         };
         let directory = File::open(path).map_err(failed)?;
         let inode = directory.metadata().map_err(failed)?.ino();
-        // Every group of v2 has it, those of v1 and plain directories do not; the kernel would say
-        // no more than "bad file descriptor".
+        // Every group of v2 has this file, groups of v1 and plain directories do not; the kernel
+        // would only report "bad file descriptor".
         if !path.join("cgroup.controllers").exists() {
             let path = path.to_path_buf();
             return Err(CgroupError::Other { path });
@@ -79,36 +79,36 @@ impl Cgroup {
         })
     }
 
-    /// Where it is.
+    /// Returns its path.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// The open directory, to attach programs to.
+    /// Returns the open directory, for attaching programs.
     #[must_use]
     pub const fn directory(&self) -> &File {
         &self.directory
     }
 
-    /// Every process of the host is in it or below: it is the topmost one, also seen from outside
-    /// of all containers.
+    /// Returns whether it contains every process of the host: it is the topmost group as seen
+    /// outside of all containers.
     #[must_use]
     pub const fn is_whole_host(&self) -> bool {
         self.whole_host
     }
 }
 
-/// Where the hierarchy is mounted that begins the furthest up.
+/// Returns the mount point that shows the largest part of the hierarchy.
 ///
 /// # Errors
-/// Nowhere.
+/// Fails if no hierarchy is mounted.
 pub fn mount_point() -> Result<PathBuf, CgroupError> {
     let mounts = fs::read(MOUNTS).map_err(CgroupError::Mounts)?;
     topmost(&mounts).ok_or(CgroupError::NotMounted)
 }
 
-/// Of several mounts one that shows all, that is `/` of the hierarchy.
+/// Returns the mount that shows the hierarchy from `/`, if several mounts exist.
 #[must_use]
 pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
     let found = mounts
@@ -119,13 +119,13 @@ pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
 }
 
 struct Mount {
-    /// What of the hierarchy is mounted.
+    /// Root of the mount within the hierarchy.
     root: Vec<u8>,
-    /// Where.
+    /// Path of the mount point.
     point: Vec<u8>,
 }
 
-/// A line if it is about `cgroup2`: number, parent, device, root, mount point, options, optional
+/// Parses a line about `cgroup2`: number, parent, device, root, mount point, options, optional
 /// fields, a dash, type.
 fn mount(line: &[u8]) -> Option<Mount> {
     let mut fields = line.split(|byte| *byte == b' ');
@@ -135,7 +135,7 @@ fn mount(line: &[u8]) -> Option<Mount> {
     (fields.next()? == b"cgroup2").then_some(Mount { root, point })
 }
 
-/// Space, tab, newline and backslash are written as three octal digits.
+/// Decodes space, tab, newline and backslash, which are written as three octal digits.
 fn unescape(field: &[u8]) -> Vec<u8> {
     let mut bytes = Vec::with_capacity(field.len());
     let mut rest = field;
@@ -184,7 +184,7 @@ mod tests {
 40 30 0:26 / /host\\040sys/fs/cgroup ro - cgroup2 cgroup rw
 ";
         assert_eq!(topmost_of(mounts).unwrap(), "/host sys/fs/cgroup");
-        // A backslash that is no escape, and one that is cut off.
+        // A backslash that starts no escape, and a truncated escape.
         assert_eq!(unescape(br"a\9990\04"), br"a\9990\04");
     }
 

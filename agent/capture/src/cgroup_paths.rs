@@ -1,7 +1,8 @@
-//! Control groups by their number: a socket's cgroup is known by the inode of its directory.
+//! Paths of control groups by number: a socket's cgroup is identified by the inode of its
+//! directory.
 //!
-//! Walks the version 2 hierarchy when a number comes up that it has not met, and remembers what it
-//! was asked for, also what is not there. Bounded in directories and depth; reads nothing in them.
+//! Walks the version 2 hierarchy for numbers that are new, and remembers the results, including
+//! numbers without a directory. Bounded in directories and depth; opens no file.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -9,11 +10,11 @@ use std::os::unix::fs::DirEntryExt as _;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
-/// Directories that one walk looks at.
+/// Most directories per walk.
 const MAX_DIRECTORIES: usize = 16_384;
-/// Levels that a walk descends.
+/// Most levels per walk.
 const MAX_DEPTH: usize = 24;
-/// Letters of a container's id, and how many of them tools show.
+/// Hex digits of a container's id, and how many of them tools show.
 const CONTAINER_ID: usize = 64;
 const CONTAINER_ID_SHOWN: usize = 12;
 
@@ -21,12 +22,12 @@ const CONTAINER_ID_SHOWN: usize = 12;
 #[derive(Debug)]
 pub struct CgroupPaths {
     root: PathBuf,
-    /// `None`: it is not there.
+    /// `None`: no directory has this number.
     known: BTreeMap<u64, Option<String>>,
 }
 
 impl CgroupPaths {
-    /// Those below the place where the version 2 hierarchy is mounted.
+    /// Creates an empty table for the mount point of the version 2 hierarchy.
     #[must_use]
     pub const fn new(root: PathBuf) -> Self {
         Self {
@@ -35,7 +36,7 @@ impl CgroupPaths {
         }
     }
 
-    /// Finds those of `wanted` that are not known yet, and forgets what is no longer wanted.
+    /// Finds the paths of new numbers in `wanted`, and forgets numbers that are no longer in it.
     pub fn refresh(&mut self, wanted: &BTreeSet<u64>) {
         self.known.retain(|id, _| wanted.contains(id));
         let mut missing: BTreeSet<u64> = wanted.iter().copied().collect();
@@ -48,16 +49,16 @@ impl CgroupPaths {
         self.known.extend(missing.iter().map(|id| (*id, None)));
     }
 
-    /// Path below the root, `/` for the root itself; `None` when it is not there, for instance
-    /// because it is gone, or was not asked for.
+    /// Returns the path below the root, `/` for the root itself; `None` if the group is gone or was
+    /// not in `wanted`.
     #[must_use]
     pub fn path(&self, id: u64) -> Option<&str> {
         self.known.get(&id)?.as_deref()
     }
 }
 
-/// A name for people: the first letters of a container's id, else the system manager's unit, else
-/// the last part of the path.
+/// Returns a name for people: the first digits of a container's id, else the systemd unit, else the
+/// last part of the path.
 #[must_use]
 pub fn short_name(path: &str) -> &str {
     let parts = || path.rsplit('/').filter(|part| !part.is_empty());
@@ -68,7 +69,7 @@ pub fn short_name(path: &str) -> &str {
         .unwrap_or("/")
 }
 
-/// `docker-<id>.scope`, `cri-containerd-<id>.scope`, `<id>`: the id, shortened.
+/// Returns the shortened id of `docker-<id>.scope`, `cri-containerd-<id>.scope` or `<id>`.
 fn container(part: &str) -> Option<&str> {
     let name = part.strip_suffix(".scope").unwrap_or(part);
     let id = name.rsplit(['-', ':']).next()?;
@@ -76,7 +77,7 @@ fn container(part: &str) -> Option<&str> {
     is_id.then(|| id.get(..CONTAINER_ID_SHOWN)).flatten()
 }
 
-/// Takes what it finds out of `missing`; ends when nothing is missing any more.
+/// Removes the groups that it finds from `missing`; ends when none is left.
 fn walk(root: &Path, missing: &mut BTreeSet<u64>) -> Vec<(u64, Option<String>)> {
     let mut found = Vec::new();
     if let Ok(metadata) = fs::metadata(root)
@@ -129,7 +130,7 @@ mod tests {
         assert_eq!(groups.path(top), Some("/"));
         assert_eq!(groups.path(below), Some("/system.slice/robot.service"));
         assert_eq!(groups.path(gone), None);
-        // Nothing is new, so nothing is walked: a path that has changed meanwhile stays.
+        // No number is new, so nothing is walked: the changed path stays.
         fs::rename(&service, root.path().join("system.slice/other.service")).unwrap();
         groups.refresh(&BTreeSet::from([below, gone]));
         assert_eq!(groups.path(below), Some("/system.slice/robot.service"));

@@ -1,24 +1,24 @@
-//! Notices a step of the calendar's clock, or a suspended machine, by the clock
-//! that goes on evenly. It reads no clock.
+//! Detects a step of the wall clock, or a suspended machine, by comparison with the monotonic
+//! clock. It reads no clock.
 
 use super::system::Clocks;
 
-/// Time servers correct less than this bit by bit.
+/// Time servers correct smaller differences gradually.
 const STEP_NANOSECONDS: u64 = 100_000_000;
-/// For how long what bears an old time may still come.
+/// How long packets with an old timestamp may still arrive.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
-/// How the calendar's clock stands against the even one.
+/// Difference between the wall clock and the monotonic clock.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockStep {
-    /// Nanoseconds that it was ahead at the last update.
+    /// Nanoseconds by which the wall clock was ahead at the last update.
     ahead: i64,
-    /// When a step was noticed last, and all steps of that moment.
+    /// Time of the last step, and the sum of all steps at that time.
     noticed: Option<(u64, i64)>,
 }
 
 impl ClockStep {
-    /// As it stands.
+    /// Starts with the current difference.
     #[must_use]
     pub const fn new(clocks: &Clocks) -> Self {
         Self {
@@ -27,8 +27,8 @@ impl ClockStep {
         }
     }
 
-    /// By how many nanoseconds the clock was set forward since the last update; 0 = it was not. Notes in
-    /// the clocks that it was, for as long as that matters.
+    /// Returns the nanoseconds by which the wall clock was set forward since the last update; 0 =
+    /// no step. Stores the step in `clocks` while old timestamps may still arrive.
     pub const fn update(&mut self, clocks: &mut Clocks) -> i64 {
         let before = match self.noticed {
             Some((at, steps)) if clocks.monotonic.saturating_sub(at) < LATE_NANOSECONDS => steps,
@@ -61,7 +61,7 @@ mod tests {
     const HOUR: i64 = 3600 * SECOND.cast_signed();
     const STARTED: u64 = 1_700_000_000 * SECOND;
 
-    /// So many nanoseconds after the start, with a calendar that has been set by `step` since.
+    /// Clocks this many nanoseconds after the start, the wall clock having been set by `step`.
     fn clocks(monotonic: u64, step: i64) -> Clocks {
         Clocks {
             now: Timestamp((STARTED + monotonic).saturating_add_signed(step)),
@@ -74,7 +74,7 @@ mod tests {
     fn a_step_is_noticed_once_and_remembered_for_a_second_and_slewing_is_none() {
         for step in [HOUR, -HOUR] {
             let mut set = ClockStep::new(&clocks(0, 0));
-            // 500 parts in a million, as fast as a time server goes.
+            // 500 parts in a million, the fastest correction of a time server.
             let mut now = clocks(SECOND, 500_000);
             assert_eq!((set.update(&mut now), now.step), (0, 0));
             let mut now = clocks(SECOND + SECOND / 4, step);

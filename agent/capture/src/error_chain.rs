@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-/// An error and its causes in one line; of a verifier's log, the first line.
+/// Returns an error and its causes in one line; only the first line of a verifier's log.
 #[must_use]
 pub fn in_words(error: &dyn Error) -> String {
     let mut words = String::new();
@@ -10,7 +10,7 @@ pub fn in_words(error: &dyn Error) -> String {
     while let Some(error) = cause {
         let message = error.to_string();
         let first = message.lines().next().unwrap_or_default();
-        // A transparent error says what its cause says.
+        // A transparent error repeats its cause.
         if !words.ends_with(first) {
             if !words.is_empty() {
                 words.push_str(": ");

@@ -1,8 +1,8 @@
-//! The kernel filter from user space: load it, tell it what is of interest, read what it found.
+//! The kernel filter from user space: loads it, sets its interest map, reads its records.
 //!
 //! The object is committed beside its source (`agent-ebpf/`), so no BPF toolchain is needed here.
 //! Needs CAP_BPF and CAP_PERFMON (CAP_SYS_ADMIN before Linux 5.8); attaching the host hook to a
-//! cgroup needs CAP_NET_ADMIN besides.
+//! cgroup also needs CAP_NET_ADMIN.
 
 mod host_hook;
 mod uprobe;
@@ -23,7 +23,7 @@ use super::tracepoints::KernelLayout;
 pub use host_hook::{CapturedPiece, Links};
 pub use uprobe::{Form, Probe, Probes};
 
-/// The object `agent-ebpf/build.sh` made. Aligned, because ELF is read in place.
+/// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
 
 #[repr(align(8))]
@@ -38,26 +38,26 @@ pub enum FilterError {
     /// The kernel refuses BPF to this process.
     #[error("loading the kernel filter is not permitted")]
     NotPermitted(#[source] io::Error),
-    /// There is no such system call.
+    /// The system call does not exist.
     #[error("BPF is not available: not supported by this kernel or emulator")]
     NoBpf(#[source] io::Error),
-    /// The object does not load.
-    #[error("the kernel filter does not load")]
+    /// The object cannot be loaded.
+    #[error("failed to load the kernel filter")]
     Load(#[source] EbpfError),
     /// The verifier refuses the program.
     #[error("the kernel refuses the filter program")]
     Program(#[source] ProgramError),
     /// The kernel refuses to attach a program to the cgroup.
     #[error(
-        "attaching the host hook to the cgroup needs CAP_NET_ADMIN, and no program there that \
-         tolerates no other"
+        "attaching the host hook to the cgroup needs CAP_NET_ADMIN and no exclusive program on that \
+         cgroup"
     )]
     AttachNotPermitted(#[source] io::Error),
-    /// The kernel does not put a breakpoint into the library.
-    #[error("the kernel does not attach to it")]
+    /// The kernel refuses a breakpoint in the library.
+    #[error("the kernel refuses the uprobe")]
     Probe(#[source] ProgramError),
-    /// The cgroup takes no program.
-    #[error("the host hook does not attach to the cgroup")]
+    /// The cgroup accepts no program.
+    #[error("failed to attach the host hook to the cgroup")]
     Attach(#[source] io::Error),
     /// The object lacks a part that this binary needs.
     #[error("the kernel filter object has no {0}")]
@@ -65,11 +65,11 @@ pub enum FilterError {
     /// A map operation failed.
     #[error("the kernel filter's {map} map: {action}")]
     Map {
-        /// Which map.
+        /// Name of the map.
         map: &'static str,
-        /// What was being done.
+        /// The failed action.
         action: &'static str,
-        /// Why it failed.
+        /// Cause of the failure.
         #[source]
         source: MapError,
     },
@@ -80,12 +80,12 @@ pub enum FilterError {
 pub struct FilterSettings {
     /// Bytes of the record ring; rounded up to a power of two of at least a page.
     pub record_ring_bytes: u32,
-    /// Host hook: bytes of the ring for captured datagrams, rounded up likewise.
+    /// Host hook: bytes of the ring for captured datagrams, rounded up in the same way.
     pub piece_ring_bytes: u32,
-    /// Whether to look at interfaces that [`Filter::accept_interface`] has not been told about.
+    /// Whether to read interfaces not passed to [`Filter::accept_interface`].
     pub accept_new_interfaces: bool,
-    /// Host hook: whether to ask the kernel for its types. Without them it is as on a kernel that
-    /// does not tell.
+    /// Host hook: whether to use the kernel's types. Without them the hook works as on a kernel
+    /// without BTF.
     pub kernel_types: bool,
 }
 
@@ -102,13 +102,13 @@ impl Default for FilterSettings {
 
 /// One loaded filter with its maps: of the wire hook, or of the host hook.
 pub struct Filter {
-    /// What is attached: the wire hook's entry, or the host hook's for datagrams on their way in.
+    /// The attached program: the wire hook's entry, or the host hook's for received datagrams.
     program: ProgramFd,
-    /// The wire hook's program, which its entry goes on with; the kernel empties it when this is
+    /// The wire hook's program, which its entry tail-calls; the kernel empties the array when it is
     /// closed.
     _wire: Option<ProgramArray<MapData>>,
     host: Option<host_hook::HostHook>,
-    /// Captured datagrams, but not on the wire hook.
+    /// Captured datagrams; host hook only.
     pieces: Option<RingBuf<MapData>>,
     interest: HashMap<MapData, [u32; 4], u32>,
     participants: HashMap<MapData, [u32; 3], u64>,
@@ -122,10 +122,11 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// Loads the wire hook's program and its maps; attaches it to nothing.
+    /// Loads the wire hook's program and its maps, without attaching it.
     ///
     /// # Errors
-    /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses it.
+    /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
+    /// refuses it.
     pub fn load(settings: &FilterSettings) -> Result<Self, FilterError> {
         let sizes = [("PIECES", page_size()), ("SOCKETS", UNUSED)];
         let mut ebpf = open(settings, false, &sizes, None, 0)?;
@@ -166,13 +167,13 @@ impl Filter {
         })
     }
 
-    /// The loaded program: the wire hook's, for attaching it to a socket.
+    /// Returns the loaded program of the wire hook, for attaching it to a socket.
     #[must_use]
     pub fn program(&self) -> BorrowedFd<'_> {
         self.program.as_fd()
     }
 
-    /// Readable when the record ring is half full.
+    /// Returns a descriptor that is readable when the record ring is half full.
     #[must_use]
     pub fn record_ring(&self) -> BorrowedFd<'_> {
         self.records.as_fd()
@@ -181,7 +182,7 @@ impl Filter {
     /// Sets or removes a writer's or reader's verdict.
     ///
     /// # Errors
-    /// When the map is full or the kernel refuses.
+    /// Fails if the map is full or the kernel refuses the update.
     pub fn set_interest(
         &mut self,
         endpoint: Guid,
@@ -195,10 +196,10 @@ impl Filter {
         .map_err(failed("INTEREST", "update"))
     }
 
-    /// Starts or stops noting when a participant last sent anything.
+    /// Starts or stops noting the time of a participant's last message.
     ///
     /// # Errors
-    /// When the map is full or the kernel refuses.
+    /// Fails if the map is full or the kernel refuses the update.
     pub fn follow_participant(
         &mut self,
         participant: GuidPrefix,
@@ -213,8 +214,8 @@ impl Filter {
         .map_err(failed("PARTICIPANTS", "update"))
     }
 
-    /// Followed participants and the CLOCK_MONOTONIC nanoseconds of their last message; those that
-    /// have sent nothing since they are followed are left out.
+    /// Iterates over followed participants and the CLOCK_MONOTONIC nanoseconds of their last
+    /// message. Omits participants that have not sent since they are followed.
     pub fn participants(&self) -> impl Iterator<Item = (GuidPrefix, u64)> + '_ {
         self.participants.iter().filter_map(|entry| {
             let (key, last): ([u32; 3], u64) = entry.ok()?;
@@ -222,38 +223,38 @@ impl Filter {
         })
     }
 
-    /// Looks at an interface's frames, or leaves them out.
+    /// Includes or excludes an interface's frames.
     ///
     /// # Errors
-    /// When the map is full or the kernel refuses.
+    /// Fails if the map is full or the kernel refuses the update.
     pub fn accept_interface(&mut self, index: u32, accept: bool) -> Result<(), FilterError> {
         self.interfaces
             .insert(index, u32::from(accept), 0)
             .map_err(failed("INTERFACES", "update"))
     }
 
-    /// Gives back the place of an interface that is gone.
+    /// Removes the entry of an interface that is gone.
     ///
     /// # Errors
-    /// When the kernel refuses.
+    /// Fails if the kernel refuses the update.
     pub fn forget_interface(&mut self, index: u32) -> Result<(), FilterError> {
         absent_is_fine(self.interfaces.remove(&index)).map_err(failed("INTERFACES", "update"))
     }
 
-    /// Sets what unclassified writers may cost from now on.
+    /// Sets a budget of unclassified writers.
     ///
     /// # Errors
-    /// When the kernel refuses.
+    /// Fails if the kernel refuses the update.
     pub fn set_unknown_budget(&mut self, budget: Budget, amount: u32) -> Result<(), FilterError> {
         self.budget
             .set(budget as u32, i64::from(amount), 0)
             .map_err(failed("BUDGET", "refill"))
     }
 
-    /// All counters, summed over CPUs and the slots of each.
+    /// Returns all counters, summed over CPUs and slots.
     ///
     /// # Errors
-    /// When the kernel refuses.
+    /// Fails if the kernel refuses the lookup.
     pub fn counters(&self) -> Result<Vec<(Counter, u64)>, FilterError> {
         let mut sums = Counter::ALL.map(|counter| (counter, 0));
         for slot in 0..self.counters.len() {
@@ -270,8 +271,8 @@ impl Filter {
         Ok(sums.to_vec())
     }
 
-    /// Takes out the runs of DATA_FRAGs that nobody has continued since `before`
-    /// (CLOCK_MONOTONIC nanoseconds): their samples lack fragments, or another CPU goes on.
+    /// Removes and returns the runs of DATA_FRAGs that have not grown since `before`
+    /// (CLOCK_MONOTONIC nanoseconds): their samples lack fragments, or another CPU continues them.
     pub fn stalled_runs(&mut self, before: u64) -> Vec<Record> {
         let stalled: Vec<_> = self
             .runs
@@ -280,8 +281,8 @@ impl Filter {
             .map(|(key, run)| (key, zerocopy::transmute!(run)))
             .filter(|(_, run): &(RunKey, Record)| run.time <= before)
             .collect();
-        // A fragment that comes between looking and removing is lost to the count; it would have
-        // had to pause for as long as it takes to stall, and then come within a microsecond.
+        // A fragment that arrives between lookup and removal is not counted. It would have to
+        // arrive within that microsecond, after a pause long enough for the run to stall.
         stalled
             .into_iter()
             .filter(|(key, _)| self.runs.remove(key).is_ok())
@@ -289,7 +290,7 @@ impl Filter {
             .collect()
     }
 
-    /// The oldest record not read yet.
+    /// Removes and returns the oldest record.
     pub fn next_record(&mut self) -> Option<Record> {
         let item = self.records.next()?;
         Record::read_from_bytes(&item).ok()
@@ -297,7 +298,7 @@ impl Filter {
 }
 
 impl FilterError {
-    /// Tells the operator's problem (no privilege) from ours.
+    /// Maps the loader's error, telling a missing privilege apart from a defect of the object.
     fn load(error: EbpfError) -> Self {
         if let Some(error) = not_permitted(&error) {
             Self::NotPermitted(error)
@@ -316,7 +317,8 @@ impl FilterError {
     }
 }
 
-/// The EPERM at the end of an error's chain of causes. EACCES is not it: that is the verifier's no.
+/// Returns the EPERM at the end of an error's chain of causes. EACCES does not count: the verifier
+/// returns it for a refused program.
 fn not_permitted(error: &(dyn std::error::Error + 'static)) -> Option<io::Error> {
     caused_by(error, libc::EPERM)
 }
@@ -335,12 +337,12 @@ fn caused_by(error: &(dyn std::error::Error + 'static), wanted: i32) -> Option<i
     None
 }
 
-/// Entries of a map that the other hook uses: an LRU map has at least some.
+/// Entries of a map that only the other hook uses: an LRU map cannot be empty.
 const UNUSED: u32 = 64;
 
-/// Opens the object and creates its maps, of which those named have another size.
-/// `host`: for the host hook. `layout`: for programs that read the kernel's structures. `within`: the
-/// control group of the processes whose messages into shared memory are looked at; 0 = all.
+/// Opens the object and creates its maps, resizing the named ones. `host`: for the host hook.
+/// `layout`: for programs that read the kernel's structures. `within`: control group of the
+/// processes whose shared-memory messages are read; 0 = all.
 fn open(
     settings: &FilterSettings,
     host: bool,
@@ -376,7 +378,7 @@ fn open(
     loader.load(&OBJECT.0).map_err(FilterError::load)
 }
 
-/// Hands a program to the kernel's verifier.
+/// Loads a program, which the kernel verifies.
 fn load_program(ebpf: &mut Ebpf, name: &'static str) -> Result<ProgramFd, FilterError> {
     let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
     match program {
@@ -392,7 +394,7 @@ fn load_program(ebpf: &mut Ebpf, name: &'static str) -> Result<ProgramFd, Filter
         .map_err(|error| FilterError::Program(ProgramError::IOError(error)))
 }
 
-/// Whether this kernel preempts what others run with bottom halves disabled: PREEMPT_RT.
+/// Returns whether this kernel preempts code that runs with bottom halves disabled: PREEMPT_RT.
 fn preempts_everything() -> bool {
     std::fs::read_to_string("/proc/sys/kernel/version")
         .map_or(true, |version| version.contains("PREEMPT_RT"))
@@ -402,7 +404,7 @@ fn ring_size(bytes: u32) -> u32 {
     ring_size_with(bytes, page_size())
 }
 
-/// The kernel takes a power of two, of whole pages.
+/// Rounds up to a power of two of whole pages, as the kernel requires.
 fn ring_size_with(bytes: u32, page: u32) -> u32 {
     bytes.next_power_of_two().max(page)
 }
@@ -423,7 +425,7 @@ fn failed(map: &'static str, action: &'static str) -> impl Fn(MapError) -> Filte
     }
 }
 
-/// Removing what is not there has already succeeded.
+/// Treats the removal of a missing element as a success.
 fn absent_is_fine(result: Result<(), MapError>) -> Result<(), MapError> {
     match result {
         Err(MapError::KeyNotFound) => Ok(()),

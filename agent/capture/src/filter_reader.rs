@@ -1,7 +1,8 @@
-//! What kernel programs find at sockets and in processes, on its way to the model: records, and
+//! Reads the kernel programs' output at sockets and in processes for the model: records, and
 //! captured datagrams in pieces.
 //!
-//! One for each loaded filter. It puts pieces together and everything in order; it decides nothing.
+//! Each loaded filter has one reader. It assembles pieces and restores the order; it decides
+//! nothing.
 
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
@@ -18,39 +19,39 @@ use super::system::Clocks;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
-/// Records younger than this wait for those that a run of fragments keeps back.
+/// Records younger than this wait for records held back in a run of fragments.
 pub const SETTLE_NANOSECONDS: u64 = 50_000_000;
-/// Fragments of one sample follow each other within microseconds; after this they do not.
+/// Fragments of one sample follow each other within microseconds; a longer pause ends the run.
 const STALLED_NANOSECONDS: u64 = 30_000_000;
-/// Datagrams younger than this wait: records that are older than they may still be on their way.
+/// Datagrams younger than this wait for older records that may still be in the ring.
 const FRESH_NANOSECONDS: u64 = 2_000_000;
-/// How many of those: 4 MB at most.
+/// Most waiting datagrams: 4 MB.
 const MAX_FRESH: usize = 64;
-/// Records taken in at a time: several rings of the built-in size.
+/// Most records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
-/// Pieces likewise.
+/// Most pieces read per round.
 const PIECES_PER_ROUND: usize = 32_768;
-/// After so many records given to the model the ring is emptied again: a burst fills it while the
-/// records before are counted.
+/// The ring is emptied again after this many records passed to the model: a burst fills it while
+/// earlier records are counted.
 const RECORDS_BETWEEN: usize = 1024;
-/// Records that wait at most, 18 MB; more stay in the ring, and are lost where they find no room.
+/// Most waiting records, 18 MB; further ones stay in the ring, and are lost if it is full.
 pub const MAX_WAITING: usize = 131_072;
 
-/// One filter's maps and what they held.
+/// The maps of one filter and their waiting contents.
 pub struct FilterReader {
     filter: Filter,
     order: ReorderBuffer,
     pieces: PieceAssembler,
-    /// Captured datagrams that wait.
+    /// Captured datagrams that wait for older records.
     fresh: VecDeque<(Piece, Vec<u8>)>,
     datagrams: u64,
     copied_bytes: u64,
-    /// When the latest record was written, in the kernel's clock.
+    /// Time of the latest record, in the kernel's clock.
     recorded: u64,
 }
 
 impl FilterReader {
-    /// Nothing taken in yet.
+    /// Creates a reader without data.
     #[must_use]
     pub fn new(filter: Filter) -> Self {
         Self {
@@ -64,7 +65,7 @@ impl FilterReader {
         }
     }
 
-    /// Readable when a ring is half full.
+    /// Returns descriptors that are readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.filter
             .piece_ring()
@@ -72,11 +73,11 @@ impl FilterReader {
             .chain([self.filter.record_ring()])
     }
 
-    /// Takes in all there is, and gives the model what is [`SETTLE_NANOSECONDS`] old. What datagrams
-    /// announce it gets at once, what they count for in its turn. Before each datagram it gets what
-    /// is older: a writer's last samples count before its farewell is read. Where a flood leaves
-    /// one ring behind, the other waits for it: what a writer's records and its captured datagrams
-    /// say would otherwise come out of order, as losses that are none.
+    /// Reads the rings and passes everything older than [`SETTLE_NANOSECONDS`] to the model.
+    /// Announcements in datagrams are passed at once, the rest in order of time. Everything older
+    /// precedes a datagram: a writer's last samples count before its disposal is read. If a flood
+    /// leaves records in one ring, the other ring waits for it; otherwise a writer's records and
+    /// captured datagrams would be out of order and look like losses.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let recorded = self.take_records();
         let fresh = clocks.monotonic.saturating_sub(FRESH_NANOSECONDS);
@@ -91,7 +92,7 @@ impl FilterReader {
         self.pieces.advance(clocks.monotonic);
     }
 
-    /// Gives the model what still waits, at the end.
+    /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.take_records();
         self.take_datagrams(clocks, u64::MAX, observer);
@@ -99,44 +100,44 @@ impl FilterReader {
         deliver(&mut self.order, clocks, u64::MAX, observer, usize::MAX);
     }
 
-    /// The kernel programs' maps.
+    /// Returns the kernel programs' maps.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
         &self.filter
     }
 
-    /// The kernel programs' maps, to tell them what is of interest.
+    /// Returns the kernel programs' maps, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         &mut self.filter
     }
 
-    /// Captured datagrams.
+    /// Returns the number of captured datagrams.
     #[must_use]
     pub const fn datagrams(&self) -> u64 {
         self.datagrams
     }
 
-    /// Bytes that came from the kernel: pieces and records.
+    /// Returns the bytes read from the kernel: pieces and records.
     #[must_use]
     pub const fn copied_bytes(&self) -> u64 {
         self.copied_bytes
     }
 
-    /// Captured datagrams that never became whole.
+    /// Returns the number of captured datagrams that never became complete.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
         self.pieces.given_up()
     }
 
-    /// Bytes held for them.
+    /// Returns the bytes held for incomplete datagrams.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         let fresh: usize = self.fresh.iter().map(|(_, bytes)| bytes.len()).sum();
         fresh + self.pieces.bytes()
     }
 
-    /// A flood may fill the ring as fast as it is emptied: what is left is taken the next time.
-    /// Returns up to which time all were taken, `u64::MAX` where none is left.
+    /// Reads records, at most one round: a flood may refill the ring as fast as it is emptied.
+    /// Returns the time up to which all records were read, `u64::MAX` if none is left.
     fn take_records(&mut self) -> u64 {
         for _ in 0..RECORDS_PER_ROUND {
             if self.order.waiting() >= MAX_WAITING {
@@ -152,7 +153,7 @@ impl FilterReader {
         self.recorded
     }
 
-    /// Takes runs of fragments that nobody has continued since `before` in the kernel's clock.
+    /// Takes runs of fragments that have not grown since `before` in the kernel's clock.
     fn take_stalled(&mut self, before: u64) {
         for record in self.filter.stalled_runs(before) {
             self.copied_bytes += size_of::<Record>() as u64;
@@ -160,8 +161,8 @@ impl FilterReader {
         }
     }
 
-    /// Those up to `before` in the kernel's clock. Returns up to which time all were taken, if not
-    /// up to `before`; else `u64::MAX`.
+    /// Reads datagrams up to `before` in the kernel's clock. Returns the time up to which all were
+    /// read if that is earlier, else `u64::MAX`.
     fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) -> u64 {
         while let Some((piece, bytes)) = self.fresh.pop_front_if(|(piece, _)| piece.time <= before)
         {
@@ -169,7 +170,7 @@ impl FilterReader {
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
-            // What is left is younger still.
+            // Every remaining datagram is younger.
             if self.fresh.len() >= MAX_FRESH {
                 return u64::MAX;
             }
@@ -193,16 +194,15 @@ impl FilterReader {
                 decode_datagram(&piece, &bytes, clocks, &mut self.order, observer);
                 continue;
             }
-            // Behind those that wait: one that overtook them would let a sample count by the copies
-            // of fragments whose bytes are still there.
+            // Queued behind those that wait: overtaking them would let a sample count by duplicate
+            // fragments whose bytes are still in the ring.
             self.fresh.push_back((piece, bytes.into_owned()));
         }
         newest
     }
 }
 
-/// Gives the model what is not younger than `until`, but not more than so many; whether that was
-/// all.
+/// Passes records up to `until` to the model, at most this many; returns whether that was all.
 fn deliver(
     order: &mut ReorderBuffer,
     clocks: &Clocks,

@@ -1,7 +1,8 @@
-//! Feeds the core with captured frames: frames to datagrams to the observer, in the frames' own time.
+//! Feeds the model with captured frames: frames to datagrams to the observer, in the frames' own
+//! time.
 //!
-//! The live source takes its frames from the ring itself. Nothing here waits; whoever replays at
-//! a certain speed does so between packets.
+//! The live source reads its frames from the ring itself. Nothing here waits; a replay at a given
+//! speed waits between packets.
 
 use ros2probe_model::input::Input;
 use ros2probe_wire::Timestamp;
@@ -12,7 +13,7 @@ use super::pcap::{Captured, PcapError, PcapReader};
 use crate::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_model::observer::Observer;
 
-/// One capture on its way into the core.
+/// State of one replayed capture.
 #[derive(Debug)]
 pub struct FrameDecoder {
     reassembly: Reassembly,
@@ -20,7 +21,7 @@ pub struct FrameDecoder {
 }
 
 impl FrameDecoder {
-    /// At the beginning.
+    /// Creates a decoder at the start of a capture.
     #[must_use]
     pub fn new(limits: Limits) -> Self {
         Self {
@@ -29,10 +30,10 @@ impl FrameDecoder {
         }
     }
 
-    /// Replays the rest of a capture as fast as it goes, and settles.
+    /// Replays the rest of a capture without pauses, and settles the model.
     ///
     /// # Errors
-    /// When the capture cannot be read on; what came before it counts.
+    /// Fails if the capture cannot be read further; the packets before that count.
     pub fn run(
         &mut self,
         reader: &mut PcapReader,
@@ -47,7 +48,7 @@ impl FrameDecoder {
 
     /// Replays one frame.
     pub fn packet(&mut self, captured: &Captured<'_>, observer: &mut Observer) {
-        // Several interfaces of one capture may be a little out of order.
+        // Several interfaces of one capture may be slightly out of order.
         self.last = self.last.max(captured.time);
         observer.input(Input::Time(self.last));
         let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
@@ -96,13 +97,13 @@ impl FrameDecoder {
         }
     }
 
-    /// The reassembly, for its counters.
+    /// Returns the reassembly, for its counters.
     #[must_use]
     pub const fn reassembly(&self) -> &Reassembly {
         &self.reassembly
     }
 
-    /// Time of the latest frame.
+    /// Returns the time of the latest frame.
     #[must_use]
     pub const fn last(&self) -> Timestamp {
         self.last

@@ -1,8 +1,8 @@
-//! This host's sockets: what any of them sends or receives, whole and in all containers, as the
-//! host hook tells it.
+//! Observes this host's sockets through the host hook: every datagram sent or received, whole and
+//! in all containers.
 //!
-//! One tap for the host, or for one control group. Everything in the kernel vanishes with this
-//! value, however the process ends. Nothing is sent, delayed or dropped.
+//! One tap covers the host or one control group. Its kernel state vanishes with this value, however
+//! the process ends. Nothing is sent, delayed or dropped.
 
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
@@ -17,32 +17,32 @@ use super::tracepoints::Abilities;
 use crate::threads::Spawn;
 use ros2probe_model::observer::Observer;
 
-/// Why the host hook is not in place.
+/// Why the host hook cannot be opened.
 #[derive(Debug, thiserror::Error)]
 pub enum HostTapError {
-    /// The control group.
+    /// The control group cannot be used.
     #[error(transparent)]
     Hierarchy(#[from] CgroupError),
-    /// The kernel programs.
+    /// The kernel programs cannot be loaded or attached.
     #[error(transparent)]
     Filter(#[from] FilterError),
 }
 
-/// Why the control group is not followed.
+/// Why the control group cannot be followed.
 #[derive(Debug, thiserror::Error)]
 pub enum FollowError {
-    /// The kernel programs.
+    /// The kernel programs have no links.
     #[error(transparent)]
     Filter(#[from] FilterError),
-    /// The thread.
+    /// The thread cannot be started.
     #[error("failed to spawn a thread")]
     Thread(#[from] std::io::Error),
 }
 
-/// Which sockets are looked at, and with how much memory.
+/// The observed sockets, and the memory for them.
 #[derive(Clone, Debug)]
 pub struct HostTapSettings {
-    /// Only those of this control group and below; `None` = all.
+    /// Only sockets of this control group and below; `None` = all.
     pub cgroup: Option<PathBuf>,
     /// Bytes of the ring for captured datagrams.
     pub ring_bytes: usize,
@@ -50,20 +50,20 @@ pub struct HostTapSettings {
     pub record_ring_bytes: usize,
 }
 
-/// The host hook and what it found on its way to the model.
+/// The host hook and the reader of its output.
 pub struct HostTap {
     cgroup: Cgroup,
     reader: FilterReader,
     sockets: Sockets,
-    /// For a control group that can be removed.
+    /// Follows a control group that may be removed.
     reattach: Option<Reattach>,
 }
 
 impl HostTap {
-    /// Attaches the hook. When this returns, every datagram is seen.
+    /// Attaches the hook. Every datagram after the return is seen.
     ///
     /// # Errors
-    /// A capability is missing, or the kernel or the machine does not have what it takes.
+    /// Fails if a capability is missing, or if the kernel or the machine lacks a requirement.
     pub fn open(settings: &HostTapSettings) -> Result<Self, HostTapError> {
         let cgroup = match &settings.cgroup {
             Some(path) => Cgroup::open(path)?,
@@ -75,7 +75,7 @@ impl HostTap {
             piece_ring_bytes: size(settings.ring_bytes),
             ..FilterSettings::default()
         })?;
-        // First, so that nothing dies unseen behind the hook.
+        // First, so that no loss behind the hook is missed.
         filter.attach_tracepoints(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
         filter.settle();
@@ -91,11 +91,11 @@ impl HostTap {
         })
     }
 
-    /// Follows the control group from now on: the hook is attached again when the group is made
-    /// anew. The topmost one stays.
+    /// Starts following the control group: the hook is attached again if the group is recreated.
+    /// The topmost group always exists.
     ///
     /// # Errors
-    /// There can be no thread for it.
+    /// Fails if its thread cannot be started.
     pub fn start(&mut self, spawn: Spawn) -> Result<(), FollowError> {
         let Some(attached) = reattach::of(self.cgroup.directory()) else {
             return Ok(());
@@ -107,65 +107,65 @@ impl HostTap {
         Ok(())
     }
 
-    /// Why the hook is attached to nothing.
+    /// Returns why the hook is not attached; `None` while it is.
     #[must_use]
     pub fn detached(&self) -> Option<String> {
         self.reattach.as_ref()?.detached()
     }
 
-    /// How often the hook was attached to another control group since the start.
+    /// Returns how often the hook was attached to another control group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.reattach.as_ref().map_or(0, Reattach::attached_anew)
     }
 
-    /// The control group whose sockets are looked at.
+    /// Returns the observed control group.
     #[must_use]
     pub fn cgroup(&self) -> &Path {
         self.cgroup.path()
     }
 
-    /// Every socket of the host is looked at, in whatever container.
+    /// Returns whether every socket of the host is observed, in any container.
     #[must_use]
     pub const fn is_whole_host(&self) -> bool {
         self.cgroup.is_whole_host()
     }
 
-    /// What can be told of what happens behind the hook.
+    /// Returns which losses behind the hook can be named.
     #[must_use]
     pub fn abilities(&self) -> Option<&Abilities> {
         Some(self.filter().tracepoints()?.abilities())
     }
 
-    /// Readable when a ring is half full.
+    /// Returns descriptors that are readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.reader.descriptors()
     }
 
-    /// Takes in all there is; see [`FilterReader::poll`].
+    /// Reads everything available; see [`FilterReader::poll`].
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.reader.poll(clocks, observer);
         self.sockets
             .follow(self.reader.filter(), clocks.monotonic, observer);
     }
 
-    /// Gives the model what still waits, at the end.
+    /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.reader.drain(clocks, observer);
     }
 
-    /// The kernel programs' maps.
+    /// Returns the kernel programs' maps.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
         self.reader.filter()
     }
 
-    /// The kernel programs' maps, to tell them what is of interest.
+    /// Returns the kernel programs' maps, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         self.reader.filter_mut()
     }
 
-    /// What was taken in so far.
+    /// Returns the reader, for its counters.
     #[must_use]
     pub const fn reader(&self) -> &FilterReader {
         &self.reader

@@ -1,8 +1,7 @@
-//! The interfaces of a network namespace: which there are, which come and go, and which of them
-//! the configuration wants to be looked at.
+//! The interfaces of a network namespace: lists them, reports changes, and selects those that the
+//! configuration includes.
 //!
-//! Learnt from the kernel through rtnetlink (`man 7 rtnetlink`). Nothing is ever changed there and
-//! nothing is sent to the network.
+//! Uses rtnetlink (`man 7 rtnetlink`). It changes nothing there and sends nothing to the network.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -13,10 +12,10 @@ use std::os::fd::{AsFd, BorrowedFd, FromRawFd, OwnedFd};
 use globset::{Glob, GlobSet, GlobSetBuilder};
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
-/// The kernel makes no longer messages for one interface.
+/// Longest message of the kernel for one interface.
 const BUFFER: usize = 64 << 10;
 const IFLA_IFNAME: u16 = 3;
-/// How often a list is asked for that changed while it was being written.
+/// Attempts to read a list that changes while the kernel writes it.
 const MOST_ATTEMPTS: u32 = 5;
 
 /// One interface.
@@ -41,26 +40,26 @@ pub enum Change {
     Gone(Interface),
 }
 
-/// Why the interfaces are not known.
+/// Why the interfaces cannot be listed.
 #[derive(Debug, thiserror::Error)]
 pub enum InterfacesError {
     /// A system call failed.
-    #[error("cannot learn the network interfaces: {call} failed")]
+    #[error("cannot list the network interfaces: {call} failed")]
     System {
-        /// The system call.
+        /// Name of the system call.
         call: &'static str,
-        /// Its error.
+        /// Error of the system call.
         source: io::Error,
     },
-    /// The kernel's answer could not be read.
-    #[error("cannot learn the network interfaces: unreadable answer")]
+    /// The kernel's answer cannot be parsed.
+    #[error("cannot list the network interfaces: the kernel's answer is malformed")]
     Unreadable(#[from] WireError),
-    /// The list never held still.
-    #[error("cannot learn the network interfaces: they change faster than the kernel lists them")]
+    /// The list changed during every attempt.
+    #[error("cannot list the network interfaces: they change faster than they can be listed")]
     Restless,
 }
 
-/// The interfaces of the namespace in which it was opened.
+/// The interfaces of the namespace in which the socket was opened.
 #[derive(Debug)]
 pub struct Interfaces {
     socket: File,
@@ -69,20 +68,20 @@ pub struct Interfaces {
     buffer: Vec<u8>,
 }
 
-/// Which interfaces to look at.
+/// Selects interfaces by name.
 #[derive(Clone, Debug)]
 pub struct Selection {
     include: GlobSet,
     exclude: GlobSet,
-    /// Interfaces included by their name, not by a pattern.
+    /// Interfaces included by name, not by a pattern.
     named: BTreeSet<String>,
 }
 
 impl Interfaces {
-    /// Lists the interfaces of the calling thread's namespace, and keeps listening.
+    /// Lists the interfaces of the calling thread's namespace, and subscribes to changes.
     ///
     /// # Errors
-    /// The kernel refuses.
+    /// Fails if the kernel refuses the socket or the list.
     pub fn open() -> Result<Self, InterfacesError> {
         let socket = File::from(listen()?);
         let mut interfaces = Self {
@@ -95,31 +94,31 @@ impl Interfaces {
         Ok(interfaces)
     }
 
-    /// All interfaces, by index.
+    /// Iterates over all interfaces, by index.
     pub fn iter(&self) -> impl Iterator<Item = &Interface> {
         self.known.values()
     }
 
-    /// The interface with this index.
+    /// Returns the interface with this index.
     #[must_use]
     pub fn by_index(&self, index: u32) -> Option<&Interface> {
         self.known.get(&index)
     }
 
-    /// What has changed since the last call. Does not wait.
+    /// Returns the changes since the last call. Does not wait.
     ///
     /// # Errors
-    /// The kernel fails; what is known stays known.
+    /// Fails if the kernel does; known interfaces stay known.
     pub fn changes(&mut self) -> Result<Vec<Change>, InterfacesError> {
         let mut changes = Vec::new();
         if self.drain(&mut changes)? {
-            // Messages were lost: only a new list tells what we missed.
+            // Messages were lost: only a new list shows the missed changes.
             changes.extend(self.list()?);
         }
         Ok(changes)
     }
 
-    /// Takes what is waiting; `true` when the kernel had to leave something out.
+    /// Reads waiting messages; returns `true` if the kernel dropped some.
     fn drain(&mut self, changes: &mut Vec<Change>) -> Result<bool, InterfacesError> {
         let mut lost = false;
         loop {
@@ -142,11 +141,11 @@ impl Interfaces {
         }
     }
 
-    /// Asks for all interfaces and compares them with those known.
+    /// Requests all interfaces and compares them with the known ones.
     fn list(&mut self) -> Result<Vec<Change>, InterfacesError> {
         let mut changes = Vec::new();
         'attempt: for _ in 0..MOST_ATTEMPTS {
-            // What still waits is older than the list, and its sequel may be lost.
+            // Waiting messages are older than the list, and messages after them may be lost.
             self.drain(&mut changes)?;
             self.ask()?;
             let mut listed = BTreeSet::new();
@@ -210,7 +209,7 @@ impl Interfaces {
         request.extend_from_slice(&libc::RTM_GETLINK.to_ne_bytes());
         request.extend_from_slice(&(NLM_F_REQUEST | NLM_F_DUMP).to_ne_bytes());
         request.extend_from_slice(&self.sequence.to_ne_bytes());
-        // Our port, given by the kernel; then an ifinfomsg that asks for every interface.
+        // Our port, assigned by the kernel; then an ifinfomsg that requests every interface.
         request.extend_from_slice(&[0; 4 + 16]);
         self.socket
             .write_all(&request)
@@ -222,17 +221,17 @@ impl Interfaces {
 }
 
 impl AsFd for Interfaces {
-    /// Readable when there are changes.
+    /// Returns a descriptor that is readable when changes wait.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.socket.as_fd()
     }
 }
 
 impl Selection {
-    /// From globs such as `eth*`. Without any `include`, everything is included.
+    /// Compiles globs such as `eth*`. Without any `include`, every interface is included.
     ///
     /// # Errors
-    /// A glob that cannot be read.
+    /// Fails if a glob is invalid.
     pub fn new(include: &[String], exclude: &[String]) -> Result<Self, globset::Error> {
         let set = |globs: &[String]| {
             let mut builder = GlobSetBuilder::new();
@@ -248,27 +247,27 @@ impl Selection {
         })
     }
 
-    /// Whether to look at an interface of this name.
+    /// Returns whether an interface of this name is observed.
     #[must_use]
     pub fn accepts(&self, name: &str) -> bool {
         (self.include.is_empty() || self.include.is_match(name)) && !self.exclude.is_match(name)
     }
 
-    /// Whether the configuration names this very interface.
+    /// Returns whether the configuration contains exactly this name.
     #[must_use]
     pub fn names(&self, name: &str) -> bool {
         self.named.contains(name) && self.accepts(name)
     }
 
-    /// Whether to look at an interface whose name is not known yet. Those that nobody asked for
-    /// must not be looked at even for a moment, nor those that somebody excluded.
+    /// Returns whether an interface is observed before its name is known. Interfaces outside of
+    /// `include` must not be observed even briefly, nor those in `exclude`.
     #[must_use]
     pub fn accepts_unknown(&self) -> bool {
         self.include.is_empty() && self.exclude.is_empty()
     }
 }
 
-/// One netlink message, as far as it matters here.
+/// The relevant fields of one netlink message.
 struct Message {
     flags: i32,
     sequence: u32,
@@ -278,7 +277,7 @@ struct Message {
 enum Body {
     Present(Interface),
     Gone(u32),
-    /// End of a list, or an error in its place: 0 or a negative error number.
+    /// End of a list, or an error instead: 0 or a negative error number.
     End(i32),
     Other,
 }
@@ -298,7 +297,7 @@ fn apply(known: &mut BTreeMap<u32, Interface>, message: Message) -> Option<Chang
     }
 }
 
-/// Reads the messages of one datagram.
+/// Parses the messages of one datagram.
 fn read(bytes: &[u8], mut sink: impl FnMut(Message)) -> Result<(), WireError> {
     const NATIVE: Endianness = if cfg!(target_endian = "big") {
         Endianness::Big
@@ -339,7 +338,8 @@ fn link(kind: u16, mut cursor: Cursor<'_>) -> Result<Body, WireError> {
     let index = cursor.u32("link index")?;
     let flags = cursor.u32("link flags")?;
     cursor.u32("link change")?;
-    // A bridge tells of its ports in the same words: one that leaves the bridge is not deleted.
+    // Bridges send the same message about their ports: a port that leaves the bridge is not
+    // deleted.
     if i32::from(family) != libc::AF_UNSPEC {
         return Ok(Body::Other);
     }
@@ -378,7 +378,7 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
     if fd < 0 {
         return Err(failed("socket(NETLINK_ROUTE)"));
     }
-    // SAFETY: a descriptor just made, which nobody else owns.
+    // SAFETY: a new descriptor without another owner.
     let socket = unsafe { OwnedFd::from_raw_fd(fd) };
     // SAFETY: a struct of integers, for which zeros are a value.
     let mut address: libc::sockaddr_nl = unsafe { std::mem::zeroed() };
@@ -486,7 +486,7 @@ mod tests {
     fn a_flood_of_changes_ends_in_the_right_list() {
         in_new_namespace(|| {
             let mut interfaces = Interfaces::open().unwrap();
-            // Far more than the socket's buffer holds, while nobody reads.
+            // Far more than the socket's buffer holds while it is not read.
             let commands: String = (0..400)
                 .flat_map(|number| {
                     [

@@ -1,17 +1,16 @@
-//! What the running kernel's types look like: where a structure has a member, what an enumerator's
-//! number is. Read from BTF (Documentation/bpf/btf.rst), which the kernel shows in
-//! `/sys/kernel/btf/vmlinux`.
+//! Layout of the running kernel's types: offsets of members, values of enumerators. Read from BTF
+//! (Documentation/bpf/btf.rst) in `/sys/kernel/btf/vmlinux`.
 //!
-//! Only looked up, never interpreted further; the file is the kernel's own, still every read is
-//! bounded and what cannot be read is an error. Whoever asks copes with a member that is not there:
-//! kernels differ.
+//! It only looks up and does not interpret further. The file is the kernel's own; still every read
+//! is bounded and unreadable content is an error. Kernels differ, so the caller handles missing
+//! members.
 
 use std::io;
 
-/// Where the kernel shows its types.
+/// File with the kernel's types.
 const PATH: &str = "/sys/kernel/btf/vmlinux";
 const MAGIC: u32 = 0xeb9f;
-/// Anonymous structures and unions inside each other that a search enters.
+/// Nesting depth of anonymous structures and unions that a search enters.
 const DEPTH: u32 = 8;
 
 /// Kinds of types.
@@ -28,23 +27,23 @@ mod kind {
     pub(super) const ENUM64: u32 = 19;
 }
 
-/// Why the kernel's types are not known.
+/// Why the kernel's types are unknown.
 #[derive(Debug, thiserror::Error)]
 pub enum KernelTypesError {
     /// A kernel without CONFIG_DEBUG_INFO_BTF has no such file.
-    #[error("the kernel does not describe its types ({PATH})")]
+    #[error("cannot read the kernel's types from {PATH} (needs CONFIG_DEBUG_INFO_BTF)")]
     Unreadable(#[source] io::Error),
-    /// The file is not what it should be.
-    #[error("the kernel's description of its types ({PATH}) is not understood at byte {0}")]
+    /// The file is malformed.
+    #[error("cannot parse the kernel's types ({PATH}) at byte {0}")]
     Malformed(usize),
 }
 
-/// The kernel's types, as bytes and an index.
+/// The kernel's types, as bytes with an index.
 pub struct KernelTypes {
     bytes: Vec<u8>,
-    /// Offset in `bytes` of each type, from id 1 on.
+    /// Offset in `bytes` of each type, starting with id 1.
     types: Vec<usize>,
-    /// Offset in `bytes` of the strings, and of their end.
+    /// Start and end offset of the strings in `bytes`.
     strings: (usize, usize),
 }
 
@@ -65,17 +64,17 @@ impl Head {
         self.info >> 24 & 0x1f
     }
 
-    /// Members, enumerators or parameters that follow.
+    /// Returns the number of members, enumerators or parameters that follow.
     fn count(self) -> usize {
         (self.info & 0xffff) as usize
     }
 
-    /// Bit offsets of members are joined with a bit field's size.
+    /// Returns whether bit offsets of members are combined with the size of a bit field.
     fn has_bit_fields(self) -> bool {
         self.info >> 31 == 1
     }
 
-    /// Bytes that follow the head; `None` for a kind that this reader does not know.
+    /// Returns the number of bytes that follow the head; `None` for an unknown kind.
     fn tail(self) -> Option<usize> {
         let count = self.count();
         Some(match self.kind() {
@@ -91,18 +90,18 @@ impl Head {
 }
 
 impl KernelTypes {
-    /// Of the running kernel.
+    /// Reads the types of the running kernel.
     ///
     /// # Errors
-    /// The kernel shows none, or in a form that is not understood.
+    /// Fails if the kernel provides none, or in a malformed file.
     pub fn read() -> Result<Self, KernelTypesError> {
         Self::parse(std::fs::read(PATH).map_err(KernelTypesError::Unreadable)?)
     }
 
-    /// From the bytes of such a file.
+    /// Parses the bytes of such a file.
     ///
     /// # Errors
-    /// [`KernelTypesError::Malformed`].
+    /// Returns [`KernelTypesError::Malformed`] if they are malformed.
     pub fn parse(bytes: Vec<u8>) -> Result<Self, KernelTypesError> {
         let malformed = KernelTypesError::Malformed;
         let header = |index: usize| word(&bytes, 4 * index).ok_or(malformed(4 * index));
@@ -133,8 +132,8 @@ impl KernelTypes {
         })
     }
 
-    /// Where in `structure` a member is, in bytes. Dots lead into members:
-    /// `__sk_common.skc_cookie`. `None` when there is none, or it is a bit field.
+    /// Returns the byte offset of a member in `structure`. Dots lead into members:
+    /// `__sk_common.skc_cookie`. `None` if the member does not exist or is a bit field.
     #[must_use]
     pub fn offset(&self, structure: &str, member: &str) -> Option<u32> {
         self.named(structure, &[kind::STRUCT, kind::UNION])
@@ -152,14 +151,14 @@ impl KernelTypes {
             })
     }
 
-    /// Bytes of a structure.
+    /// Returns the size of a structure in bytes.
     #[must_use]
     pub fn size(&self, structure: &str) -> Option<u32> {
         let head = self.named(structure, &[kind::STRUCT]).next()?;
         Some(head.size)
     }
 
-    /// The number behind a name in an enumeration.
+    /// Returns the value of an enumerator.
     #[must_use]
     pub fn enumerator(&self, enumeration: &str, name: &str) -> Option<u32> {
         self.named(enumeration, &[kind::ENUM]).find_map(|head| {
@@ -171,7 +170,7 @@ impl KernelTypes {
         })
     }
 
-    /// Bit offset and type id of a member, also inside anonymous structures and unions.
+    /// Returns bit offset and type id of a member, searching anonymous structures and unions.
     fn member(&self, of: Head, name: &str, depth: u32) -> Option<(u32, u32)> {
         (0..of.count()).find_map(|index| {
             let at = of.at + Head::LEN + 12 * index;
@@ -226,7 +225,7 @@ fn head(bytes: &[u8], at: usize) -> Option<Head> {
     })
 }
 
-/// The kernel writes its types in its own byte order.
+/// Reads a word in the kernel's own byte order, in which BTF is written.
 fn word(bytes: &[u8], at: usize) -> Option<u32> {
     let bytes = bytes.get(at..)?.first_chunk()?;
     Some(u32::from_ne_bytes(*bytes))
@@ -342,7 +341,7 @@ mod tests {
     #[test]
     fn an_anonymous_type_that_contains_itself_is_left() {
         let mut bytes = types();
-        // The union's only member is of the union's own type.
+        // The union's only member has the union's own type.
         let header = 24;
         let union = header + 4 * (5 + 6 + 4 + 9);
         bytes[union + 16..union + 20].copy_from_slice(&5_u32.to_ne_bytes());

@@ -2,11 +2,13 @@
 //!
 //! - [`live::LiveSource`] observes this host: at the sockets of a control group ([`host_tap`]), on
 //!   interfaces ([`wire_tap`]), in shared memory of Fast DDS ([`shm`], or with uprobes [`uprobe`]).
-//! - [`pcap::PcapReader`] reads a capture, and [`frame_decoder::FrameDecoder`] brings its packets to the model.
+//! - [`pcap::PcapReader`] reads a capture, and [`frame_decoder::FrameDecoder`] passes its packets
+//!   to the model.
 //!
-//! All `unsafe` code of user space is here: rings, maps, `ptrace`-like reads of other processes. A
-//! source changes, delays and drops nothing of what it observes, and sends nothing. It is given how
-//! to start threads ([`threads::Spawn`]), so that it knows nothing of privileges.
+//! This crate contains all `unsafe` code of user space: rings, maps, `ptrace`-like reads of other
+//! processes. A source changes, delays and drops nothing that it observes, and sends nothing. The
+//! caller passes a function that starts threads ([`threads::Spawn`]), so that sources do not depend
+//! on privileges.
 //!
 //! ```no_run
 //! use std::path::Path;

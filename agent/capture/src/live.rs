@@ -1,8 +1,8 @@
-//! This host's traffic: what its taps find, given to the model in the order in which it was captured.
+//! This host's traffic, read from its taps and passed to the model in capture order.
 //!
-//! At the sockets where the kernel and the configuration allow it, otherwise on the wire with a tap
-//! for each namespace; also both, for interfaces with traffic that no socket receives. Nothing is
-//! ever sent.
+//! Observes sockets if the kernel and the configuration allow it, otherwise interfaces with a tap
+//! per namespace; or both, for interfaces with traffic that no socket receives. Nothing is ever
+//! sent.
 
 mod open;
 
@@ -37,44 +37,43 @@ use open::{open_exact, open_host, open_wires, scope};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
-/// What unclassified writers may cost each second, all together: a dozen nodes that start at once
-/// stay far below, a storm of forged ones stays bounded.
+/// Capture budget of all unclassified writers per second: enough for a dozen nodes that start at
+/// once, and a bound for a storm of forged writers.
 const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
-/// Handed out in small portions, so that a storm that comes while we are held up leaves most of the
-/// record ring to the writers we know.
+/// Refilled in small portions: a storm during a delay of this process then leaves most of the
+/// record ring to known writers.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
-/// How long news from the host hook is gathered: a node that starts announces its endpoints one by
-/// one, and each round costs.
+/// How long news from the host hook is collected: a starting node announces its endpoints one by
+/// one, and each round costs CPU time.
 const GATHER: Duration = Duration::from_millis(10);
-/// Likewise while whole samples are captured: they fill the ring, a point cloud in a few
-/// milliseconds.
+/// The same while whole samples are captured: a point cloud fills the ring in a few milliseconds.
 const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
 const TENTH: u64 = SECOND / 10;
 
-/// Why capturing could not begin or go on.
+/// Why capturing cannot start or continue.
 #[derive(Debug, thiserror::Error)]
 pub enum CaptureError {
-    /// The host hook was asked for and is not to be had.
-    #[error("the host hook cannot be used")]
+    /// The host hook is required but unavailable.
+    #[error("the host hook is unavailable")]
     Host(#[from] HostTapError),
-    /// An interface cannot be looked at.
+    /// An interface cannot be observed.
     #[error(transparent)]
     Tap(#[from] WireTapError),
-    /// Another network namespace.
+    /// Another network namespace cannot be entered.
     #[error(transparent)]
     Namespace(#[from] NetnsError),
-    /// An interface glob.
-    #[error("capture.interfaces")]
+    /// An interface glob is invalid.
+    #[error("capture.interfaces has an invalid glob")]
     Selection(#[from] globset::Error),
-    /// The kernel programs.
+    /// The kernel programs failed.
     #[error(transparent)]
     Filter(#[from] FilterError),
-    /// Waiting for packets.
-    #[error("waiting for packets")]
+    /// Waiting for packets failed.
+    #[error("failed to wait for packets")]
     Wait(#[source] std::io::Error),
 }
 
-/// All taps.
+/// All taps of this host.
 pub struct LiveSource {
     host: Option<HostTap>,
     wires: Vec<WireTap>,
@@ -82,12 +81,12 @@ pub struct LiveSource {
     without_host: Option<String>,
     shared_memory: Shm,
     exact: Option<Uprobe>,
-    /// Why messages into shared memory are not seen in their senders although that was asked for.
+    /// Why shared-memory messages are not read in their senders although that is configured.
     without_exact: Option<String>,
-    /// When unclassified writers last got bytes and records to spend.
+    /// When the budget of unclassified writers was last refilled.
     bytes_refilled: u64,
     records_refilled: u64,
-    /// When the model was last asked what is wanted of shared memory.
+    /// When the model last reported its interest in shared memory.
     wanted_asked: u64,
     refused_updates: u64,
     clock: Timestamp,
@@ -95,25 +94,25 @@ pub struct LiveSource {
     clock_step: ClockStep,
 }
 
-/// What looks at shared memory. Its thread begins when the source is started.
+/// The observer of shared memory. Its thread begins when the source is started.
 enum Shm {
     Off,
     Later(Scope, Shares),
     Running(SharedMemory),
 }
 
-/// What one interface delivered.
+/// Frames of one interface.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InterfaceCount {
     /// Network namespace as configured; `None` = the agent's own.
     pub namespace: Option<PathBuf>,
     /// Interface name, or its index if it went away before it was known.
     pub name: String,
-    /// Frames that the filter let through.
+    /// Frames that passed the filter.
     pub packets: u64,
 }
 
-/// What the kernel dropped for one namespace.
+/// Frames dropped by the kernel in one namespace.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DropCount {
     /// Network namespace as configured; `None` = the agent's own.
@@ -123,11 +122,10 @@ pub struct DropCount {
 }
 
 impl LiveSource {
-    /// Opens what the settings ask for, or the best there is. When this returns, every tap is
-    /// capturing.
+    /// Opens the configured taps, or the best ones available. Every tap captures when this returns.
     ///
     /// # Errors
-    /// A capability is missing, a namespace does not exist, the kernel refuses.
+    /// Fails if a capability is missing, a namespace does not exist, or the kernel refuses a tap.
     pub fn open(settings: &CaptureSettings, limits: Limits) -> Result<Self, CaptureError> {
         let (host, without_host) = open_host(settings)?;
         let wires = match &host {
@@ -174,8 +172,8 @@ impl LiveSource {
         Ok(source)
     }
 
-    /// Starts the threads that need privileges of their own with `spawn`, before the caller gives up
-    /// its own.
+    /// Starts the threads that need their own privileges with `spawn`, before the caller drops its
+    /// privileges.
     pub fn start(&mut self, spawn: Spawn) {
         if let Some(exact) = &mut self.exact
             && let Err(error) = exact.start(spawn)
@@ -187,34 +185,34 @@ impl LiveSource {
             && let Err(error) = host.start(spawn)
         {
             let reason = in_words(&error);
-            tracing::warn!(reason, "a cgroup that is made anew is not seen");
+            tracing::warn!(reason, "a recreated cgroup is not observed");
         }
         self.start_shared_memory(spawn);
     }
 
-    /// The tap at the host's sockets, if that is where this looks.
+    /// Returns the tap at the host's sockets, if it is used.
     #[must_use]
     pub const fn host(&self) -> Option<&HostTap> {
         self.host.as_ref()
     }
 
-    /// Whether interfaces are looked at.
+    /// Returns whether interfaces are observed.
     #[must_use]
     pub const fn is_on_the_wire(&self) -> bool {
         !self.wires.is_empty()
     }
 
-    /// Why the host hook is not used although it would show more, in plain words.
+    /// Returns why the host hook is not used although it would show more, as a sentence.
     #[must_use]
     pub fn without_host(&self) -> Option<&str> {
         self.without_host.as_deref()
     }
 
-    /// Waits for packets, up to `timeout` or until `bell` is readable, and gives the model all there
-    /// is.
+    /// Waits for packets until `timeout` expires or `bell` is readable, and passes everything
+    /// available to the model.
     ///
     /// # Errors
-    /// The kernel refuses to go on.
+    /// Fails if the kernel refuses to continue.
     pub fn poll(
         &mut self,
         timeout: Duration,
@@ -239,7 +237,7 @@ impl LiveSource {
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
-            // News seldom comes alone. What nobody was woken for has had its time.
+            // News seldom comes alone. After a timeout it has had time to accumulate.
             std::thread::sleep(if observer.wants_payloads() {
                 GATHER_PAYLOADS
             } else {
@@ -287,7 +285,8 @@ impl LiveSource {
             }
         }
         if held_up {
-            // Its rings may have been too small: nobody went because this process did not look.
+            // Its rings may have been too small: silence does not mean that participants left,
+            // since this process did not read.
             for (prefix, at) in self.last_seen() {
                 observer.input(Input::ParticipantAlive(prefix, at));
             }
@@ -296,7 +295,7 @@ impl LiveSource {
         Ok(())
     }
 
-    /// Gives the model what still waits, at the end.
+    /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
         if let Some(host) = &mut self.host {
@@ -313,8 +312,8 @@ impl LiveSource {
         }
     }
 
-    /// Tells the kernel programs what has become of interest. What they have no room for stays
-    /// unknown to them, and is counted.
+    /// Updates the kernel programs' interest maps. Entries that do not fit stay unclassified and
+    /// are counted.
     pub fn apply(&mut self, changes: &[(Guid, Option<Verdict>)]) {
         for (endpoint, verdict) in changes {
             self.each_filter(|filter| filter.set_interest(*endpoint, *verdict));
@@ -324,25 +323,25 @@ impl LiveSource {
         }
     }
 
-    /// Notes from now on, or no longer, when a participant last sent anything.
+    /// Starts or stops noting the time of a participant's last message.
     pub fn follow(&mut self, participant: GuidPrefix, follow: bool) {
         self.each_filter(|filter| filter.follow_participant(participant, follow));
     }
 
-    /// Updates that a kernel map had no room for, or that the kernel refused.
+    /// Returns the number of updates that did not fit a kernel map or that the kernel refused.
     #[must_use]
     pub fn refused_updates(&self) -> u64 {
         let interfaces: u64 = self.wires.iter().map(WireTap::refused_interfaces).sum();
         self.refused_updates + interfaces
     }
 
-    /// Time up to which everything captured has been given to the model.
+    /// Returns the time up to which every capture has been passed to the model.
     #[must_use]
     pub const fn clock(&self) -> Timestamp {
         self.clock
     }
 
-    /// When each followed participant last sent anything.
+    /// Returns the time of each followed participant's last message.
     #[must_use]
     pub fn last_seen(&self) -> BTreeMap<GuidPrefix, Timestamp> {
         let mut seen = BTreeMap::new();
@@ -354,7 +353,7 @@ impl LiveSource {
         seen
     }
 
-    /// Captured frames by interface.
+    /// Iterates over captured frames by interface.
     pub fn packets(&self) -> impl Iterator<Item = InterfaceCount> + '_ {
         self.wires.iter().flat_map(|wire| {
             wire.packets().map(|(name, packets)| InterfaceCount {
@@ -365,10 +364,10 @@ impl LiveSource {
         })
     }
 
-    /// Frames that the kernel dropped, by namespace.
+    /// Returns frames dropped by the kernel, by namespace.
     ///
     /// # Errors
-    /// The kernel does not tell.
+    /// Fails if the kernel's statistics cannot be read.
     pub fn drops(&mut self) -> Result<Vec<DropCount>, CaptureError> {
         self.wires
             .iter_mut()
@@ -382,10 +381,10 @@ impl LiveSource {
             .collect()
     }
 
-    /// The kernel programs' counters, summed.
+    /// Returns the kernel programs' counters, summed.
     ///
     /// # Errors
-    /// The kernel does not tell.
+    /// Fails if the kernel's counters cannot be read.
     pub fn counters(&self) -> Result<Vec<(Counter, u64)>, CaptureError> {
         let mut sums: Vec<_> = Counter::ALL.map(|counter| (counter, 0)).into();
         for filter in self.filters() {
@@ -396,15 +395,14 @@ impl LiveSource {
         Ok(sums)
     }
 
-    /// Bytes that came from the kernel: frames, datagrams and records.
+    /// Returns the bytes read from the kernel: frames, datagrams and records.
     #[must_use]
     pub fn copied_bytes(&self) -> u64 {
         let host: u64 = self.readers().map(FilterReader::copied_bytes).sum();
         host + self.wires.iter().map(WireTap::copied_bytes).sum::<u64>()
     }
 
-    /// Datagrams that were begun and never became complete: the kernel programs' and those put
-    /// together here.
+    /// Returns the number of datagrams that never became complete, in the kernel programs or here.
     #[must_use]
     pub fn incomplete_datagrams(&self) -> u64 {
         let host: u64 = self.readers().map(FilterReader::incomplete_datagrams).sum();
@@ -412,25 +410,25 @@ impl LiveSource {
         host + wires.sum::<u64>()
     }
 
-    /// Bytes held to put IP fragments together.
+    /// Returns the bytes held for IP reassembly.
     #[must_use]
     pub fn reassembly_bytes(&self) -> usize {
         self.wires.iter().map(WireTap::reassembly_bytes).sum()
     }
 
-    /// Bytes held to put captured datagrams together that come in pieces.
+    /// Returns the bytes held for captured datagrams that arrive in pieces.
     #[must_use]
     pub fn waiting_bytes(&self) -> usize {
         self.readers().map(FilterReader::waiting_bytes).sum()
     }
 
-    /// Datagrams given up because there were too many fragments.
+    /// Returns the number of datagrams discarded because of too many fragments.
     #[must_use]
     pub fn reassembly_evicted(&self) -> u64 {
         self.wires.iter().map(WireTap::reassembly_evicted).sum()
     }
 
-    /// What the tap on shared memory says of itself, if there is one.
+    /// Returns the report of the shared-memory tap, if it exists.
     #[must_use]
     pub fn shared_memory(&self) -> Option<shm::Facts> {
         match &self.shared_memory {
@@ -439,46 +437,47 @@ impl LiveSource {
         }
     }
 
-    /// Whether shared memory is, or will be, looked at.
+    /// Returns whether shared memory is, or will be, observed.
     #[must_use]
     pub const fn looks_at_shared_memory(&self) -> bool {
         !matches!(self.shared_memory, Shm::Off)
     }
 
-    /// What is attached to processes that send into shared memory, if that was asked for and can be
-    /// had.
+    /// Returns the probes attached to processes that send into shared memory, if they are
+    /// configured and available.
     #[must_use]
     pub fn exact(&self) -> Option<UprobeFacts> {
         self.exact.as_ref().map(Uprobe::facts)
     }
 
-    /// Messages that were captured whole in the processes that sent them.
+    /// Returns the number of messages captured whole in the processes that sent them.
     #[must_use]
     pub fn messages_of_processes(&self) -> Option<u64> {
         Some(self.exact.as_ref()?.reader().datagrams())
     }
 
-    /// Why they are not looked at there although that was asked for, in plain words.
+    /// Returns why messages are not read in their senders although that is configured, as a
+    /// sentence.
     #[must_use]
     pub fn without_exact(&self) -> Option<&str> {
         self.without_exact.as_deref()
     }
 
-    /// What is looked at and is gone, in plain words: nothing is seen there.
+    /// Returns which observed objects are gone, as a sentence: nothing is seen there.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
         cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
     }
 
-    /// How often the hook at the sockets was attached to a control group that was made anew.
+    /// Returns how often the host hook was attached to a recreated control group.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.host.as_ref().map_or(0, HostTap::attached_anew)
     }
 
-    /// The programs for messages into shared memory know their control group by a number, which a
-    /// group made anew does not have. Shared memory is sampled from then on.
+    /// Switches to sampling of shared memory: the programs identify their control group by a
+    /// number, which a recreated group does not have.
     fn leave_exact_mode(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if self.attached_anew() > 0
             && let Some(mut exact) = self.exact.take()

@@ -1,7 +1,7 @@
-//! Opening things in another network namespace: that of a container, or a named one.
+//! Opens sockets in another network namespace: that of a container, or a named one.
 //!
-//! A thread of its own enters the namespace and ends, so no other thread's namespace changes. A
-//! socket stays in the namespace it was made in, whoever uses it later.
+//! A separate thread enters the namespace and ends, so no other thread's namespace changes. A
+//! socket stays in the namespace where it was created, whichever thread uses it later.
 
 use std::fs::File;
 use std::io;
@@ -9,15 +9,15 @@ use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::thread;
 
-/// Why nothing could be done in a network namespace.
+/// Why work in a network namespace failed.
 #[derive(Debug, thiserror::Error)]
 pub enum NetnsError {
-    /// There is no such file, or it may not be read.
+    /// The file does not exist or cannot be read.
     #[error("cannot open network namespace {}", path.display())]
     Open {
         /// Path of the namespace.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
     /// The process lacks a capability.
@@ -25,18 +25,18 @@ pub enum NetnsError {
     NotPermitted {
         /// Path of the namespace.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
-    /// It cannot be entered, for instance because the file is not a network namespace.
+    /// The namespace cannot be entered, for example because the file is not a network namespace.
     #[error("cannot enter network namespace {}", path.display())]
     Enter {
         /// Path of the namespace.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
-    /// The thread that entered it could not be started or did not come back.
+    /// The thread that enters the namespace could not be started or panicked.
     #[error("the thread for network namespace {} failed", path.display())]
     Thread {
         /// Path of the namespace.
@@ -47,7 +47,7 @@ pub enum NetnsError {
 /// Runs `work` in the network namespace at `path` (`/run/netns/robot`, `/proc/1234/ns/net`).
 ///
 /// # Errors
-/// The namespace cannot be opened or entered.
+/// Fails if the namespace cannot be opened or entered.
 pub fn within<T: Send>(path: &Path, work: impl FnOnce() -> T + Send) -> Result<T, NetnsError> {
     let failed = || NetnsError::Thread {
         path: path.to_path_buf(),
@@ -62,7 +62,7 @@ pub fn within<T: Send>(path: &Path, work: impl FnOnce() -> T + Send) -> Result<T
     })
 }
 
-/// Moves the calling thread, for good.
+/// Moves the calling thread permanently.
 fn enter(path: &Path) -> Result<(), NetnsError> {
     let open = |source| NetnsError::Open {
         path: path.to_path_buf(),

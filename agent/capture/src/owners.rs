@@ -1,8 +1,8 @@
-//! Which process holds which socket.
+//! Maps sockets to the processes that hold them.
 //!
-//! Asks the kernel for all open sockets of all processes at once (an iterator over open files, Linux
-//! 5.8); nothing is read under `/proc`, and no process is entered. Only sockets with a cookie are
-//! told, and kept only if they are asked for.
+//! Reads all open sockets of all processes at once from the kernel (an iterator over open files,
+//! Linux 5.8). It reads nothing under `/proc` and enters no process. The iterator reports only
+//! sockets with a cookie, and only requested ones are kept.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
@@ -16,34 +16,34 @@ use zerocopy::FromBytes;
 
 use crate::bpf;
 
-/// Bytes that one run may give: some 20,000 sockets.
+/// Most bytes of one run: some 20,000 sockets.
 const LIMIT: u64 = 1 << 20;
 /// `BPF_TRACE_ITER` of `linux/bpf.h`.
 const TRACE_ITER: u32 = 28;
 
-/// Who holds a socket.
+/// The process that holds a socket.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Owner {
     /// Inode of the socket.
     pub inode: u64,
-    /// Process that holds it; of several (a parent and its child) the first found.
+    /// Process id of the holder; if several hold it (a parent and its child), the first one found.
     pub process_id: u32,
-    /// The same as the process itself sees it: another number in a container.
+    /// Process id in the process's own PID namespace, which differs in a container.
     pub own_process_id: u32,
     /// Name of that process.
     pub process_name: String,
-    /// Datagrams that the socket has dropped for whatever reason, where the kernel tells.
+    /// Datagrams dropped by the socket for any reason; `None` if the kernel does not count them.
     pub drops: Option<u32>,
 }
 
-/// Why owners are not known.
+/// Why owners are unknown.
 #[derive(Debug, thiserror::Error)]
 pub enum OwnersError {
-    /// The object has no such program.
+    /// The object lacks the program.
     #[error("the kernel filter object has no program socket_owners")]
     Missing,
-    /// The kernel does not describe its types.
-    #[error("the kernel's types")]
+    /// The kernel's types are unavailable.
+    #[error("cannot list the processes that hold sockets")]
     Types(#[from] BtfError),
     /// The kernel refuses the program.
     #[error("the kernel refuses the iterator over open files")]
@@ -53,34 +53,34 @@ pub enum OwnersError {
     Run(#[source] io::Error),
 }
 
-/// The loaded iterator. Running it needs no more than CAP_BPF.
+/// The loaded iterator. Running it needs only CAP_BPF.
 pub struct Owners {
     link: OwnedFd,
 }
 
 impl Owners {
-    /// Loads the program of an object that was told the kernel's types.
+    /// Loads the program of an object whose layout globals are set.
     ///
     /// # Errors
-    /// The kernel is too old, shows no types, or refuses the program.
+    /// Fails if the kernel is too old, has no types, or refuses the program.
     pub fn load(ebpf: &mut Ebpf) -> Result<Self, OwnersError> {
         let program = ebpf
             .program_mut("socket_owners")
             .ok_or(OwnersError::Missing)?;
         let program: &mut Iter = program.try_into()?;
         program.load("task_file", &Btf::from_sys_fs()?)?;
-        // A link of aya's gives one run only.
+        // A link created by aya allows only one run.
         let program = program.fd()?.as_fd().as_raw_fd().cast_unsigned();
         let link = bpf::create_link(program, 0, TRACE_ITER).map_err(OwnersError::Run)?;
         Ok(Self { link })
     }
 
-    /// The owners, as of now, of those of `sockets` (by cookie) that are still open.
+    /// Returns the current owners of the open sockets in `sockets` (by cookie).
     ///
-    /// Goes through all open files of the host: a few times a minute, not more.
+    /// Visits all open files of the host: call it a few times a minute at most.
     ///
     /// # Errors
-    /// The kernel refuses.
+    /// Fails if the kernel refuses the iterator.
     pub fn refresh(&self, sockets: &BTreeSet<u64>) -> Result<BTreeMap<u64, Owner>, OwnersError> {
         let link = self.link.as_raw_fd().cast_unsigned();
         let run = bpf::create_iterator(link).map_err(OwnersError::Run)?;

@@ -1,13 +1,12 @@
 //! Captures on disk as a source of frames: pcap (both byte orders, micro- and nanoseconds) and
 //! pcapng, plain or gzipped.
 //!
-//! A capture is as untrusted as the network it was taken from. Lengths in the file are checked
-//! against a cap before they are believed, memory grows with bytes read and never with bytes
-//! announced, and whatever is wrong with the rest of a file, the packets before it are delivered
-//! and counted. Own code rather than the crate `pcap-file` for exactly that: there a block length
-//! decides how much is allocated.
+//! A capture is as untrusted as its network. Lengths in the file are checked against a cap, and
+//! memory grows with bytes read, never with bytes announced. If the rest of a file is damaged, the
+//! packets before it are delivered and counted. The crate `pcap-file` is not used because it
+//! allocates by block length.
 //!
-//! The reader knows no clock; following the capture's pace is [`Pacer`]'s business.
+//! The reader knows no clock; [`Pacer`] follows the capture's pace.
 
 mod next_generation;
 mod pace;
@@ -25,7 +24,7 @@ use ros2probe_wire::{Cursor, Endianness, Timestamp, WireError};
 use next_generation::Section;
 pub use pace::{Pacer, Speed};
 
-/// tcpdump's largest snapshot length; no frame of a network is longer.
+/// tcpdump's largest snapshot length; no network frame is longer.
 const LONGEST_PACKET: u32 = 262_144;
 const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
@@ -33,15 +32,15 @@ const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 pub struct PcapReader {
     source: Box<dyn Read + Send>,
     format: Format,
-    /// The packet or block being read; its capacity is reused.
+    /// The current packet or block; its capacity is reused.
     buffer: Vec<u8>,
     packets: u64,
-    /// Bytes of the file that were read, and how many it has.
+    /// Bytes of the file that were read, and its size.
     progress: Option<(Arc<AtomicU64>, u64)>,
     ended: bool,
 }
 
-/// A file of which is counted how much was read.
+/// A file that counts the bytes read.
 struct Counted {
     file: File,
     read: Arc<AtomicU64>,
@@ -58,37 +57,37 @@ impl Read for Counted {
 /// One packet of a capture.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Captured<'a> {
-    /// When it was captured.
+    /// Capture time.
     pub time: Timestamp,
-    /// What the bytes begin with.
+    /// Link layer of the bytes.
     pub link: Link,
-    /// Number of the interface within the capture: always 0 in pcap, the n-th description in
-    /// pcapng. Not an interface index of the capturing host.
+    /// Number of the interface within the capture: always 0 in pcap, the index of its description
+    /// in pcapng. Not an interface index of the capturing host.
     pub interface: u32,
-    /// The bytes kept.
+    /// The captured bytes.
     pub bytes: &'a [u8],
-    /// How many there were on the wire.
+    /// Length of the packet on the wire.
     pub length: u32,
 }
 
-/// Why a capture could not be read, or not to its end.
+/// Why a capture could not be read to its end.
 #[derive(Debug, thiserror::Error)]
 pub enum PcapError {
     /// The file cannot be opened.
     #[error("cannot open capture {}", path.display())]
     Open {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The system's reason.
+        /// Error of the system.
         source: io::Error,
     },
-    /// None of its packets can be read.
+    /// The link layer is not supported, so no packet can be read.
     #[error(
-        "its link type is {}, which rp cannot read: capture Ethernet, loopback or the interface `any`",
+        "unsupported link type {}: capture Ethernet, loopback or the interface `any`",
         link_name(*link)
     )]
     UnsupportedLink {
-        /// The link layer of its packets.
+        /// Link layer of its packets.
         link: Link,
     },
     /// Neither pcap nor pcapng.
@@ -99,7 +98,7 @@ pub enum PcapError {
     Read {
         /// Packets delivered before.
         packets: u64,
-        /// The system's or the decompressor's reason.
+        /// Error of the system or the decompressor.
         source: io::Error,
     },
     /// The file ends inside a header or a packet.
@@ -107,19 +106,19 @@ pub enum PcapError {
     Truncated {
         /// Packets delivered before.
         packets: u64,
-        /// What was being read.
+        /// The item that was being read.
         what: &'static str,
     },
-    /// A length beyond anything reasonable.
-    #[error("a {what} of {length} bytes after packet {packets} is over the limit of {limit}")]
+    /// A length exceeds its limit.
+    #[error("a {what} of {length} bytes after packet {packets} exceeds the limit of {limit}")]
     TooLong {
         /// Packets delivered before.
         packets: u64,
-        /// What was being read.
+        /// The item that was being read.
         what: &'static str,
-        /// What the file claims.
+        /// Length in the file.
         length: u32,
-        /// What we accept.
+        /// Largest accepted length.
         limit: u32,
     },
     /// The file contradicts itself.
@@ -127,7 +126,7 @@ pub enum PcapError {
     Malformed {
         /// Packets delivered before.
         packets: u64,
-        /// What is wrong.
+        /// Description of the contradiction.
         what: &'static str,
     },
 }
@@ -137,14 +136,14 @@ enum Format {
     NextGeneration(Section),
 }
 
-/// What the header of a pcap file says about all its packets.
+/// Properties of all packets, from the header of a pcap file.
 struct Classic {
     endianness: Endianness,
     nanoseconds_per_unit: u64,
     link: Link,
 }
 
-/// Where in the buffer a packet's bytes are, and what is known about them.
+/// Position of a packet's bytes in the buffer, and its metadata.
 struct Found {
     time: Timestamp,
     link: Link,
@@ -158,7 +157,7 @@ impl PcapReader {
     /// Opens a capture file; gzip is recognised by its magic, not by its name.
     ///
     /// # Errors
-    /// The file cannot be opened, or does not begin like a capture.
+    /// Fails if the file cannot be opened or does not begin like a capture.
     pub fn open(path: &Path) -> Result<Self, PcapError> {
         let file = File::open(path).map_err(|source| PcapError::Open {
             path: path.to_path_buf(),
@@ -177,7 +176,7 @@ impl PcapReader {
         })
     }
 
-    /// Which part of the file was read, 0 to 1; `None` where its length is not known.
+    /// Returns the fraction of the file that was read, 0 to 1; `None` if its length is unknown.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a part for people")]
     pub fn part_read(&self) -> Option<f64> {
@@ -188,7 +187,7 @@ impl PcapReader {
     /// Reads from any stream of bytes.
     ///
     /// # Errors
-    /// The stream does not begin like a capture.
+    /// Fails if the stream does not begin like a capture.
     pub fn new(source: impl Read + Send + 'static) -> Result<Self, PcapError> {
         let mut source: Box<dyn Read + Send> = Box::new(BufReader::new(source));
         let mut magic: [u8; 4] = array(&mut source, "file header", 0)?;
@@ -212,13 +211,13 @@ impl PcapReader {
         })
     }
 
-    /// Packets delivered so far.
+    /// Returns the number of packets delivered so far.
     #[must_use]
     pub const fn packets(&self) -> u64 {
         self.packets
     }
 
-    /// The link layer of all packets, where the file has one for all (pcap only).
+    /// Returns the link layer of all packets; `None` in pcapng, which has one per interface.
     #[must_use]
     pub const fn link(&self) -> Option<Link> {
         match &self.format {
@@ -227,7 +226,8 @@ impl PcapReader {
         }
     }
 
-    /// Name of the interface with this number, where the capture tells (pcapng only).
+    /// Returns the name of the interface with this number, if the capture contains it (pcapng
+    /// only).
     #[must_use]
     pub fn interface_name(&self, interface: u32) -> Option<&str> {
         match &self.format {
@@ -236,10 +236,11 @@ impl PcapReader {
         }
     }
 
-    /// The next packet, or `None` at the end. Not an iterator, because packets borrow the buffer.
+    /// Returns the next packet, or `None` at the end. Not an iterator, because packets borrow the
+    /// buffer.
     ///
     /// # Errors
-    /// The rest of the file cannot be read. After an error the reader is at its end.
+    /// Fails if the rest of the file cannot be read. After an error the reader is at its end.
     pub fn next_packet(&mut self) -> Result<Option<Captured<'_>>, PcapError> {
         if self.ended {
             return Ok(None);
@@ -334,7 +335,7 @@ impl Classic {
     }
 }
 
-/// The number of a link layer, and what it is where captures of it are common.
+/// Formats the number of a link layer, and its name if captures of it are common.
 #[must_use]
 pub fn link_name(link: Link) -> String {
     let name = match link.0 {
@@ -352,13 +353,14 @@ pub fn link_name(link: Link) -> String {
     format!("{} ({name})", link.0)
 }
 
-/// The upper half of the field tells about frame check sequences: the IP length cuts those off.
+/// Returns the link layer without the upper half of the field, which describes frame check
+/// sequences: the IP length cuts those off.
 fn link_of(field: u32) -> Link {
     let [.., high, low] = field.to_be_bytes();
     Link(u16::from_be_bytes([high, low]))
 }
 
-/// Fills as much of `target` as the source has, and says how much.
+/// Fills as much of `target` as the source has, and returns the number of bytes.
 fn fill(
     source: &mut dyn Read,
     target: &mut [u8],
@@ -415,7 +417,8 @@ fn read_exactly(
     Ok(())
 }
 
-/// A gzip stream that is cut off is an error of its own kind; for the reader it is the same end.
+/// Maps a read error. A truncated gzip stream has its own kind of error, but is an early end like
+/// any other.
 fn failed(source: io::Error, what: &'static str, packets: u64) -> PcapError {
     if source.kind() == io::ErrorKind::UnexpectedEof {
         PcapError::Truncated { packets, what }

@@ -1,21 +1,21 @@
-//! Puts captured datagrams together again that the host hook gives in pieces.
+//! Assembles captured datagrams that the host hook delivers in pieces.
 //!
-//! Pieces of one datagram come in order, others may lie between them. One whose rest does not come
-//! lacked room in the ring: it is given up and counted. Bounded in number, and so in bytes. Knows
-//! nothing of what is in them.
+//! Pieces of one datagram arrive in order, with others between them. If the rest of a datagram is
+//! missing, the ring was full: the datagram is discarded and counted. Bounded in number, and so in
+//! bytes. Contents are not interpreted.
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
 use ros2probe_wire::host::{PIECE_BYTES, Piece};
 
-/// Datagrams that may wait for their rest, 4 MB at most. Only those of programs that run at the same
-/// time do, or those whose rest will not come.
+/// Most incomplete datagrams, 4 MB. Only datagrams of programs that run at the same time are
+/// incomplete, and those whose rest is lost.
 const MAX_OPEN: usize = 64;
 /// A program writes all pieces within microseconds, unless it loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 
-/// Datagrams of which not all pieces have come, the oldest first.
+/// Incomplete datagrams, the oldest first.
 #[derive(Debug, Default)]
 pub struct PieceAssembler {
     open: VecDeque<Open>,
@@ -29,8 +29,8 @@ struct Open {
 }
 
 impl PieceAssembler {
-    /// Takes in a piece and the bytes that follow it; gives the datagram when it is whole, with its
-    /// first piece.
+    /// Accepts a piece and the bytes that follow it; returns the complete datagram with its first
+    /// piece.
     pub fn piece<'a>(&mut self, piece: &Piece, bytes: &'a [u8]) -> Option<(Piece, Cow<'a, [u8]>)> {
         let bytes = bytes.get(..piece.len as usize).unwrap_or_default();
         let end = piece.offset.checked_add(piece.len);
@@ -43,7 +43,7 @@ impl PieceAssembler {
             .iter()
             .position(|open| open.first.datagram == piece.datagram);
         if piece.offset == 0 {
-            // The token is used again: the rest of the other one will not come.
+            // The token is in use again: the rest of the other datagram is lost.
             self.give_up(open);
             if !fits {
                 self.given_up += 1;
@@ -61,7 +61,7 @@ impl PieceAssembler {
             });
             return None;
         }
-        // Without the first piece it has been given up already, or never was here.
+        // The first piece was discarded or never arrived.
         let index = open?;
         let open = self.open.get_mut(index)?;
         if !fits || !open.is_followed_by(piece) {
@@ -76,7 +76,7 @@ impl PieceAssembler {
         Some((whole.first, Cow::Owned(whole.bytes)))
     }
 
-    /// Gives up what has waited too long, in the kernel's clock.
+    /// Discards datagrams that have waited too long, in the kernel's clock.
     pub fn advance(&mut self, now: u64) {
         let before = self.open.len();
         self.open
@@ -84,13 +84,13 @@ impl PieceAssembler {
         self.given_up += (before - self.open.len()) as u64;
     }
 
-    /// Datagrams that were begun and never became whole.
+    /// Returns the number of datagrams that never became complete.
     #[must_use]
     pub const fn given_up(&self) -> u64 {
         self.given_up
     }
 
-    /// Bytes that wait.
+    /// Returns the bytes of incomplete datagrams.
     #[must_use]
     pub fn bytes(&self) -> usize {
         self.open.iter().map(|open| open.bytes.len()).sum()
@@ -104,7 +104,7 @@ impl PieceAssembler {
 }
 
 impl Open {
-    /// Of the same datagram, and where this ends.
+    /// Returns whether `piece` belongs to the same datagram and begins where this one ends.
     fn is_followed_by(&self, piece: &Piece) -> bool {
         piece.offset as usize == self.bytes.len()
             && piece.datagram_len == self.first.datagram_len
@@ -130,7 +130,7 @@ mod tests {
         }
     }
 
-    /// Byte `i` of a datagram is not that of its neighbours.
+    /// Content in which adjacent bytes of a datagram differ.
     fn content(datagram: u32, offset: u32, len: u32) -> Vec<u8> {
         (offset..offset + len)
             .map(|at| (at * 7 + at / 256 + datagram) as u8)
@@ -179,7 +179,7 @@ mod tests {
         let mut wholes = PieceAssembler::default();
         let all = pieces(1, 40_000);
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
-        // The second had no room.
+        // The second piece is lost.
         assert!(wholes.piece(&all[2].0, &all[2].1).is_none());
         assert_eq!((wholes.bytes(), wholes.given_up()), (0, 1));
         assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
@@ -187,7 +187,7 @@ mod tests {
         assert_eq!(wholes.given_up(), 1);
         wholes.advance(LIFETIME_NANOSECONDS + 1);
         assert_eq!((wholes.bytes(), wholes.given_up()), (0, 2));
-        // Nor is a rest that comes after all taken for anything.
+        // A rest that arrives later is ignored.
         assert!(wholes.piece(&all[1].0, &all[1].1).is_none());
         assert_eq!(wholes.given_up(), 2);
     }

@@ -1,13 +1,13 @@
-//! Puts UDP datagrams together again that IP cut into fragments.
+//! Reassembles UDP datagrams from IP fragments.
 //!
-//! Kept in memory are bytes that came, never bytes that were announced; flows and bytes are capped,
-//! and the oldest flow goes first. A finished datagram is remembered for a while, so that a
-//! repeated fragment does not open it anew. Fragments never wait longer than the receiving kernel
-//! would let them.
+//! Memory holds bytes that arrived, never bytes that were announced. Flows and bytes are capped,
+//! and the oldest flow is evicted first. A finished datagram is remembered for a while, so that a
+//! duplicate fragment does not open it again. Fragments never wait longer than in the receiving
+//! kernel.
 //!
-//! The kernel filter walks fragmented datagrams itself. Where it cannot go on it hands over: it
-//! tells from which submessage on, and captures the remaining fragments only. Such a datagram is
-//! complete when everything from there to its end has come.
+//! The kernel filter walks fragmented datagrams itself. If it cannot continue, it hands the
+//! datagram over: it reports the next submessage and captures only the remaining fragments. Such a
+//! datagram is complete when everything from there to its end has arrived.
 
 mod flow;
 
@@ -23,7 +23,7 @@ use ros2probe_model::size::Size;
 
 const UDP_HEADER: u32 = 8;
 
-/// How much may be kept, and for how long.
+/// Limits of memory and time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Limits {
     /// Bytes of all unfinished datagrams together, bookkeeping included.
@@ -34,8 +34,8 @@ pub struct Limits {
     pub timeout: u64,
     /// Finished datagrams remembered.
     pub remembered: usize,
-    /// Nanoseconds a finished datagram is remembered. Repetitions come within milliseconds, while
-    /// a busy sender uses an IPv4 identification again after seconds.
+    /// Nanoseconds a finished datagram is remembered. Duplicates arrive within milliseconds, while
+    /// a busy sender reuses an IPv4 identification after seconds.
     pub remember: u64,
 }
 
@@ -51,8 +51,8 @@ impl Default for Limits {
     }
 }
 
-/// What the fragments of one datagram have in common. They travel together, so a copy of the
-/// datagram seen on another interface or in the other direction is another flow.
+/// Key shared by the fragments of one datagram. They take the same path, so a copy on another
+/// interface or in the other direction is another flow.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct FlowKey {
     /// Number of the source (network namespace, capture) that saw them.
@@ -69,15 +69,16 @@ pub struct FlowKey {
     pub id: u32,
 }
 
-/// A datagram put together.
+/// A reassembled datagram.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Reassembled {
     /// UDP header and payload; zeros before `start`.
     transport: Vec<u8>,
-    /// The kernel filter's [`ros2probe_wire::record::kind::HANDOVER`] record when the walk begins
+    /// The kernel filter's [`ros2probe_wire::record::kind::HANDOVER`] record, if the walk begins
     /// inside the payload.
     pub handover: Option<Record>,
-    /// Offset in the payload where to begin: 0 unless handed over. Before it are zeros.
+    /// Offset in the payload at which to begin: 0 unless handed over. The bytes before it are
+    /// zeros.
     pub start: u32,
     /// True length of the payload; more than [`Self::payload`] holds if the capture was cut short.
     pub length: u32,
@@ -85,17 +86,17 @@ pub struct Reassembled {
     pub first_seen: Timestamp,
     /// Capture time of the fragment that completed it.
     pub last_seen: Timestamp,
-    /// Port it was sent from; 0 when handed over.
+    /// Source port; 0 if handed over.
     pub source_port: u16,
-    /// Port it was sent to.
+    /// Destination port.
     pub destination_port: u16,
 }
 
 impl Reassembled {
-    /// Bytes held.
+    /// Returns the bytes held.
     #[must_use]
     pub fn held(&self) -> usize {
-        // A new list does not compile before it has a place here.
+        // A new list does not compile until it is listed here.
         let Self {
             transport,
             handover: _,
@@ -109,7 +110,7 @@ impl Reassembled {
         transport.capacity()
     }
 
-    /// The payload up to the first byte that the capture did not keep.
+    /// Returns the payload up to the first byte that is missing in the capture.
     #[must_use]
     pub fn payload(&self) -> &[u8] {
         self.transport
@@ -118,21 +119,21 @@ impl Reassembled {
     }
 }
 
-/// What became of fragments that made no datagram.
+/// Counters of the reassembly.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Counters {
     /// Datagrams completed.
     pub completed: u64,
-    /// Unfinished datagrams given up because of the caps.
+    /// Unfinished datagrams discarded because of the caps.
     pub evicted: u64,
-    /// Unfinished datagrams given up because of their age.
+    /// Unfinished datagrams discarded because of their age.
     pub timed_out: u64,
-    /// Fragments that brought nothing new.
+    /// Fragments without new bytes.
     pub duplicate: u64,
-    /// Fragments that contradict what came before: other bytes in the same place, or bytes beyond
+    /// Fragments that contradict earlier ones: different bytes at the same offset, or bytes beyond
     /// the datagram's end.
     pub contradictory: u64,
-    /// Datagrams with an impossible UDP header.
+    /// Datagrams with an invalid UDP header.
     pub malformed: u64,
 }
 
@@ -141,7 +142,7 @@ pub struct Counters {
 pub struct Reassembly {
     limits: Limits,
     flows: HashMap<FlowKey, Flow>,
-    /// Flows by the order in which they were opened.
+    /// Flows by order of creation.
     order: BTreeMap<u64, FlowKey>,
     opened: u64,
     bytes: usize,
@@ -151,7 +152,7 @@ pub struct Reassembly {
 }
 
 impl FlowKey {
-    /// Of a captured fragment.
+    /// Returns the key of a captured fragment.
     #[must_use]
     pub const fn new(
         namespace: u32,
@@ -170,7 +171,7 @@ impl FlowKey {
         }
     }
 
-    /// Of the datagram that a HANDOVER record is about.
+    /// Returns the key of the datagram in a HANDOVER record.
     #[must_use]
     pub fn of_handover(namespace: u32, record: &Record) -> Self {
         let handover = record.handover();
@@ -190,7 +191,7 @@ impl FlowKey {
 }
 
 impl Reassembly {
-    /// Nothing kept yet.
+    /// Creates an empty reassembly.
     #[must_use]
     pub fn new(limits: Limits) -> Self {
         Self {
@@ -205,10 +206,10 @@ impl Reassembly {
         }
     }
 
-    /// Entries, or bytes, and cap of every table.
+    /// Returns entries, or bytes, and cap of every table.
     #[must_use]
     pub fn sizes(&self) -> [Size; 5] {
-        // A new table does not compile before it has a place here.
+        // A new table does not compile until it is listed here.
         let Self {
             limits,
             flows,
@@ -234,7 +235,7 @@ impl Reassembly {
         ]
     }
 
-    /// Takes a fragment; gives the datagram it completes.
+    /// Accepts a fragment; returns the datagram that it completes.
     pub fn fragment(
         &mut self,
         at: Timestamp,
@@ -257,8 +258,8 @@ impl Reassembly {
             Placed::Nothing => self.counters.duplicate += 1,
             Placed::Contradiction => {
                 self.counters.contradictory += 1;
-                // The identification is in use again, and the rest of the old datagram will not
-                // come. What the kernel filter handed over it has just seen itself: that stays.
+                // The identification is in use again, and the rest of the old datagram is lost. The
+                // kernel filter has just seen a handed-over datagram itself: that one stays.
                 if !handed_over {
                     self.close(&key);
                     let flow = self.open(at, key)?;
@@ -272,8 +273,8 @@ impl Reassembly {
         self.finish(key)
     }
 
-    /// Takes a HANDOVER record, before or after the fragments it is about; gives the datagram if
-    /// they are all there.
+    /// Accepts a HANDOVER record, before or after the fragments of its datagram; returns the
+    /// datagram if all of them have arrived.
     pub fn hand_over(
         &mut self,
         at: Timestamp,
@@ -293,7 +294,7 @@ impl Reassembly {
         self.finish(key)
     }
 
-    /// Gives up what has waited for too long at the time `now`.
+    /// Discards datagrams that have waited too long at the time `now`.
     pub fn advance(&mut self, now: Timestamp) {
         while let Some(key) = self.oldest() {
             let fresh = self
@@ -319,19 +320,19 @@ impl Reassembly {
         }
     }
 
-    /// Counters since the start.
+    /// Returns the counters since the start.
     #[must_use]
     pub const fn counters(&self) -> Counters {
         self.counters
     }
 
-    /// Bytes held at the moment.
+    /// Returns the bytes currently held.
     #[must_use]
     pub const fn bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Unfinished datagrams at the moment.
+    /// Returns the number of unfinished datagrams.
     #[must_use]
     pub fn flows(&self) -> usize {
         self.flows.len()
@@ -341,7 +342,7 @@ impl Reassembly {
         self.order.first_key_value().map(|(_, key)| *key)
     }
 
-    /// The flow of this key, made if need be at the oldest one's expense.
+    /// Returns the flow of this key; creates it if needed, evicting the oldest one.
     fn open(&mut self, at: Timestamp, key: FlowKey) -> Option<&mut Flow> {
         if !self.flows.contains_key(&key) {
             if self.flows.len() >= self.limits.flows
@@ -366,7 +367,7 @@ impl Reassembly {
         Some(flow)
     }
 
-    /// Delivers the flow if it is complete, and otherwise makes room.
+    /// Returns the datagram of the flow if it is complete, and otherwise makes room.
     fn finish(&mut self, key: FlowKey) -> Option<Reassembled> {
         let complete = self.flows.get(&key)?.complete();
         if complete.is_none() {
@@ -408,7 +409,8 @@ fn handed_over(flow: &Flow, transport: Vec<u8>, record: &Record) -> Reassembled 
     }
 }
 
-/// `None` when the UDP header cannot be read or claims more than there is: no socket got that.
+/// Returns `None` if the UDP header is unreadable or claims more bytes than exist: no socket
+/// received it.
 fn whole(flow: &Flow, mut transport: Vec<u8>, total: u32) -> Option<Reassembled> {
     let mut cursor = Cursor::new(&transport, Endianness::Big);
     let source_port = cursor.u16("UDP source port").ok()?;

@@ -1,8 +1,9 @@
-//! Follows the control group at the configured path. The kernel detaches the host hook from a group
-//! that is removed; a group that is made anew at the path gets the hook again.
+//! Follows the control group at the configured path. The kernel detaches the host hook from a
+//! removed group; a group recreated at the path gets the hook again.
 //!
-//! A thread of its own: attaching takes `CAP_NET_ADMIN`, which no other thread keeps. Its filter of
-//! system calls allows no use of it but creating links. It makes and changes no control group.
+//! Runs in its own thread: attaching takes `CAP_NET_ADMIN`, which no other thread keeps. The
+//! thread's system call filter allows creating links as the only use of it. It creates and changes
+//! no control group.
 
 use std::fs::{self, File};
 use std::io::{self, PipeReader, PipeWriter};
@@ -20,13 +21,13 @@ use super::filter::{FilterError, Links};
 use super::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
 
-/// How often the path is looked at. A group that appears in an existing directory is noticed at once.
+/// Interval of checks. A group that appears in an existing directory is noticed at once.
 const EVERY: Duration = Duration::from_secs(1);
 
-/// Device and inode of a directory. The kernel gives no two control groups the same.
+/// Device and inode of a directory, unique per control group.
 pub type Identity = (u64, u64);
 
-/// The thread, from the outside. It ends when this is dropped.
+/// Handle of the thread, which ends when this is dropped.
 pub struct Reattach {
     shared: Arc<Shared>,
     /// Closed to end the thread.
@@ -36,19 +37,19 @@ pub struct Reattach {
 
 #[derive(Default)]
 struct Shared {
-    /// Why the hook is attached to nothing.
+    /// Why the hook is not attached.
     detached: Mutex<Option<String>>,
     /// How often the hook was attached again.
     attached_anew: AtomicU64,
 }
 
-/// What the thread works with.
+/// State of the thread.
 struct Follow {
     path: PathBuf,
-    /// The group that the hook is attached to; `None` = none.
+    /// The group with the hook; `None` = none.
     attached: Option<Identity>,
     links: Links,
-    /// Detached when it is dropped.
+    /// The links; dropping them detaches the hook.
     held: Vec<OwnedFd>,
     shared: Arc<Shared>,
 }
@@ -63,10 +64,10 @@ enum ReattachError {
 }
 
 impl Reattach {
-    /// Follows the group at `path`, whose directory `attached` is the hook's now.
+    /// Follows the group at `path`; the hook is attached to the directory `attached`.
     ///
     /// # Errors
-    /// There can be no more threads.
+    /// Fails if the thread cannot be started.
     pub fn start(path: &Path, attached: Identity, links: Links, spawn: Spawn) -> io::Result<Self> {
         let (ended, end) = io::pipe()?;
         let shared = Arc::new(Shared::default());
@@ -88,14 +89,14 @@ impl Reattach {
         })
     }
 
-    /// Why the hook is attached to nothing; `None` while it is.
+    /// Returns why the hook is not attached; `None` while it is.
     #[must_use]
     pub fn detached(&self) -> Option<String> {
         let detached = self.shared.detached.lock();
         detached.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// How often the hook was attached to another group since the start.
+    /// Returns how often the hook was attached to another group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
         self.shared.attached_anew.load(Ordering::Acquire)
@@ -114,7 +115,7 @@ impl Drop for Reattach {
 
 impl Follow {
     fn run(&mut self, ended: &PipeReader) {
-        // Without it, a group that is made anew is noticed within a second.
+        // Without inotify, a recreated group is noticed within a second.
         let mut watch = DirectoryWatch::new().ok();
         loop {
             if let (Some(watch), Some(above)) = (&mut watch, self.path.parent()) {
@@ -143,7 +144,7 @@ impl Follow {
         if self.attached.take().is_some() {
             self.held.clear();
             let reason = format!("the cgroup {} was removed", self.path.display());
-            tracing::warn!("{reason}: its sockets are not seen until it is there again");
+            tracing::warn!("{reason}: its sockets are not observed until it is recreated");
             self.detach(reason);
         }
         if there.is_none() {
@@ -155,7 +156,7 @@ impl Follow {
                 *self.detached() = None;
                 tracing::info!(
                     cgroup = %self.path.display(),
-                    "the cgroup is there again: its sockets are seen"
+                    "the cgroup was recreated: its sockets are observed"
                 );
             }
             Err(error) => {
@@ -185,14 +186,14 @@ impl Follow {
     }
 }
 
-/// Of an open directory.
+/// Returns the identity of an open directory.
 #[must_use]
 pub fn of(directory: &File) -> Option<Identity> {
     let metadata = directory.metadata().ok()?;
     Some((metadata.dev(), metadata.ino()))
 }
 
-/// Of what is at a path now.
+/// Returns the current identity of the directory at a path.
 #[must_use]
 pub fn identity(path: &Path) -> Option<Identity> {
     let metadata = fs::metadata(path).ok()?;

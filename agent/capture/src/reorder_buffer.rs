@@ -1,13 +1,13 @@
-//! Puts what is counted back into the order in which it was captured.
+//! Restores the capture order of records.
 //!
-//! Records come from the kernel program's ring or, of a datagram that was captured whole, from the
-//! walk of its bytes, and either way may be the quicker one. A retransmission must not overtake the
-//! gap that it fills: it would count as a sample that was never missing. Everything waits until
-//! both ways have had their time. It decides nothing and knows no writer.
+//! Records come from the kernel program's ring or, for a datagram captured whole, from the walk
+//! over its bytes; either path may be faster. A retransmission must not overtake the gap that it
+//! fills, since it would count as a sample that was never missing. So every record waits until both
+//! paths have had their time. The buffer decides nothing and knows no writer.
 //!
-//! That a socket had no room is known after its datagram was reported, and has to be said before:
-//! such records go first among all of their time or later. Of a captured datagram the kernel names
-//! the token only; its records are then said twice, first as not delivered.
+//! A full socket buffer is reported after its datagram but must be counted before it: such records
+//! precede all records of their time or later. For a captured datagram the kernel reports only the
+//! token. The datagram's records are then passed twice, first as not delivered.
 
 use std::collections::{HashSet, VecDeque};
 
@@ -19,26 +19,26 @@ use ros2probe_wire::walk::Envelope;
 
 use super::system::Clocks;
 
-/// Records of captured datagrams that may wait: some 2.5 MB. Two thousand fit a datagram that means
-/// harm.
+/// Most waiting records of captured datagrams: some 2.5 MB. A malicious datagram has two thousand
+/// records.
 const MAX_WALKED: usize = 16_384;
-/// Room for records that is kept when none wait; what a burst took beyond is given back.
+/// Capacity for records that is kept while none wait; memory beyond it is freed after a burst.
 const KEPT: usize = 512;
-/// How much later than the word that it was not delivered a captured datagram may be read.
+/// How much later than the report of its drop a captured datagram may be read.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
 /// The records of one tap.
 #[derive(Debug, Default)]
 pub struct ReorderBuffer {
-    /// In the kernel's clock.
+    /// Records of the kernel, in the kernel's clock.
     kernel: VecDeque<Record>,
-    /// Those with [`flag::NO_ROOM`], in the kernel's clock and sorted by it.
+    /// Records with [`flag::NO_ROOM`], sorted by time in the kernel's clock.
     no_room: VecDeque<Record>,
     walked: VecDeque<Walked>,
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: VecDeque<(u64, u32)>,
     undelivered_tokens: HashSet<u32>,
-    /// Records of the datagram that is being walked, empty otherwise.
+    /// Records of the datagram being walked, otherwise empty.
     found: Vec<Record>,
 }
 
@@ -47,13 +47,13 @@ pub struct ReorderBuffer {
 struct Walked {
     /// Its time in the kernel's clock.
     at: u64,
-    /// Its time is calendar time.
+    /// The record, with its time in the wall clock.
     record: Record,
-    /// It has been said that its datagram was not delivered.
+    /// Whether it was already passed as not delivered.
     no_room_said: bool,
 }
 
-/// One record whose turn it is, in calendar time.
+/// The next record in order, with its time in the wall clock.
 #[derive(Clone, Copy, Debug)]
 pub enum Next {
     /// Written by the kernel program.
@@ -63,13 +63,13 @@ pub enum Next {
 }
 
 impl ReorderBuffer {
-    /// Takes in a record of the kernel's ring, its time in the kernel's clock.
+    /// Accepts a record of the kernel's ring, with its time in the kernel's clock.
     pub fn kernel(&mut self, record: Record) {
         if matches!(record.body(), Body::Undelivered) {
             self.undelivered.push_back((record.time, record.datagram));
             self.undelivered_tokens.insert(record.datagram);
         } else if record.flags & flag::NO_ROOM != 0 {
-            // CPUs may be microseconds out of order.
+            // Records of several CPUs may be out of order by microseconds.
             let place = self
                 .no_room
                 .partition_point(|other| other.time <= record.time);
@@ -79,8 +79,8 @@ impl ReorderBuffer {
         }
     }
 
-    /// Takes in a record of a captured datagram, its time in calendar time and `at` the same in the
-    /// kernel's clock; gives it back when too many wait.
+    /// Accepts a record of a captured datagram, with its time in the wall clock and the same time
+    /// in the kernel's clock as `at`; returns it if too many wait.
     #[must_use]
     pub fn walked(&mut self, at: u64, record: Record) -> Option<Record> {
         if self.walked.len() >= MAX_WALKED {
@@ -94,9 +94,9 @@ impl ReorderBuffer {
         None
     }
 
-    /// Gives the model what a captured datagram announces. The datagram's records of user data wait
-    /// for their turn, `at` being its time in the kernel's clock. `complete` adds to each what the
-    /// bytes do not hold.
+    /// Passes the announcements in a captured datagram to the model. The datagram's records of user
+    /// data wait for their turn; `at` is its time in the kernel's clock. `complete` adds to each
+    /// record what the bytes do not contain.
     pub fn datagram(
         &mut self,
         at: u64,
@@ -120,13 +120,14 @@ impl ReorderBuffer {
         self.found = found;
     }
 
-    /// Records of the kernel's ring that wait.
+    /// Returns the number of waiting records of the kernel's ring.
     #[must_use]
     pub fn waiting(&self) -> usize {
         self.kernel.len() + self.no_room.len()
     }
 
-    /// The oldest record, if it is not younger than `until` in the kernel's clock.
+    /// Removes and returns the oldest record, if it is not younger than `until` in the kernel's
+    /// clock.
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|walked| walked.at);
@@ -178,7 +179,7 @@ impl ReorderBuffer {
         }
     }
 
-    /// Of the last second, records up to `until` may not have come yet.
+    /// Forgets reports older than a second before `until`, whose records have arrived.
     fn forget_undelivered(&mut self, until: u64) {
         let before = until.saturating_sub(LATE_NANOSECONDS);
         while let Some((_, token)) = self.undelivered.pop_front_if(|(at, _)| *at < before) {
@@ -229,7 +230,7 @@ mod tests {
         }
     }
 
-    /// Time in the kernel's clock, and record.
+    /// A captured record with its time in the kernel's clock.
     fn captured(number: u64, milliseconds: u64) -> (u64, Record) {
         let clocks = clocks(milliseconds);
         let record = Record {
@@ -243,7 +244,7 @@ mod tests {
         assert!(order.walked(at, record).is_none());
     }
 
-    /// Sequence numbers, negative where the record says that there was no room.
+    /// Sequence numbers, negative for records of a full socket buffer.
     fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
         std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
@@ -260,7 +261,8 @@ mod tests {
     #[test]
     fn a_retransmission_in_a_captured_frame_does_not_overtake_the_gap_it_fills() {
         let mut order = ReorderBuffer::default();
-        // 10 was lost; it comes again in a frame that user space gets before the record of 11.
+        // 10 was lost; it is retransmitted in a frame that user space reads before the record of
+        // 11.
         walked(&mut order, captured(10, 30));
         order.kernel(of_the_kernel(9, 1));
         order.kernel(of_the_kernel(11, 20));
@@ -275,13 +277,13 @@ mod tests {
         let mut order = ReorderBuffer::default();
         order.kernel(of_the_kernel(1, 5));
         order.kernel(of_the_kernel(2, 10));
-        // Another CPU's, and two that are out of order.
+        // A record of another CPU, and two that are out of order.
         order.kernel(of_the_kernel(3, 12));
         order.kernel(no_room(3, 12));
         order.kernel(no_room(2, 10));
         walked(&mut order, captured(4, 12));
         assert_eq!(numbers(&mut order, &clocks(200)), [1, -2, 2, -3, 3, 4]);
-        // The arrival waits in a run and comes with the time of the last fragment.
+        // The arrival waits in a run and has the time of the last fragment.
         order.kernel(no_room(7, 300));
         order.kernel(of_the_kernel(6, 299));
         order.kernel(of_the_kernel(7, 320));
@@ -323,7 +325,7 @@ mod tests {
                 [1, -2, 2, -3, 3, 4, 5],
                 "{pieces_first}"
             );
-            // Tokens come again.
+            // Tokens are reused.
             assert!(numbers(&mut order, &clocks(4000)).is_empty());
             walked(&mut order, of(8, captured(6, 5000)));
             assert_eq!(numbers(&mut order, &clocks(6000)), [6]);

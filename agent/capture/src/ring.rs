@@ -1,12 +1,12 @@
 //! Frames of every interface of a network namespace, through a ring shared with the kernel:
 //! `AF_PACKET` with TPACKET_V3.
 //!
-//! The socket is created without a protocol, so that nothing arrives before the filter is attached;
-//! it is bound to no interface, so that interfaces which appear later are seen as well. It never
-//! sends. Which frames are kept, and how much of each, is the filter's verdict and not decided here.
+//! The socket is created without a protocol, so that nothing arrives before the filter is attached.
+//! It is bound to no interface, so that it also sees interfaces that appear later. It never sends.
+//! The filter decides which frames are kept, and how much of each.
 //!
-//! Kernel memory is touched here and in `turns` only: a [`Block`] is lent to its reader and goes
-//! back to the kernel when it is dropped. What is in a block is read by [`block`] as plain bytes.
+//! Only this module and `turns` access memory shared with the kernel: a [`Block`] is lent to its
+//! reader and returns to the kernel when it is dropped. [`block`] reads a block as plain bytes.
 
 pub mod block;
 mod turns;
@@ -25,15 +25,15 @@ use turns::Turns;
 pub use block::{Frames, RingFrame};
 pub use turns::Block;
 
-/// The kernel wants a frame size in TPACKET_V3 too, but packs frames as tightly as they fit.
+/// TPACKET_V3 requires a frame size too, but packs frames tightly.
 const NOMINAL_FRAME: usize = 2048;
-/// The largest frame, a 64 KiB datagram on loopback, fits with its header and the block's. A block
-/// changes hands when it is full or [`Settings::retire`] old, so the number of blocks is also the
-/// time for which the reader may be held up: small blocks, and many.
+/// Bytes of a block. The largest frame, a 64 KiB datagram on loopback, fits with its header and the
+/// block's. A block changes hands when it is full or [`Settings::retire`] old, so the number of
+/// blocks limits how long the reader may be delayed: many small blocks are better.
 const BLOCK: usize = 128 << 10;
-/// Memory of a ring unless somebody says otherwise.
+/// Default memory of a ring.
 const MEMORY: usize = 4 << 20;
-/// Between two looks at a socket that reports an error again and again.
+/// Pause between polls of a socket that repeatedly reports an error.
 const ERROR_PAUSE: Duration = Duration::from_millis(10);
 
 /// Size and pace of a ring.
@@ -41,7 +41,7 @@ const ERROR_PAUSE: Duration = Duration::from_millis(10);
 pub struct Settings {
     /// Bytes of a block; rounded up to whole pages.
     pub block_size: usize,
-    /// Blocks. One is being filled, the others wait for the reader.
+    /// Number of blocks. One is being filled, the others wait for the reader.
     pub blocks: usize,
     /// How long a frame may wait in a block that does not fill up.
     pub retire: Duration,
@@ -54,7 +54,8 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// A ring of about this much memory, in blocks that hold the largest frame (64 KiB on `lo`).
+    /// Returns settings for a ring of about this much memory, in blocks that hold the largest frame
+    /// (64 KiB on `lo`).
     #[must_use]
     pub fn with_memory(bytes: usize) -> Self {
         Self {
@@ -65,44 +66,44 @@ impl Settings {
     }
 }
 
-/// What the kernel counted for this socket.
+/// The kernel's counters of this socket.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Statistics {
-    /// Frames that passed the filter, also those dropped for lack of room.
+    /// Frames that passed the filter, including those dropped for lack of room.
     pub packets: u64,
-    /// Frames dropped because every block was waiting for the reader.
+    /// Frames dropped because every block waited for the reader.
     pub drops: u64,
-    /// How often that began.
+    /// Number of times that the ring filled up.
     pub freezes: u64,
-    /// Errors the socket reported, such as a link going down. Capturing goes on.
+    /// Errors reported by the socket, such as a link going down. Capturing continues.
     pub socket_errors: u64,
 }
 
-/// Why there is no ring, or no more.
+/// Why the ring cannot be opened or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RingError {
     /// The process lacks a capability.
     #[error("not permitted to capture ({call}): CAP_NET_RAW is missing")]
     NotPermitted {
-        /// The system call.
+        /// Name of the system call.
         call: &'static str,
-        /// Its error.
+        /// Error of the system call.
         source: io::Error,
     },
     /// A system call failed.
     #[error("{call} failed")]
     System {
-        /// The system call.
+        /// Name of the system call.
         call: &'static str,
-        /// Its error.
+        /// Error of the system call.
         source: io::Error,
     },
     /// The ring cannot have this size.
     #[error("a ring of {blocks} blocks of {block_size} bytes is empty or too large")]
     Size {
-        /// Blocks asked for.
+        /// Requested number of blocks.
         blocks: usize,
-        /// Bytes of a block asked for.
+        /// Requested bytes per block.
         block_size: usize,
     },
 }
@@ -110,7 +111,7 @@ pub enum RingError {
 /// A packet socket and its ring.
 #[derive(Debug)]
 pub struct Ring {
-    // Fields are dropped in this order: the memory is given back before the socket is closed.
+    // Fields are dropped in this order: the memory is released before the socket is closed.
     turns: Turns,
     _memory: Mapping,
     socket: OwnedFd,
@@ -122,7 +123,7 @@ impl Ring {
     /// loaded BPF program of type socket filter; without one every frame is kept.
     ///
     /// # Errors
-    /// A capability is missing, or the kernel refuses the filter or the ring's size.
+    /// Fails if a capability is missing, or if the kernel refuses the filter or the ring's size.
     pub fn open(settings: Settings, filter: Option<BorrowedFd<'_>>) -> Result<Self, RingError> {
         Self::open_on(settings, filter, 0)
     }
@@ -167,9 +168,9 @@ impl Ring {
             "PACKET_RX_RING",
         )?;
         let memory = Mapping::new(&socket, block_size * settings.blocks)?;
-        // SAFETY: as many blocks are mapped, from the beginning of a page on, whole pages each, until
-        // the mapping is dropped, behind `turns` and together with it. The other side is the kernel,
-        // which keeps to the protocol of TPACKET_V3.
+        // SAFETY: as many blocks are mapped from the start of a page, in whole pages each, until
+        // the mapping is dropped, which happens after `turns` is dropped. The other side is the
+        // kernel, which follows the TPACKET_V3 protocol.
         let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,
@@ -181,24 +182,24 @@ impl Ring {
         Ok(ring)
     }
 
-    /// How many blocks there are.
+    /// Returns the number of blocks.
     #[must_use]
     pub const fn blocks(&self) -> usize {
         self.turns.blocks()
     }
 
-    /// The next block if the kernel is done with it.
+    /// Returns the next block if the kernel has released it.
     pub fn block(&mut self) -> Option<Block<'_>> {
         self.turns.block()
     }
 
-    /// Waits until a block is ready; `false` when the time is over or a signal came.
+    /// Waits until a block is ready; returns `false` on a timeout or signal.
     ///
-    /// An error that the socket reports is cleared, counted and survived. A link that goes down
+    /// Clears and counts an error reported by the socket, and continues. A link that goes down
     /// reports one to each socket bound to it.
     ///
     /// # Errors
-    /// `poll` itself fails.
+    /// Fails if `poll` itself fails.
     pub fn wait(&mut self, timeout: Duration) -> Result<bool, RingError> {
         let mut poll = libc::pollfd {
             fd: self.socket.as_raw_fd(),
@@ -206,7 +207,7 @@ impl Ring {
             revents: 0,
         };
         let milliseconds = c_int::try_from(timeout.as_millis()).unwrap_or(c_int::MAX);
-        // SAFETY: `poll` is one pollfd, it is ours, and the count says one.
+        // SAFETY: `poll` is one live pollfd, and the count is 1.
         let count = unsafe { libc::poll(&raw mut poll, 1, milliseconds) };
         if count < 0 {
             let source = io::Error::last_os_error();
@@ -221,7 +222,7 @@ impl Ring {
         if poll.revents & !libc::POLLIN != 0 {
             self.statistics.socket_errors += 1;
             let mut pending: c_int = 0;
-            // Reading the error clears it; without that, poll would return at once for ever.
+            // Reading the error clears it; otherwise poll would return at once forever.
             get(
                 &self.socket,
                 libc::SOL_SOCKET,
@@ -236,17 +237,17 @@ impl Ring {
         Ok(poll.revents & libc::POLLIN != 0)
     }
 
-    /// Counts since the ring was opened.
+    /// Returns the counters since the ring was opened.
     ///
     /// # Errors
-    /// The kernel does not tell.
+    /// Fails if the kernel's statistics cannot be read.
     pub fn statistics(&mut self) -> Result<Statistics, RingError> {
         let mut fresh = libc::tpacket_stats_v3 {
             tp_packets: 0,
             tp_drops: 0,
             tp_freeze_q_cnt: 0,
         };
-        // The kernel starts over with each reading.
+        // The kernel resets its counters on each read.
         get(
             &self.socket,
             libc::SOL_PACKET,
@@ -274,8 +275,8 @@ struct Mapping {
     length: usize,
 }
 
-// SAFETY: the mapping is owned, and reached through the ring that owns it only; no thread has a
-// claim to it.
+// SAFETY: the mapping is owned, and accessed only through the ring that owns it; it is bound to no
+// thread.
 unsafe impl Send for Mapping {}
 
 impl Mapping {
@@ -307,14 +308,14 @@ impl Drop for Mapping {
     }
 }
 
-/// 4 KiB, but 16 on a Raspberry Pi 5 and 64 on some servers.
+/// Returns the page size: 4 KiB, but 16 on a Raspberry Pi 5 and 64 on some servers.
 fn page_bytes() -> Option<usize> {
-    // SAFETY: sysconf reads nothing of ours.
+    // SAFETY: sysconf accesses no memory of this process.
     usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).ok()
 }
 
-/// The ring as the kernel wants to be asked for it, blocks of whole pages, and the size of its
-/// blocks. `None` when the numbers do not fit.
+/// Returns the kernel's request for the ring in blocks of whole pages, and the size of its blocks.
+/// `None` if the numbers overflow.
 fn request(settings: Settings, page: usize) -> Option<(libc::tpacket_req3, usize)> {
     let block_size = settings.block_size.max(1).checked_next_multiple_of(page)?;
     let length = block_size.checked_mul(settings.blocks)?;
@@ -327,7 +328,7 @@ fn request(settings: Settings, page: usize) -> Option<(libc::tpacket_req3, usize
         tp_block_nr: u32::try_from(settings.blocks).ok()?,
         tp_frame_size: u32::try_from(NOMINAL_FRAME).ok()?,
         tp_frame_nr: u32::try_from(frames).ok()?,
-        // 0 would mean a default computed from the link's speed.
+        // 0 would select a default computed from the link's speed.
         tp_retire_blk_tov: u32::try_from(settings.retire.as_millis().max(1)).ok()?,
         tp_sizeof_priv: 0,
         tp_feature_req_word: 0,
@@ -335,7 +336,7 @@ fn request(settings: Settings, page: usize) -> Option<(libc::tpacket_req3, usize
     Some((request, block_size))
 }
 
-/// Protocol 0: receives nothing until it is bound.
+/// Creates a socket with protocol 0, which receives nothing until it is bound.
 fn create() -> Result<OwnedFd, RingError> {
     let kind = libc::SOCK_DGRAM | libc::SOCK_CLOEXEC | libc::SOCK_NONBLOCK;
     // SAFETY: takes no pointers.
@@ -343,7 +344,7 @@ fn create() -> Result<OwnedFd, RingError> {
     if fd < 0 {
         return Err(last("socket(AF_PACKET)"));
     }
-    // SAFETY: a descriptor just made, which nobody else owns.
+    // SAFETY: a new descriptor without another owner.
     Ok(unsafe { OwnedFd::from_raw_fd(fd) })
 }
 
@@ -388,7 +389,7 @@ fn set<T>(
     if result < 0 { Err(last(name)) } else { Ok(()) }
 }
 
-/// `T` must be a plain integer or a `repr(C)` struct of such.
+/// Reads a socket option. `T` must be a plain integer or a `repr(C)` struct of integers.
 fn get<T: Copy>(
     socket: &OwnedFd,
     level: c_int,

@@ -1,22 +1,22 @@
-//! What to capture, and the memory for it.
+//! Settings of the capture and its memory.
 
 use std::path::PathBuf;
 
 use schemars::JsonSchema;
 use serde::Deserialize;
 
-/// Where packets come from and the memory used for it.
+/// Packet sources and their memory.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CaptureSettings {
     /// At the sockets of this host, or on the wire.
     pub source: SourceChoice,
     /// Only sockets of this cgroup; `None` = the whole host.
     pub cgroup: Option<PathBuf>,
-    /// Interface globs whose wire is looked at besides the host's sockets.
+    /// Interface globs that are observed in addition to the host's sockets.
     pub mirror_interfaces: Vec<String>,
-    /// Interface globs to look at; empty = all.
+    /// Interface globs to observe; empty = all.
     pub include_interfaces: Vec<String>,
-    /// Interface globs never looked at.
+    /// Interface globs that are never observed.
     pub exclude_interfaces: Vec<String>,
     /// Further network namespaces.
     pub network_namespaces: Vec<PathBuf>,
@@ -24,53 +24,53 @@ pub struct CaptureSettings {
     pub ring_bytes: usize,
     /// Ring for measurement records.
     pub record_ring_bytes: usize,
-    /// What goes through shared memory.
+    /// Settings of shared memory.
     pub shm: ShmSettings,
 }
 
-/// How shared memory is looked at.
+/// How shared memory is observed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ShmSettings {
-    /// Whether it is.
+    /// Whether it is observed.
     pub mode: ShmMode,
-    /// Whether every message is to be seen in the process that sends it.
+    /// Whether every message is read in the process that sends it.
     pub exact: ExactChoice,
-    /// Share of one CPU that it may cost, in percent.
+    /// Share of one CPU for it, in percent.
     pub cpu_percent: f64,
-    /// The same while samples are given one by one.
+    /// The same while single samples are delivered.
     pub reading_cpu_percent: f64,
 }
 
-/// Whether shared memory is looked at.
+/// Whether shared memory is read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ShmMode {
-    /// Where there is any.
+    /// If it exists.
     #[default]
     Auto,
     /// Never.
     Off,
 }
 
-/// How every message into shared memory is seen, if at all.
+/// How every message in shared memory is read, if at all.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum ExactChoice {
-    /// It is not: shared memory is only read.
+    /// Shared memory is only sampled.
     #[default]
     Off,
-    /// By a breakpoint of the kernel's in the code of the processes that send.
+    /// By a kernel breakpoint in the code of the sending processes.
     Uprobe,
-    /// As `uprobe`, but only while samples of a topic that goes through shared memory are given one
-    /// by one; otherwise shared memory is only read.
+    /// Like `uprobe`, but only while messages of a topic in shared memory are delivered to a client or
+    /// recording; otherwise shared memory is sampled.
     Auto,
 }
 
-/// Where the agent looks.
+/// Where the agent captures packets.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum SourceChoice {
-    /// `host` where the kernel and the configuration allow it, otherwise `wire`.
+    /// `host` if the kernel and the configuration allow it, otherwise `wire`.
     #[default]
     Auto,
     /// Datagrams at the sockets of this host: whole, once per socket, in every container.

@@ -1,8 +1,8 @@
-//! The sockets that the host hook meets: who holds them, in which control group they are, and what
-//! died there without a name. Told to the model, again when something changes.
+//! The sockets seen by the host hook: the processes that hold them, their control groups, and their
+//! unattributed drops. Passed to the model when something changes.
 //!
-//! Asks seldom: going through all open files of the host costs. Keeps no more sockets than the hook
-//! remembers.
+//! Queries rarely: visiting all open files of the host is expensive. Keeps at most as many sockets
+//! as the hook remembers.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -18,14 +18,14 @@ use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::snapshot::SocketFacts;
 
-/// How often new sockets are looked for.
+/// Interval of looking for new sockets.
 const PERIOD: u64 = 2 * SECOND;
-/// How often all owners are asked for anew: sockets are closed, and count what they drop.
+/// Interval of reading all owners again: sockets are closed, and count their drops.
 const ALL_PERIOD: u64 = 15 * SECOND;
-/// How often owners are asked for because of a socket that nobody was found to hold.
+/// Most queries for the owner of a socket that was not found.
 const MOST_QUESTIONS: u8 = 3;
 
-/// What is known of all of them.
+/// State of all sockets.
 #[derive(Debug)]
 pub struct Sockets {
     groups: CgroupPaths,
@@ -38,16 +38,16 @@ pub struct Sockets {
 #[derive(Debug, Default)]
 struct Known {
     owner: Option<Owner>,
-    /// What it had dropped before it was known, named or not.
+    /// Drops before the socket was known, attributed or not.
     dropped_before: Option<u64>,
     questions: u8,
-    /// As it was when it was told.
+    /// Value at the last report to the model.
     no_room: u64,
     told: Option<SocketFacts>,
 }
 
 impl Sockets {
-    /// None known. `hierarchy` is where the control groups are mounted.
+    /// Creates an empty table. `hierarchy` is the mount point of the control groups.
     #[must_use]
     pub const fn new(hierarchy: PathBuf) -> Self {
         Self {
@@ -59,7 +59,7 @@ impl Sockets {
         }
     }
 
-    /// Looks when it is time, and tells the model what is new.
+    /// Queries if it is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
         if now.saturating_sub(self.looked) < PERIOD {
             return;
@@ -88,7 +88,7 @@ impl Sockets {
         }
     }
 
-    /// Those that the hook remembers no longer: others have taken their places.
+    /// Forgets sockets that the hook has evicted.
     fn forget(&mut self, met: &BTreeMap<u64, Socket>, observer: &mut Observer) {
         self.known.retain(|cookie, known| {
             let stays = met.contains_key(cookie);
@@ -103,7 +103,7 @@ impl Sockets {
         });
     }
 
-    /// All owners, when it is worth asking.
+    /// Returns all owners, if a query is worthwhile.
     fn owners(
         &mut self,
         inside: Option<&Tracepoints>,
@@ -141,7 +141,7 @@ impl Sockets {
             known.questions = known.questions.saturating_add(1);
             let owner = owners.remove(cookie);
             if owner.is_none() && known.owner.is_some() {
-                // Nobody has it open any more.
+                // No process has it open any more.
                 *known = Known {
                     questions: MOST_QUESTIONS,
                     ..Known::default()
@@ -158,12 +158,12 @@ impl Sockets {
 }
 
 impl Known {
-    /// Somebody has it open, or nobody can say.
+    /// Returns whether some process may have it open.
     const fn may_be_open(&self) -> bool {
         self.owner.is_some() || self.questions < MOST_QUESTIONS
     }
 
-    /// What the socket dropped beyond what was named.
+    /// Returns the drops of the socket beyond the attributed ones.
     fn unnamed(&self, socket: &Socket) -> Option<u64> {
         let dropped = u64::from(self.owner.as_ref()?.drops?);
         Some(dropped.saturating_sub(socket.no_room))
@@ -220,7 +220,7 @@ mod tests {
         assert_eq!(look(&mut all, 100, 0), 0);
         assert_eq!(look(&mut all, 110, 10), 0);
         assert_eq!(look(&mut all, 125, 20), 5);
-        // Named since the counter was read.
+        // Attributed since the counter was read.
         assert_eq!(drops(&all, 40), 0);
         assert_eq!(look(&mut all, 125, 20), 5);
     }

@@ -1,4 +1,4 @@
-//! The system calls that live capture needs beside its sockets: waiting, the clocks, free memory.
+//! System calls of live capture besides its sockets: waiting, clocks, free memory.
 
 use std::ffi::CString;
 use std::fs::File;
@@ -12,16 +12,16 @@ use std::time::Duration;
 use libc::c_int;
 use ros2probe_wire::Timestamp;
 
-/// Clock readings that are tried.
+/// Most attempts to read the clocks.
 const READINGS: usize = 8;
-/// Nanoseconds between two clocks that are read at one moment.
+/// Nanoseconds between two clock readings that count as simultaneous.
 const CLOSE: u64 = 5_000;
 
-/// Waits until one of `descriptors` is readable or in error, a signal comes, or the time is over.
-/// Which of them it was, the first if several.
+/// Waits until one of `descriptors` is readable or in error, a signal arrives, or the timeout
+/// expires. Returns the index of the first such descriptor.
 ///
 /// # Errors
-/// `poll` itself fails.
+/// Fails if `poll` itself fails.
 pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Option<usize>> {
     let mut poll: Vec<_> = descriptors
         .iter()
@@ -45,32 +45,32 @@ pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Opt
     Ok(poll.iter().position(|descriptor| descriptor.revents != 0))
 }
 
-/// Tells when a file is created in some directories. It looks and does not touch: who creates files
-/// there cannot tell.
+/// Reports files created in some directories. It is passive: processes that create files cannot
+/// detect it.
 #[derive(Debug)]
 pub struct DirectoryWatch {
     events: File,
 }
 
 impl DirectoryWatch {
-    /// On no directory.
+    /// Creates a watch without directories.
     ///
     /// # Errors
-    /// The kernel allows this user no more of them.
+    /// Fails if the kernel's limit of watches per user is reached.
     pub fn new() -> io::Result<Self> {
         // SAFETY: has no preconditions.
         let descriptor = unsafe { libc::inotify_init1(libc::IN_CLOEXEC | libc::IN_NONBLOCK) };
         if descriptor < 0 {
             return Err(io::Error::last_os_error());
         }
-        // SAFETY: the kernel just gave us this descriptor, and nobody else has it.
+        // SAFETY: a new descriptor without another owner.
         let descriptor = unsafe { OwnedFd::from_raw_fd(descriptor) };
         Ok(Self {
             events: descriptor.into(),
         })
     }
 
-    /// Also on this one, while it exists. One that cannot be watched is not.
+    /// Adds a directory, while it exists. A directory that cannot be watched is skipped.
     pub fn add(&mut self, directory: &Path) {
         let Ok(path) = CString::new(directory.as_os_str().as_bytes()) else {
             return;
@@ -80,7 +80,8 @@ impl DirectoryWatch {
         unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) };
     }
 
-    /// Sleeps, but no longer than until a file is created. Whether one was whose name `matters`.
+    /// Sleeps until a file is created or the timeout expires. Returns whether `matters` accepts a
+    /// created file's name.
     pub fn wait(&mut self, timeout: Duration, matters: impl Fn(&str) -> bool) -> bool {
         let mut poll = libc::pollfd {
             fd: self.events.as_raw_fd(),
@@ -104,14 +105,14 @@ impl DirectoryWatch {
 }
 
 impl AsFd for DirectoryWatch {
-    /// Readable when a file was created.
+    /// Returns a descriptor that is readable when a file was created.
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.events.as_fd()
     }
 }
 
-/// The names in what inotify(7) tells: 16 bytes, the last four of them the length of a name that
-/// follows and is filled up with zeros.
+/// Returns the names in inotify(7) events: 16 bytes, the last four of which are the length of the
+/// name that follows, padded with zeros.
 fn names(mut events: &[u8]) -> impl Iterator<Item = &str> {
     std::iter::from_fn(move || {
         let (head, rest) = events.split_first_chunk::<16>()?;
@@ -123,8 +124,8 @@ fn names(mut events: &[u8]) -> impl Iterator<Item = &str> {
     })
 }
 
-/// Lets threads of this process ask for [`run_first`] when privileges are given up. Whether they may
-/// then: it is ours to allow, or the service manager did.
+/// Allows threads of this process to call [`run_first`] after privileges are dropped. Returns
+/// whether they may: this process sets the limit, or the service manager has set it.
 pub fn allow_running_first() -> bool {
     let mut limit = libc::rlimit {
         rlim_cur: 1,
@@ -134,22 +135,22 @@ pub fn allow_running_first() -> bool {
     if unsafe { libc::setrlimit(libc::RLIMIT_RTPRIO, &raw const limit) } == 0 {
         return true;
     }
-    // SAFETY: `limit` is ours and outlives the call.
+    // SAFETY: `limit` is a live local and outlives the call.
     let told = unsafe { libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) };
     told == 0 && limit.rlim_cur > 0
 }
 
-/// From now on, when this thread wakes it runs before ordinary ones, at the lowest real-time
-/// priority; or no longer.
+/// Sets or clears the lowest real-time priority of this thread, which lets it run before ordinary
+/// threads when it wakes.
 ///
 /// # Errors
-/// It is not allowed to.
+/// Fails if the thread lacks the permission.
 pub fn run_first(first: bool) -> io::Result<()> {
     let (policy, sched_priority) = match first {
         true => (libc::SCHED_FIFO, 1),
         false => (libc::SCHED_OTHER, 0),
     };
-    // SAFETY: numbers alone, for which 0 is a value; musl has more of them than glibc.
+    // SAFETY: plain integers, for which 0 is valid; musl has more of them than glibc.
     let mut parameter: libc::sched_param = unsafe { std::mem::zeroed() };
     parameter.sched_priority = sched_priority;
     // SAFETY: has no preconditions.
@@ -161,9 +162,8 @@ pub fn run_first(first: bool) -> io::Result<()> {
     }
 }
 
-/// Gives free memory back to the system. Reading the kernel's types takes some 15 MB that nobody needs
-/// afterwards, and the allocator of glibc would keep them for as long as the agent lives; that of musl
-/// gives large pieces back by itself.
+/// Returns free memory to the system. Reading the kernel's types takes some 15 MB that glibc's
+/// allocator would keep while the agent lives; musl's returns large pieces by itself.
 pub fn give_back_memory() {
     #[cfg(target_env = "gnu")]
     // SAFETY: has no preconditions and touches free memory only.
@@ -172,23 +172,23 @@ pub fn give_back_memory() {
     }
 }
 
-/// What comes has waited no longer than this, unless this process was held up.
+/// Packets are at most this old when they are read, unless this process was delayed.
 const RECENT_NANOSECONDS: i64 = 1_000_000_000;
 
-/// The kernel filter's clock beside the calendar's, read at one moment.
+/// The kernel filter's clock and the wall clock, read at the same time.
 #[derive(Clone, Copy, Debug)]
 pub struct Clocks {
     /// CLOCK_REALTIME.
     pub now: Timestamp,
     /// CLOCK_MONOTONIC in nanoseconds.
     pub monotonic: u64,
-    /// By how many nanoseconds the calendar's clock was set forward a moment ago.
+    /// Nanoseconds by which the wall clock was recently set forward.
     pub step: i64,
 }
 
 impl Clocks {
-    /// Both clocks now. A thread that loses its CPU between the two would set all captured times
-    /// off by as long, so the closest of a few readings counts.
+    /// Reads both clocks. A thread that loses its CPU between the two readings would shift all
+    /// capture times, so the closest of several readings counts.
     #[must_use]
     pub fn read() -> Self {
         let mut best = Self::read_once();
@@ -204,7 +204,7 @@ impl Clocks {
         best.0
     }
 
-    /// One reading, and within how many nanoseconds it was taken.
+    /// Reads both clocks once, and returns the nanoseconds between the readings.
     fn read_once() -> (Self, u64) {
         let before = nanoseconds(libc::CLOCK_MONOTONIC);
         let now = Timestamp(nanoseconds(libc::CLOCK_REALTIME));
@@ -219,15 +219,16 @@ impl Clocks {
         (clocks, within)
     }
 
-    /// A monotonic time as a calendar time. Wrong by the step if the calendar clock was set between.
+    /// Converts a monotonic time to a wall-clock time. Wrong by the step if the wall clock was set
+    /// in between.
     #[must_use]
     pub const fn calendar(&self, monotonic: u64) -> Timestamp {
         let ago = self.monotonic.wrapping_sub(monotonic);
         Timestamp(self.now.0.wrapping_sub(ago))
     }
 
-    /// When something came that bears this calendar time. Just after the clock was set, that may be a
-    /// time of the calendar before.
+    /// Returns the monotonic time of an event with this wall-clock time. Just after the clock was
+    /// set, the time may belong to the clock before the step.
     #[must_use]
     pub const fn stamped(&self, calendar: Timestamp) -> Timestamp {
         if self.step == 0 || self.is_recent(calendar) {
@@ -246,7 +247,7 @@ impl Clocks {
         age > -RECENT_NANOSECONDS / 10 && age < RECENT_NANOSECONDS
     }
 
-    /// A calendar time of the past as a monotonic time; one of the future is now.
+    /// Converts a past wall-clock time to a monotonic time; a future one becomes now.
     #[must_use]
     pub const fn monotonic_of(&self, calendar: Timestamp) -> u64 {
         let ago = self.now.0.saturating_sub(calendar.0);
@@ -254,19 +255,19 @@ impl Clocks {
     }
 }
 
-/// Nanoseconds of the monotonic clock.
+/// Returns nanoseconds of the monotonic clock.
 #[must_use]
 pub fn monotonic() -> u64 {
     nanoseconds(libc::CLOCK_MONOTONIC)
 }
 
-/// Nanoseconds since the Unix epoch.
+/// Returns nanoseconds since the Unix epoch.
 #[must_use]
 pub fn calendar() -> u64 {
     nanoseconds(libc::CLOCK_REALTIME)
 }
 
-/// CPU time that the calling thread has used, in nanoseconds.
+/// Returns the CPU time of the calling thread, in nanoseconds.
 #[must_use]
 pub fn thread_cpu() -> u64 {
     nanoseconds(libc::CLOCK_THREAD_CPUTIME_ID)
@@ -275,7 +276,7 @@ pub fn thread_cpu() -> u64 {
 /// The kernel's state of its clock, `adjtimex(2)`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ClockState {
-    /// A program keeps it synchronised.
+    /// Whether a program keeps it synchronised.
     pub synchronised: bool,
     /// Estimated error in microseconds.
     pub estimated_error: i64,
@@ -283,14 +284,14 @@ pub struct ClockState {
     pub maximum_error: i64,
 }
 
-/// Reads the state of the kernel's clock, and changes nothing.
+/// Reads the state of the kernel's clock without changing it.
 ///
 /// # Errors
-/// The kernel refuses.
+/// Fails if the kernel refuses the call.
 pub fn clock_state() -> io::Result<ClockState> {
     // SAFETY: a `timex` is plain numbers, for which zero is a value; zero modes change nothing.
     let mut state: libc::timex = unsafe { std::mem::zeroed() };
-    // SAFETY: `state` is ours and outlives the call.
+    // SAFETY: `state` is a live local and outlives the call.
     let result = unsafe { libc::adjtimex(&raw mut state) };
     if result < 0 {
         return Err(io::Error::last_os_error());
@@ -307,7 +308,7 @@ fn nanoseconds(clock: libc::clockid_t) -> u64 {
         tv_sec: 0,
         tv_nsec: 0,
     };
-    // SAFETY: `time` is ours; all three clocks always exist.
+    // SAFETY: `time` is a live local; all three clocks always exist.
     unsafe { libc::clock_gettime(clock, &raw mut time) };
     let seconds = u64::try_from(time.tv_sec).unwrap_or(0);
     let nanoseconds = u64::try_from(time.tv_nsec).unwrap_or(0);

@@ -1,20 +1,20 @@
-//! Threads of sources, and the privileges that each needs while it runs.
+//! Threads of sources, and the privileges that each needs.
 
 use std::io;
 use std::thread::{Builder, JoinHandle};
 
-/// Task of a thread, which decides what privileges it keeps.
+/// Task of a thread, which determines the privileges that it keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Task {
-    /// Reads shared memory of other processes, before ordinary threads run.
+    /// Reads shared memory of other processes, with priority over ordinary threads.
     SharedMemory,
-    /// Attaches the host hook to a control group that is made anew.
+    /// Attaches the host hook to a recreated control group.
     Reattach,
     /// Attaches uprobes to libraries.
     Probes,
 }
 
-/// Starts a thread that holds no more than what its task needs, and returns once that is so.
+/// Starts a thread with only the privileges of its task, and returns after the others are dropped.
 ///
-/// Fails when the system has no thread left, or when the thread cannot be confined.
+/// Fails if the system has no thread left, or if the thread cannot be confined.
 pub type Spawn = fn(Task, Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;

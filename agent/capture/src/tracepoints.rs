@@ -1,8 +1,8 @@
-//! The programs that look where the host hook cannot: at full receive buffers, at datagrams that
-//! never became complete, at who holds a socket.
+//! Programs for losses that the host hook cannot see: at full receive buffers and in reassembly.
+//! Another one lists the processes that hold a socket.
 //!
-//! None of them is needed to observe. One that this kernel does not allow or cannot serve is left
-//! out with the reason, which [`Abilities`] tells.
+//! All of them are optional. A program that this kernel does not support is skipped, and
+//! [`Abilities`] holds the reason.
 
 use std::error::Error;
 use std::fmt::Write as _;
@@ -15,29 +15,29 @@ use ros2probe_wire::host::Layout;
 use super::kernel_types::KernelTypes;
 use super::owners::Owners;
 
-/// What can be told on this kernel, or why not.
+/// The losses that this kernel can attribute, or the reason why not.
 #[derive(Clone, Debug)]
 pub struct Abilities {
-    /// Datagrams that a socket had no room for, by writer and sequence number.
+    /// Datagrams dropped at a full socket buffer, by writer and sequence number.
     pub socket_losses: Result<(), String>,
-    /// Datagrams that lacked IP fragments, by writer and sequence number.
+    /// Datagrams with missing IP fragments, by writer and sequence number.
     pub reassembly_losses: Result<(), String>,
-    /// Which process holds a socket.
+    /// Processes that hold a socket.
     pub owners: Result<(), String>,
 }
 
-/// The running kernel's types, as far as the programs read them.
+/// The running kernel's types that the programs read.
 #[derive(Debug)]
 pub struct KernelLayout {
     array: [u32; Layout::COUNT],
-    /// Why there are none at all.
+    /// Why they are unknown altogether.
     unknown: Option<String>,
 }
 
-/// The enumeration of reasons why a packet is thrown away: Linux 5.17; those about fragments: 6.2.
+/// The enumeration of drop reasons: Linux 5.17; those for fragments: 6.2.
 const REASONS: &str = "skb_drop_reason";
 
-/// From this release on the kernel tells of datagrams over IPv6 that a socket had no room for.
+/// First release that reports IPv6 datagrams dropped at a full socket buffer.
 const REPORTS_IPV6: (u32, u32) = (6, 6);
 
 /// Kernel name of each entry: a member of a structure, an enumerator, or a structure whose size is read.
@@ -89,7 +89,7 @@ const TABLE: [(Layout, &str, &str); Layout::COUNT] = [
     (Layout::PidNumberSize, "upid", ""),
 ];
 
-/// The programs in place; they go with this value.
+/// The attached programs; dropping this value detaches them.
 pub struct Tracepoints {
     abilities: Abilities,
     owners: Option<Owners>,
@@ -97,7 +97,7 @@ pub struct Tracepoints {
 }
 
 impl KernelLayout {
-    /// Of the running kernel.
+    /// Reads the types of the running kernel.
     #[must_use]
     pub fn read() -> Self {
         match KernelTypes::read() {
@@ -106,7 +106,7 @@ impl KernelLayout {
         }
     }
 
-    /// None are known, for this reason.
+    /// Marks every type as unknown, for this reason.
     #[must_use]
     pub const fn unknown(reason: String) -> Self {
         Self {
@@ -133,12 +133,12 @@ impl KernelLayout {
         }
     }
 
-    /// Tells the programs of an object that is about to be loaded.
+    /// Sets the layout globals of an object before it is loaded.
     pub fn set_globals<'a>(&'a self, loader: &mut EbpfLoader<'a>) {
         loader.override_global("LAYOUT", &self.array, true);
     }
 
-    /// Nothing, if all of these are known; otherwise the reason why a program cannot do without.
+    /// Checks that all of these are known; otherwise returns the reason why a program cannot run.
     fn need(&self, layout: &[Layout]) -> Result<(), String> {
         if let Some(unknown) = &self.unknown {
             return Err(unknown.clone());
@@ -154,8 +154,8 @@ impl KernelLayout {
 }
 
 impl Tracepoints {
-    /// Loads and attaches what this kernel has of them, from an object that [`KernelLayout::set_globals`] was
-    /// told about. `whole_host`: the host hook sees every socket.
+    /// Loads and attaches the programs that this kernel supports, from an object prepared with
+    /// [`KernelLayout::set_globals`]. `whole_host`: the host hook sees every socket.
     #[must_use]
     pub fn attach(ebpf: &mut Ebpf, layout: &KernelLayout, whole_host: bool) -> Self {
         let mut links = Vec::new();
@@ -174,13 +174,13 @@ impl Tracepoints {
         }
     }
 
-    /// What can be told.
+    /// Returns the losses that can be attributed.
     #[must_use]
     pub const fn abilities(&self) -> &Abilities {
         &self.abilities
     }
 
-    /// The table of sockets' owners, where there is one.
+    /// Returns the table of sockets' owners, if it is available.
     #[must_use]
     pub const fn owners(&self) -> Option<&Owners> {
         self.owners.as_ref()
@@ -193,7 +193,7 @@ fn socket_losses(
     whole_host: bool,
 ) -> Result<Vec<RawTracePointLink>, String> {
     if !whole_host && let Err(reason) = layout.need(&[Layout::SocketCookie]) {
-        // A socket that the hook does not see could be taken for one that it does.
+        // A socket outside of the hook's cgroup could be mistaken for one inside.
         return Err(format!("limited to one cgroup, and {reason}"));
     }
     let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
@@ -209,7 +209,7 @@ fn socket_losses(
     Ok(links)
 }
 
-/// The kernel's major and minor version.
+/// Returns the kernel's major and minor version.
 fn release() -> Option<(u32, u32)> {
     let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
     let mut parts = release.split(['.', '-', '+']);
@@ -268,7 +268,7 @@ fn tracepoint(
     attach().map_err(|error| format!("tracepoint {tracepoint}: {}", chain(&error)))
 }
 
-/// An error and its causes in one line; of a verifier's log, the first line.
+/// Returns an error and its causes in one line; only the first line of a verifier's log.
 fn chain(error: &dyn Error) -> String {
     let mut text = String::new();
     let mut cause = Some(error);

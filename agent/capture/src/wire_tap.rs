@@ -1,8 +1,8 @@
-//! One network namespace seen on its interfaces: packet socket, ring, kernel filter, and what they
-//! found on its way to the model.
+//! One network namespace observed on its interfaces: packet socket, ring, kernel filter, and the
+//! way of their output to the model.
 //!
-//! Frames and records come through two rings, either may be the quicker one; both wait until they
-//! are taken in by time. Nothing is ever sent.
+//! Frames and records arrive through two rings, either of which may be faster; both are merged by
+//! time. Nothing is ever sent.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::fd::{AsFd as _, BorrowedFd};
@@ -25,48 +25,48 @@ use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
-/// Records younger than this wait, so that frames captured before them are taken in first: a frame
-/// waits up to 100 ms for its block to fill.
+/// Records younger than this wait for frames captured before them: a frame waits up to 100 ms until
+/// its block is full.
 pub const SETTLE_NANOSECONDS: u64 = 120_000_000;
-/// Fragments of one sample follow each other within microseconds; after this they do not.
+/// Fragments of one sample follow each other within microseconds; a longer pause ends the run.
 const STALLED_NANOSECONDS: u64 = 60_000_000;
-/// Records taken in at a time: several rings of the built-in size.
+/// Most records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
 
-/// Why an interface cannot be looked at, or no longer.
+/// Why an interface cannot be observed any more.
 #[derive(Debug, thiserror::Error)]
 pub enum WireTapError {
-    /// The kernel filter.
+    /// The kernel filter failed.
     #[error(transparent)]
     Filter(#[from] FilterError),
-    /// The packet socket or its ring.
+    /// The packet socket or its ring failed.
     #[error(transparent)]
     Ring(#[from] RingError),
-    /// The list of interfaces.
+    /// The interfaces cannot be listed.
     #[error(transparent)]
     Interfaces(#[from] InterfacesError),
 }
 
-/// Which interfaces of a namespace are looked at, and with how much memory.
+/// The observed interfaces of a namespace, and the memory for them.
 #[derive(Clone, Debug)]
 pub struct WireTapSettings {
-    /// Which interfaces.
+    /// The observed interfaces.
     pub selection: Selection,
     /// Bytes of the packet ring.
     pub ring_bytes: usize,
     /// Bytes of the record ring.
     pub record_ring_bytes: usize,
-    /// For what has to be put together from IP fragments.
+    /// Limits of IP reassembly.
     pub reassembly: Limits,
 }
 
-/// One network namespace.
+/// The tap of one network namespace.
 pub struct WireTap {
     path: Option<PathBuf>,
-    /// Device and inode of what was at the path. The socket keeps the namespace, so that the kernel
-    /// gives no other one the same.
+    /// Device and inode of the namespace at the path. The socket keeps the namespace alive, so no
+    /// other one gets the same identity.
     identity: Option<Identity>,
-    /// Something else is at the path, or nothing.
+    /// The path is gone or names another namespace.
     is_gone: bool,
     ring: Ring,
     filter: Filter,
@@ -80,12 +80,12 @@ pub struct WireTap {
 }
 
 impl WireTap {
-    /// In the calling thread's namespace, which is the one at `path` or, without, the agent's own.
-    /// `number` tells the taps apart. The filter knows the interfaces before the socket sees the
-    /// first frame.
+    /// Opens a tap in the calling thread's namespace, which is the one at `path` or, without a
+    /// path, the agent's own. `number` distinguishes the taps. The filter's interface map is set
+    /// before the socket sees the first frame.
     ///
     /// # Errors
-    /// A capability is missing, or the kernel refuses.
+    /// Fails if a capability is missing, or if the kernel refuses the socket, ring or filter.
     pub fn open(
         settings: &WireTapSettings,
         number: u32,
@@ -128,14 +128,14 @@ impl WireTap {
         })
     }
 
-    /// Network namespace as configured; `None` = the agent's own.
+    /// Returns the network namespace as configured; `None` = the agent's own.
     #[must_use]
     pub fn namespace(&self) -> Option<&Path> {
         self.path.as_deref()
     }
 
-    /// Logs when another namespace is at the path by now, or none: its frames are not seen, and
-    /// entering it would take privileges that were given up. Logs when the first one is there again.
+    /// Logs if the path is gone or names another namespace: frames there are not seen, and entering
+    /// it would take privileges that were dropped. Logs again when the original one is back.
     pub fn check_namespace(&mut self) {
         let Some(path) = &self.path else { return };
         let is_gone = identity(path) != self.identity;
@@ -150,11 +150,12 @@ impl WireTap {
                 "the network namespace was removed or replaced: restart to observe the current one"
             );
         } else {
-            tracing::info!(%namespace, "the network namespace is there again");
+            tracing::info!(%namespace, "the network namespace is back");
         }
     }
 
-    /// What is gone, in plain words: the namespace, or an interface that the configuration names.
+    /// Returns what is gone, as a sentence: the namespace, or an interface that the configuration
+    /// names.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         if let (Some(path), true) = (&self.path, self.is_gone) {
@@ -174,7 +175,7 @@ impl WireTap {
         })
     }
 
-    /// Readable when there is something to take in.
+    /// Returns descriptors that are readable when frames, records or interface changes wait.
     #[must_use]
     pub fn descriptors(&self) -> [BorrowedFd<'_>; 3] {
         [
@@ -184,10 +185,11 @@ impl WireTap {
         ]
     }
 
-    /// Takes in all there is, and gives the model what is [`SETTLE_NANOSECONDS`] old.
+    /// Reads everything available, and passes everything older than [`SETTLE_NANOSECONDS`] to the
+    /// model.
     ///
     /// # Errors
-    /// The kernel refuses to go on.
+    /// Fails if the kernel refuses to continue.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), WireTapError> {
         self.follow_interfaces();
         self.take_frames(clocks, observer)?;
@@ -200,26 +202,26 @@ impl WireTap {
         Ok(())
     }
 
-    /// Gives the model what still waits, at the end.
+    /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.frames.take_records(&mut self.filter);
         self.frames.take_stalled(&mut self.filter, clocks.monotonic);
         self.frames.deliver(clocks, u64::MAX, observer);
     }
 
-    /// The kernel filter.
+    /// Returns the kernel filter.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
         &self.filter
     }
 
-    /// The kernel filter, to tell it what is of interest.
+    /// Returns the kernel filter, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         &mut self.filter
     }
 
-    /// Captured frames by the name of the interface, or its index if it went away before it was
-    /// known.
+    /// Iterates over captured frames by interface name, or by index if the interface went away
+    /// before its name was known.
     pub fn packets(&self) -> impl Iterator<Item = (String, u64)> + '_ {
         self.packets.iter().map(|(index, packets)| {
             let name = self
@@ -230,48 +232,48 @@ impl WireTap {
         })
     }
 
-    /// Frames that the kernel dropped because the ring was full.
+    /// Returns the number of frames dropped by the kernel because the ring was full.
     ///
     /// # Errors
-    /// The kernel does not tell.
+    /// Fails if the kernel's statistics cannot be read.
     pub fn drops(&mut self) -> Result<u64, WireTapError> {
         Ok(self.ring.statistics()?.drops)
     }
 
-    /// Bytes that came from the kernel: frames and records.
+    /// Returns the bytes read from the kernel: frames and records.
     #[must_use]
     pub const fn copied_bytes(&self) -> u64 {
         self.frames.copied_bytes
     }
 
-    /// Fragmented datagrams that were begun and never became complete: the kernel filter's and
-    /// those reassembled here.
+    /// Returns the number of fragmented datagrams that never became complete, in the kernel filter
+    /// or here.
     #[must_use]
     pub const fn incomplete_datagrams(&self) -> u64 {
         let reassembly = self.frames.reassembly.counters();
         self.frames.ahead.given_up() + reassembly.evicted + reassembly.timed_out
     }
 
-    /// Bytes held for reassembly.
+    /// Returns the bytes held for reassembly.
     #[must_use]
     pub const fn reassembly_bytes(&self) -> usize {
         self.frames.reassembly.bytes()
     }
 
-    /// Datagrams given up for want of room.
+    /// Returns the number of datagrams discarded for lack of room.
     #[must_use]
     pub const fn reassembly_evicted(&self) -> u64 {
         self.frames.reassembly.counters().evicted
     }
 
-    /// Interfaces that the kernel filter could not be told of.
+    /// Returns the number of interfaces that did not fit the kernel filter's map.
     #[must_use]
     pub const fn refused_interfaces(&self) -> u64 {
         self.refused_interfaces
     }
 
-    /// A list that cannot be read now is read the next time. Of an interface that is gone nothing
-    /// is kept: containers come and go for years.
+    /// Applies changes of interfaces. A failed listing is repeated at the next call. An interface
+    /// that is gone leaves no state: containers come and go for years.
     fn follow_interfaces(&mut self) {
         let changes = self.interfaces.changes().unwrap_or_default();
         if !changes.is_empty() {
@@ -294,16 +296,18 @@ impl WireTap {
         }
     }
 
-    /// What frames announce the model gets at once, what they count for in its turn. Before each
-    /// frame it gets what is older: a writer's last samples count before its farewell is read.
+    /// Reads frames. Their announcements are passed to the model at once, the rest in order of
+    /// time. Everything older precedes a frame: a writer's last samples count before its disposal
+    /// is read.
     fn take_frames(
         &mut self,
         clocks: &Clocks,
         observer: &mut Observer,
     ) -> Result<(), WireTapError> {
-        // Clears what the socket reports when a link goes down; without, waiting would never wait.
+        // Clears the error that the socket reports when a link goes down; otherwise waiting would
+        // return at once.
         self.ring.wait(Duration::ZERO)?;
-        // No more than the ring holds: a flood must not keep us from everything else.
+        // At most one full ring: a flood must not starve everything else.
         for _ in 0..self.ring.blocks() {
             let Some(block) = self.ring.block() else {
                 break;
@@ -330,7 +334,7 @@ impl WireTap {
     }
 }
 
-/// Interfaces that the configuration names and that were there, with whether they are now.
+/// The interfaces that the configuration names and that existed, with whether they exist now.
 #[derive(Debug, Default)]
 struct IncludedInterfaces(BTreeMap<String, bool>);
 
@@ -342,7 +346,7 @@ impl IncludedInterfaces {
             if *was_there && !is_there {
                 tracing::warn!(interface = name, "the interface is gone");
             } else if is_there && !*was_there {
-                tracing::info!(interface = name, "the interface is there again");
+                tracing::info!(interface = name, "the interface is back");
             }
             *was_there = is_there;
         }
@@ -362,14 +366,14 @@ struct FrameAssembly {
     number: u32,
     reassembly: Reassembly,
     ahead: Ahead,
-    /// What is to be counted, waiting for its turn.
+    /// Records that wait for their turn.
     order: ReorderBuffer,
     copied_bytes: u64,
 }
 
 impl FrameAssembly {
-    /// Empties the kernel's record ring; what the model gets of it is decided by [`Self::deliver`].
-    /// A flood may fill it as fast as it is emptied: what is left is taken the next time.
+    /// Reads the kernel's record ring, at most one round: a flood may refill it as fast as it is
+    /// emptied. [`Self::deliver`] decides what is passed to the model.
     fn take_records(&mut self, filter: &mut Filter) {
         for _ in 0..RECORDS_PER_ROUND {
             let Some(record) = filter.next_record() else {
@@ -380,7 +384,7 @@ impl FrameAssembly {
         }
     }
 
-    /// Takes runs of fragments that nobody has continued since `before` in the filter's clock.
+    /// Takes runs of fragments that have not grown since `before` in the filter's clock.
     fn take_stalled(&mut self, filter: &mut Filter, before: u64) {
         for record in filter.stalled_runs(before) {
             self.copied_bytes += size_of::<Record>() as u64;
@@ -388,7 +392,7 @@ impl FrameAssembly {
         }
     }
 
-    /// Gives the model the records up to a time of the filter's clock.
+    /// Passes the records up to a time of the filter's clock to the model.
     fn deliver(&mut self, clocks: &Clocks, until: u64, observer: &mut Observer) {
         while let Some(next) = self.order.next(clocks, until) {
             let record = match next {
@@ -413,7 +417,7 @@ impl FrameAssembly {
         }
     }
 
-    /// Gives up what has waited too long for its rest.
+    /// Discards datagrams that have waited too long for their rest.
     fn advance(&mut self, clocks: &Clocks) {
         self.ahead.advance(clocks.now);
         self.reassembly.advance(clocks.now);
@@ -474,7 +478,7 @@ impl FrameAssembly {
     }
 }
 
-/// A captured datagram.
+/// Decodes a captured frame.
 fn decode_frame(
     envelope: &Envelope,
     payload: &[u8],
@@ -486,7 +490,7 @@ fn decode_frame(
     order.datagram(at, envelope, payload, |_| {}, observer);
 }
 
-/// What has become complete.
+/// Passes a complete item to the model.
 fn deliver_ready(ready: Ready, observer: &mut Observer) {
     match ready {
         Ready::Record(record) => observer.input(Input::Record(&record)),
@@ -526,7 +530,7 @@ mod tests {
             let missing = Some("one".to_owned());
             assert_eq!(update("link set one name other"), missing);
             assert_eq!(update("link set other name one"), None);
-            // The other end goes with it: a pattern names no interface.
+            // Deleting one end of a veth pair deletes the other; a pattern names no interface.
             assert_eq!(update("link delete one"), missing);
             assert_eq!(update("link add one type veth peer name far"), None);
         });

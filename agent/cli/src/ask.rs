@@ -1,36 +1,28 @@
 //! `rp discover` at the terminal: listen, say what will be sent, ask, say what came of it.
 
 use std::io::{Write, stdout};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail};
-use ros2probe_capture::live::LiveSource;
-use ros2probe_capture::reassembly::Limits;
 use ros2probe_daemon::agent::configuration;
-use ros2probe_daemon::config::{CaptureSettings, ShmMode, SourceChoice};
+use ros2probe_daemon::discover::announcements::Announcements;
+use ros2probe_daemon::discover::participants::{HeardParticipant, Listening, listen};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Session, Target};
 use ros2probe_daemon::discover::{converse, local_participant};
-use ros2probe_daemon::privilege;
-use ros2probe_model::input::Input;
-use ros2probe_model::naming::Naming;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::ParticipantFacts;
-use ros2probe_wire::discovery::Role;
 
 use crate::cli::Discover;
-
-/// How often the clock is looked at while listening.
-const SLICE: Duration = Duration::from_millis(250);
 
 /// The command.
 pub(crate) fn discover(options: &Discover) -> Result<()> {
     let mut out = stdout().lock();
     let (config, _) = configuration(options.config.as_deref())?;
-    let capture = capture(config.capture, options.interface.as_deref());
-    privilege::check(&capture)?;
-    let live = LiveSource::open(&capture, Limits::default())?;
-    privilege::give_up(privilege::Role::capture())?;
-    let participants = listen(live, options)?;
+    let listening = Listening {
+        interface: options.interface.clone(),
+        domain_id: options.domain,
+        participant: options.participant,
+        time: Duration::from_secs(options.listen),
+    };
+    let participants = listen(config.capture, &listening)?;
     let seconds = options.listen;
     let heard = match participants.len() {
         1 => "1 participant".to_owned(),
@@ -40,7 +32,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     let mut targets = Vec::new();
     for participant in &participants {
         let described = describe(participant);
-        match Target::of(participant) {
+        match participant.target {
             Ok(target) => {
                 writeln!(out, "{described}, at {}", target.metatraffic)?;
                 targets.push((target, participant.domain_id));
@@ -57,7 +49,7 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     }
     let mut failed = 0;
     for (target, domain_id) in &targets {
-        let answered = ask(target, domain_id.0, options, &mut out)?;
+        let answered = ask(target, *domain_id, options, &mut out)?;
         failed += usize::from(!answered);
     }
     if failed > 0 {
@@ -69,62 +61,18 @@ pub(crate) fn discover(options: &Discover) -> Result<()> {
     Ok(())
 }
 
-/// The configured capture, or the wire of one interface.
-fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
-    // Participants announce themselves on the network.
-    configured.shm.mode = ShmMode::Off;
-    let Some(interface) = interface else {
-        return configured;
-    };
-    CaptureSettings {
-        source: SourceChoice::Wire,
-        cgroup: None,
-        mirror_interfaces: Vec::new(),
-        include_interfaces: vec![interface.to_owned()],
-        exclude_interfaces: Vec::new(),
-        ..configured
-    }
-}
-
-/// Who announces itself, or the one that is looked for.
-fn listen(mut live: LiveSource, options: &Discover) -> Result<Vec<ParticipantFacts>> {
-    let mut observer = Observer::new(Settings::default());
-    let end = Instant::now() + Duration::from_secs(options.listen);
-    let is_meant = |participant: &ParticipantFacts| {
-        options
-            .domain
-            .is_none_or(|it| it == participant.domain_id.0)
-            && options
-                .participant
-                .is_none_or(|it| it == participant.guid.prefix)
-    };
-    loop {
-        let left = end.saturating_duration_since(Instant::now());
-        live.poll(left.min(SLICE), None, &mut observer)?;
-        observer.input(Input::Time(live.clock()));
-        live.apply(&observer.drain().interest);
-        let mut heard = observer.snapshot(live.clock()).participants;
-        heard.retain(is_meant);
-        let is_found = options.participant.is_some() && !heard.is_empty();
-        if left.is_zero() || is_found {
-            return Ok(heard);
-        }
-    }
-}
-
-fn describe(participant: &ParticipantFacts) -> String {
+fn describe(participant: &HeardParticipant) -> String {
     let mut words = format!(
         "{}  domain {}, {}",
-        participant.guid.prefix, participant.domain_id, participant.vendor
+        participant.prefix, participant.domain_id, participant.vendor
     );
-    let process = &participant.process;
-    if let Some(name) = &process.name {
+    if let Some(name) = &participant.process {
         words += &format!(", {name}");
     }
-    if let Some(id) = process.id {
+    if let Some(id) = participant.process_id {
         words += &format!(", process {id}");
     }
-    if let Some(host) = &process.host {
+    if let Some(host) = &participant.host {
         words += &format!(" on {host}");
     }
     words
@@ -154,22 +102,27 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
 }
 
 fn report(session: &Session, took: Duration, out: &mut impl Write) -> Result<bool> {
-    let endpoints = session.endpoints();
-    let with = |role| endpoints.values().filter(move |it| it.role == role);
+    let Announcements {
+        writers,
+        readers,
+        nodes,
+    } = Announcements::of(session);
     writeln!(
         out,
         "  learned {} writers and {} readers",
-        with(Role::Writer).count(),
-        with(Role::Reader).count()
+        writers.len(),
+        readers.len()
     )?;
-    for node in session.nodes().unwrap_or_default() {
-        writeln!(out, "    node   {}", node.fully_qualified_name())?;
+    for node in nodes.iter().flatten() {
+        writeln!(out, "    node   {node}")?;
     }
-    for (role, word) in [(Role::Writer, "writer"), (Role::Reader, "reader")] {
-        for endpoint in with(role) {
-            let topic = Naming::of(&endpoint.topic).name;
-            let message_type = endpoint.type_name.message();
-            writeln!(out, "    {word} {topic} {message_type}")?;
+    for (endpoints, word) in [(writers, "writer"), (readers, "reader")] {
+        for endpoint in endpoints {
+            writeln!(
+                out,
+                "    {word} {} {}",
+                endpoint.topic, endpoint.message_type
+            )?;
         }
     }
     let (sent, received) = session.cost();
@@ -182,7 +135,7 @@ fn report(session: &Session, took: Duration, out: &mut impl Write) -> Result<boo
         received.bytes,
         took.as_secs_f64() * 1e3
     )?;
-    let has_nodes = !session.expects_nodes() || session.nodes().is_some();
+    let has_nodes = !session.expects_nodes() || nodes.is_some();
     if !session.was_answered() {
         writeln!(out, "  it did not answer")?;
     } else if session.missing() > 0 {

@@ -4,8 +4,7 @@
 //! - [`ros2`] makes the text of `ros2 topic`, `ros2 node`, `ros2 bag info` and others from answers.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
-//! The commands themselves are in the program (`src/cli/`). The crates below are exported here for
-//! tests and fuzz targets.
+//! The commands themselves are in the program (`src/cli/`).
 //!
 //! ```
 //! use ros2probe::ros2::Dialect;
@@ -14,15 +13,6 @@
 //! ```
 
 #![forbid(unsafe_code)]
-
-pub use ros2probe_bag as bag;
-pub use ros2probe_capture as capture;
-pub use ros2probe_daemon::{
-    agent_facts, config, discover, escape, events, file, limit_facts, privilege, recording, run,
-    settings_cell, snapshot_cell, state, subscriptions, surface, watches,
-};
-pub use ros2probe_message as message;
-pub use ros2probe_model as model;
 
 pub mod client;
 pub mod doctor;

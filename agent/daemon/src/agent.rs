@@ -7,10 +7,11 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use ros2probe_capture::live::LiveSource;
-use ros2probe_capture::pcap::Speed;
+pub use ros2probe_capture::pcap::Speed;
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::{Dialect, Library, Sources};
+use ros2probe_model::discovery::Memory;
 use ros2probe_model::history::History;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{self, Observer};
@@ -187,19 +188,8 @@ impl Components<'_> {
 /// # Errors
 /// Returns the reason why it did not start or could not go on.
 pub fn run(options: Options) -> Result<()> {
-    let (mut config, file) = configuration(options.config.as_deref())?;
-    let configured = config.clone();
-    if let Some(listen) = options.metrics {
-        config.metrics.listen = listen.0;
-    } else if options.report {
-        config.metrics.listen = None;
-    }
-    control::choose(
-        &mut config.api,
-        options.api,
-        options.api_loopback,
-        options.report,
-    );
+    let (configured, file) = configuration(options.config.as_deref())?;
+    let config = overridden(&configured, &options);
     let log = Log::start(config.log);
     let export = otlp::Settings::resolve(
         &config.otlp,
@@ -227,24 +217,9 @@ pub fn run(options: Options) -> Result<()> {
         announce(privilege::become_own_user());
     }
     control::open_socket(&mut control, &config.api)?;
-    let state = match &source {
-        Source::Live(_) => memory::open(&config.state_directory),
-        Source::Replay(_) => None,
-    };
-    let recordings = memory::recordings(&config.recordings.directory, state.as_deref());
-    let known = state.as_deref().map(memory::load);
-    let (known, keeps_known) = known.unwrap_or_default();
-    let keeps_watches = state
-        .as_deref()
-        .is_some_and(|state| memory::restore_watches(state, &watches));
-    let role = match &mut source {
-        Source::Live(live) => {
-            live.start(privilege::spawn_source);
-            Role::capture()
-        }
-        Source::Replay(_) => Role::Service,
-    };
-    let worker = Worker::start(role).context("cannot start the working thread")?;
+    let mut state = KeptState::open(&source, &config, &watches);
+    let recordings = memory::recordings(&config.recordings.directory, state.directory());
+    let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
     let exporter = export.map(|settings| Exporter::start(settings, &sources, Arc::clone(&spans)));
@@ -253,24 +228,7 @@ pub fn run(options: Options) -> Result<()> {
     report_listeners(server.as_ref(), &control, &watches);
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
-    if let (Some(known), Source::Live(live)) = (known, &source) {
-        observer.input(Input::Restored {
-            memory: &known,
-            now: live.clock(),
-        });
-        drop(known);
-        // Reading it takes several times what stays of it.
-        give_back_memory();
-    }
-    let keep = |directory: Arc<StateDirectory>| {
-        if keeps_watches {
-            watches.keep_in(Arc::clone(&directory))?;
-        }
-        keeps_known
-            .then(|| StateWriter::start(directory))
-            .transpose()
-    };
-    let keeper = state.map_or(Ok(None), keep);
+    state.restore(&mut observer, &source);
     let stop = CancellationToken::new();
     let components = Components {
         config: &config,
@@ -279,7 +237,9 @@ pub fn run(options: Options) -> Result<()> {
         sources: sources.clone(),
         spans,
         watches: Arc::clone(&watches),
-        keeper: keeper.context("cannot start the threads that keep state")?,
+        keeper: state
+            .keep(&watches)
+            .context("cannot start the threads that keep state")?,
         recordings,
         library: library(),
         // Only clients of the API read the history.
@@ -293,26 +253,18 @@ pub fn run(options: Options) -> Result<()> {
         },
         stop: stop.clone(),
     };
-    let parts = components.assemble().context("recordings.snapshots")?;
+    let agent = components.assemble().context("recordings.snapshots")?;
     if options.report && server.is_none() && control.is_empty() {
-        let ended = worker.finish(parts.run);
+        let ended = worker.finish(agent.run);
         print!("{}", Exposition::new(sources).render(Format::Classic)?);
         return ended;
     }
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build();
-    let runtime = runtime.context("cannot start the runtime of signals")?;
-    let (recordings, snapshots) = (
-        Arc::clone(&parts.context.recordings),
-        Arc::clone(&parts.context.snapshots),
-    );
     let supervisor = Supervisor {
         sources: sources.clone(),
         config: configured,
         file,
-        watches: Arc::clone(&watches),
-        reloads: parts.reloads,
+        watches,
+        reloads: agent.reloads,
         stop,
         log,
         exporter,
@@ -320,19 +272,135 @@ pub fn run(options: Options) -> Result<()> {
     let surfaces = Surfaces {
         metrics: server,
         control,
-        context: parts.context,
+        context: agent.context,
         powerless,
     };
-    let ended = supervisor.run(worker, parts.run, responder, surfaces, options.report);
-    let ended = runtime.block_on(ended);
-    snapshots.finish();
-    recordings.finish();
-    watches.finish();
-    ended?;
+    supervise(
+        supervisor,
+        surfaces,
+        (worker, agent.run),
+        responder,
+        options.report,
+    )?;
     if options.report {
         print!("{}", Exposition::new(sources).render(Format::Classic)?);
     }
     Ok(())
+}
+
+/// The configuration with what the command line overrides.
+fn overridden(configured: &Config, options: &Options) -> Config {
+    let mut config = configured.clone();
+    if let Some(listen) = options.metrics {
+        config.metrics.listen = listen.0;
+    } else if options.report {
+        config.metrics.listen = None;
+    }
+    control::choose(
+        &mut config.api,
+        options.api,
+        options.api_loopback,
+        options.report,
+    );
+    config
+}
+
+/// Starts the threads of the source and the working thread, which keep their privileges.
+fn worker(source: &mut Source) -> Result<Worker> {
+    let role = match source {
+        Source::Live(live) => {
+            live.start(privilege::spawn_source);
+            Role::capture()
+        }
+        Source::Replay(_) => Role::Service,
+    };
+    Worker::start(role).context("cannot start the working thread")
+}
+
+/// Runs until a signal, a failure or the end of a report, and completes what is written.
+fn supervise(
+    supervisor: Supervisor,
+    surfaces: Surfaces,
+    (worker, run): (Worker, Run),
+    responder: Responder,
+    report: bool,
+) -> Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime.context("cannot start the runtime of signals")?;
+    let watches = Arc::clone(&supervisor.watches);
+    let (recordings, snapshots) = (
+        Arc::clone(&surfaces.context.recordings),
+        Arc::clone(&surfaces.context.snapshots),
+    );
+    let ended = supervisor.run(worker, run, responder, surfaces, report);
+    let ended = runtime.block_on(ended);
+    snapshots.finish();
+    recordings.finish();
+    watches.finish();
+    ended
+}
+
+/// The state directory, and what the agent before this one left in it.
+struct KeptState {
+    directory: Option<Arc<StateDirectory>>,
+    known: Option<Memory>,
+    /// What is known may be written over what is there, and so may the watches.
+    keeps_known: bool,
+    keeps_watches: bool,
+}
+
+impl KeptState {
+    /// Reads the state of a live agent; restores its watches.
+    fn open(source: &Source, config: &Config, watches: &Watches) -> Self {
+        let directory = match source {
+            Source::Live(_) => memory::open(&config.state_directory),
+            Source::Replay(_) => None,
+        };
+        let known = directory.as_deref().map(memory::load);
+        let (known, keeps_known) = known.unwrap_or_default();
+        let keeps_watches = directory
+            .as_deref()
+            .is_some_and(|directory| memory::restore_watches(directory, watches));
+        Self {
+            directory,
+            known,
+            keeps_known,
+            keeps_watches,
+        }
+    }
+
+    fn directory(&self) -> Option<&StateDirectory> {
+        self.directory.as_deref()
+    }
+
+    /// Gives the model what was known.
+    fn restore(&mut self, observer: &mut Observer, source: &Source) {
+        if let (Some(known), Source::Live(live)) = (self.known.take(), source) {
+            observer.input(Input::Restored {
+                memory: &known,
+                now: live.clock(),
+            });
+            drop(known);
+            // Reading it takes several times what stays of it.
+            give_back_memory();
+        }
+    }
+
+    /// Starts the threads that write watches and what is known.
+    fn keep(self, watches: &Watches) -> std::io::Result<Option<StateWriter>> {
+        let Some(directory) = self.directory else {
+            return Ok(None);
+        };
+        if self.keeps_watches {
+            watches.keep_in(Arc::clone(&directory))?;
+        }
+        let keeps_known = self.keeps_known;
+        keeps_known
+            .then(|| StateWriter::start(directory))
+            .transpose()
+    }
 }
 
 /// Reads the configuration, and returns it with its file. Without `file`, a missing

@@ -1,6 +1,7 @@
 //! The agent: brings what its sources capture to the model, and serves what the model knows.
 //!
 //! - [`agent::run`] is the life of an agent. [`agent::Components`] composes one, live or replayed.
+//! - [`replay_agent`] replays a capture within the process of a client.
 //! - [`config`] reads the configuration, [`watches`] merges what is watched.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] what happened, [`limit_facts`] the caps.
@@ -25,11 +26,13 @@ pub mod discover;
 pub mod escape;
 pub mod events;
 pub mod file;
+pub mod host_examination;
 pub mod limit_facts;
 mod logging;
 mod memory;
 pub mod privilege;
 pub mod recording;
+pub mod replay_agent;
 pub mod run;
 mod series_name;
 pub mod settings_cell;

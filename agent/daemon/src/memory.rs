@@ -102,9 +102,9 @@ pub(crate) fn restore_watches(directory: &StateDirectory, watches: &Watches) -> 
         Ok(0) => {}
         Ok(left_out) => {
             let limit = "limits.watches";
-            tracing::warn!(left_out, limit, "not all watches that were added fit in");
+            tracing::warn!(left_out, limit, "some saved watches exceed limits.watches");
         }
-        Err(error) => tracing::warn!(%error, "the watches that were added cannot be used"),
+        Err(error) => tracing::warn!(%error, "the saved watches cannot be used"),
     }
     true
 }
@@ -125,7 +125,7 @@ fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
         }
         LoadedWatches::Unusable { reason, aside } => {
             let aside = aside.map(|aside| aside.display().to_string());
-            tracing::warn!(%path, reason, aside, "the watches that were added cannot be used");
+            tracing::warn!(%path, reason, aside, "the saved watches cannot be used");
             Vec::new()
         }
     })

@@ -64,7 +64,7 @@ pub enum Done {
 #[derive(Debug, thiserror::Error)]
 pub enum Refused {
     /// Listed by the configuration or the command line, which a client does not overrule.
-    #[error("it is given by {}", by.phrase())]
+    #[error("it is defined by {}", by.phrase())]
     Given {
         /// Which of them.
         by: Origin,

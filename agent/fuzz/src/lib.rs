@@ -1,45 +1,45 @@
-//! What the fuzz targets do with their bytes: plain functions, so that the tests run them too, over
-//! the committed seeds and all their truncations (`agent/cli/tests/surface/fuzz_seeds.rs`).
+//! Bodies of the fuzz targets: plain functions, so that the tests run them too, over the committed
+//! seeds and all their truncations (`agent/cli/tests/surface/fuzz_seeds.rs`).
 //!
-//! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic,
-//! nothing delivered that was not there, an end, and an end that stays.
+//! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
+//! panics, delivers nothing that was not there, ends, and stays at its end.
 
 use std::fs;
 use std::io::{Cursor, Write as _};
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
 
-use ros2probe::bag::info::Bag;
-use ros2probe::bag::reindex::{Found, reindex};
-use ros2probe::capture::pcap::PcapReader;
-use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
-use ros2probe::capture::ring::block::Frames;
-use ros2probe::capture::shm::cell::Cell;
-use ros2probe::capture::shm::classifier::MessageClassifier;
-use ros2probe::capture::shm::port::Port;
-use ros2probe::capture::shm::segment::{Buffer, Message};
-use ros2probe::capture::uprobe::library;
-use ros2probe::config::{Config, Watch, Watchlist};
-use ros2probe::message::filter::{Filter, Subject};
-use ros2probe::message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::selection::{Depth, SampleRequest, Selection};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
+use ros2probe_bag::info::Bag;
+use ros2probe_bag::reindex::{Found, reindex};
+use ros2probe_capture::pcap::PcapReader;
+use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_capture::ring::block::Frames;
+use ros2probe_capture::shm::cell::Cell;
+use ros2probe_capture::shm::classifier::MessageClassifier;
+use ros2probe_capture::shm::port::Port;
+use ros2probe_capture::shm::segment::{Buffer, Message};
+use ros2probe_capture::uprobe::library;
+use ros2probe_daemon::config::{Config, Watch, Watchlist};
+use ros2probe_message::filter::{Filter, Subject};
+use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
 use zerocopy::FromBytes as _;
 
-/// The block's header, and a frame's with its address.
+/// Length of the block's header, and of a frame's with its address.
 const BLOCK_HEADER: usize = 48;
 const FRAME_HEADER: usize = 48;
-/// A compressed capture may be as long as it likes; the fuzzer looks at its beginning.
+/// Most packets read: a compressed capture may be of any length.
 const PACKETS: u64 = 10_000;
 
-/// A capture file, through reassembly and walk.
+/// Reads a capture file, through reassembly and walk.
 pub fn capture(bytes: &[u8]) {
     let Ok(mut reader) = PcapReader::new(Cursor::new(bytes.to_vec())) else {
         return;
@@ -59,7 +59,7 @@ pub fn capture(bytes: &[u8]) {
     assert!(matches!(reader.next_packet(), Ok(None)));
 }
 
-/// A block of the packet ring, through reassembly and walk.
+/// Reads a block of the packet ring, through reassembly and walk.
 pub fn ring_block(bytes: &[u8]) {
     let mut frames = Frames::new(bytes);
     let mut inside = Inside::default();
@@ -82,8 +82,8 @@ pub fn ring_block(bytes: &[u8]) {
     assert_eq!(frames.next(), None);
 }
 
-/// A port of Fast DDS's shared memory, the same port a moment later, and a segment: lengths of the
-/// first two, little-endian, come first.
+/// Reads a port of Fast DDS's shared memory, the same port a moment later, and a segment. The
+/// lengths of the first two precede them, little-endian.
 pub fn shared_memory(bytes: &[u8]) {
     const PORT: u32 = 7411;
     const MOMENT: u64 = 1_000_000;
@@ -128,7 +128,7 @@ pub fn shared_memory(bytes: &[u8]) {
     }
 }
 
-/// A configuration file.
+/// Reads a configuration file.
 pub fn configuration(bytes: &[u8]) {
     match Config::parse(bytes) {
         Ok(config) => assert_eq!(config.needs_restart(&config), [""; 0]),
@@ -143,7 +143,7 @@ pub fn configuration(bytes: &[u8]) {
     }
 }
 
-/// A message definition: as each kind of file, and as a bag's schema.
+/// Reads a message definition: as each kind of file, and as a bag's schema.
 pub fn definition(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else {
         return;
@@ -155,7 +155,7 @@ pub fn definition(bytes: &[u8]) {
             assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}");
         }
         match Definition::parse_idl(name(), text) {
-            // Its text stands for the same.
+            // Its text is equivalent.
             Ok(read) => assert_eq!(Definition::parse(name(), &read.text), Ok(read)),
             Err(mistake) => assert!((1..=lines).contains(&mistake.line), "{mistake} of {lines}"),
         }
@@ -173,7 +173,7 @@ pub fn definition(bytes: &[u8]) {
     }
 }
 
-/// The types that payloads are read as; the first byte chooses one.
+/// Types as which payloads are read; the first byte chooses one.
 static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
     macro_rules! text {
         ($name:literal) => {
@@ -214,9 +214,9 @@ static TYPES: LazyLock<Vec<MessageType>> = LazyLock::new(|| {
     types.collect::<Result<_, _>>().expect("definitions")
 });
 
-/// A payload: read whole and in part, and printed.
+/// Reads a payload, whole and in part, and prints it.
 pub fn message(bytes: &[u8]) {
-    // Far more text comes of few octets than there are: an octet is a line.
+    // A payload of few octets gives far more text: one line per octet.
     const LONGEST: usize = 64;
     let Some((choice, payload)) = bytes.split_first() else {
         return;
@@ -251,7 +251,8 @@ pub fn message(bytes: &[u8]) {
     }
 }
 
-/// A condition, a line, and what it is asked of: a message as [`message`] reads it.
+/// Reads a condition, a line break, and the message on which it is evaluated, which [`message`]
+/// reads.
 pub fn filter(bytes: &[u8]) {
     let mut parts = bytes.splitn(2, |byte| *byte == b'\n');
     let (Some(condition), Some(rest)) = (parts.next(), parts.next()) else {
@@ -281,8 +282,8 @@ pub fn filter(bytes: &[u8]) {
     }
 }
 
-/// A bag of one file: the first byte chooses how the file is named, the next two are the length of
-/// its metadata.yaml, little-endian, which is left out where that is 0.
+/// Reads a bag of one file. The first byte chooses the file's name, the next two are the length of
+/// its metadata.yaml, little-endian; 0 means that it has none.
 pub fn bag_file(bytes: &[u8]) {
     let Some(([choice, low, high], rest)) = bytes.split_first_chunk::<3>() else {
         return;
@@ -307,7 +308,7 @@ pub fn bag_file(bytes: &[u8]) {
     assert_eq!(report.files.len(), 1);
     let of_file = &report.files[0];
     assert!(!path.with_extension("mcap.part").exists());
-    // What was made whole is whole, and says the same again.
+    // A completed bag is complete: a second run reports the same.
     told(directory);
     let again = reindex(directory).expect("what was written");
     assert_eq!(again.metadata.message_count, report.metadata.message_count);
@@ -321,7 +322,7 @@ pub fn bag_file(bytes: &[u8]) {
     }
 }
 
-/// All that is told of a bag or a file.
+/// Reads everything that can be reported of a bag or a file.
 fn told(path: &Path) {
     let Ok(opened) = Bag::open(path) else {
         return;
@@ -338,12 +339,12 @@ fn told(path: &Path) {
     }
 }
 
-/// Makes something of files, in memory where there is such a place.
+/// Runs `make` on a temporary directory, in memory if possible.
 fn scratch<T>(make: impl Fn(&Path) -> std::io::Result<T>) -> std::io::Result<T> {
     make(Path::new("/dev/shm")).or_else(|_| make(&std::env::temp_dir()))
 }
 
-/// A library that a process has loaded.
+/// Reads a library that a process has loaded.
 pub fn library(bytes: &[u8]) {
     let mut file = scratch(|place| tempfile::tempfile_in(place)).expect("a file");
     file.write_all(bytes).expect("room");
@@ -352,8 +353,8 @@ pub fn library(bytes: &[u8]) {
     }
 }
 
-/// What a source brings the model, one thing after the other: kind, time since the one before in
-/// 10 ms, length (little-endian), and so many bytes.
+/// Passes inputs to the model as a source does. Each has a kind, the time since the previous one in
+/// 10 ms, a length (little-endian), and that many bytes.
 pub fn model(bytes: &[u8]) {
     const START: u64 = 1_795_143_000_000_000_000;
     const STEP: u64 = 10_000_000;
@@ -387,7 +388,7 @@ pub fn model(bytes: &[u8]) {
     let endpoints = endpoints.map(|topic| topic.publishers.len() + topic.subscriptions.len());
     assert!(endpoints.sum::<usize>() <= SMALL.endpoints);
     observer.drain();
-    // What is remembered can be taken back, as far as it is believed.
+    // The saved state can be restored, as far as it is trusted.
     let mut after = small_observer();
     after.input(Input::Restored {
         memory: &memory,
@@ -396,7 +397,7 @@ pub fn model(bytes: &[u8]) {
     assert!(after.memory().participants.len() <= memory.participants.len());
 }
 
-/// Few of everything, so that what happens at the caps happens soon.
+/// Small limits, so that the caps are reached soon.
 const SMALL: Settings = Settings {
     participants: 3,
     endpoints: 8,
@@ -462,7 +463,7 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
                 observer.input(Input::Record(record));
             }
         }
-        // As the kernel's programs write them, of whatever was sent.
+        // Records as the kernel programs write them, for any traffic.
         _ => {
             if let Ok((record, _)) = Record::read_from_prefix(content) {
                 observer.input(Input::Record(&Record {
@@ -474,7 +475,7 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
     }
 }
 
-/// What comes out of frames.
+/// Collects the datagrams in frames.
 struct Inside(Reassembly);
 
 impl Default for Inside {

@@ -1,4 +1,4 @@
-//! What decoding costs: an Imu, as it comes 200 times a second, and a point cloud of 644 KB, of which
+//! Time of decoding: an Imu, published 200 times per second, and a point cloud of 644 KB, of which
 //! `echo` shows 128 octets.
 
 use std::hint::black_box;
@@ -10,7 +10,7 @@ use ros2probe_message::{Library, Limits, Sources, Truncation, decode};
 const IMU: usize = 324;
 const CLOUD: usize = 644_000;
 
-/// Nothing but zeros after the encapsulation is an Imu with an empty frame.
+/// Returns zeros after the encapsulation, which decode as an Imu with an empty frame.
 fn imu() -> Vec<u8> {
     let mut payload = vec![0, 1, 0, 0];
     payload.resize(IMU, 0);

@@ -1,13 +1,14 @@
-//! A message as one line of comma-separated values, without quoting, as `ros2 topic echo --csv`.
+//! A message as one line of comma-separated values, without quoting, as `ros2 topic echo --csv`
+//! prints it.
 //!
-//! A comma only stands behind something: empty values at the beginning of a message or an array
-//! leave no trace, which is the original's form and what its users parse.
+//! A comma only follows a value: empty values at the beginning of a message or an array leave no
+//! trace. This is the original's format, which its users parse.
 
 use super::python;
 use super::truncation::Truncation;
 use super::value::{Array, Items, Message, Scalar, Value};
 
-/// The line, without its end.
+/// Returns the line without its line break.
 pub fn line(message: &Message<'_>, shown: &Truncation) -> String {
     let mut line = String::new();
     for (_, value) in message.fields() {
@@ -42,7 +43,7 @@ fn elements(array: &Array<'_>, shown: &Truncation) -> String {
             for value in scalars.iter().take(count) {
                 separate(&mut line);
                 match value {
-                    // numpy prints the digits of its width.
+                    // numpy prints the digits of its own width.
                     Scalar::Float32(number) if array.is_fixed() => {
                         line.push_str(&python::float32(number));
                     }

@@ -1,11 +1,11 @@
-//! Reads a payload by its type: CDR as ROS 2 and other DDS applications write it.
+//! Decodes a payload by its type: CDR as ROS 2 and other DDS applications write it.
 //!
-//! The payload is anybody's: a length is held against the bytes that are left before anything is
-//! made of it, and what is made is bounded by [`Limits`]. XCDR1 and XCDR2 (plain and delimited)
-//! in both byte orders; parameter lists are refused by name.
+//! The payload is untrusted: a length is compared with the remaining bytes before it is used, and
+//! the result is bounded by [`Limits`]. Supports XCDR1 and XCDR2 (plain and delimited) in both byte
+//! orders; parameter lists are rejected by name.
 //!
-//! Strings that are not UTF-8 and octets that are no truth value are shown as the original shows
-//! them, and counted ([`Oddities`]); a NUL that is missing at a string's end is missed by nobody.
+//! Strings that are not UTF-8 and invalid booleans are shown as the original shows them, and
+//! counted ([`Oddities`]). A missing NUL at a string's end is accepted.
 
 use std::borrow::Cow;
 
@@ -14,19 +14,19 @@ use ros2probe_wire::cursor::{Cursor, Endianness, Reason, WireError};
 use super::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
 use super::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
-/// Every XCDR structure begins at the first byte behind this.
+/// Every XCDR structure is aligned relative to the first byte behind this.
 const ENCAPSULATION: usize = 4;
-/// Bytes behind the last field that RTPS pads submessages with.
+/// Padding of submessages in RTPS: most bytes behind the last field.
 const PADDING: usize = 3;
 
-/// What one message may cost.
+/// Limits of one decoded message.
 #[derive(Debug, Clone, Copy)]
 pub struct Limits {
     /// Levels of nested messages.
     pub depth: usize,
-    /// Values that are kept, arrays of numbers being one.
+    /// Values that are kept; an array of numbers is one value.
     pub values: usize,
-    /// Elements of an array of messages or strings that are kept; the others are only checked.
+    /// Elements that are kept per array of messages or strings; the others are only validated.
     pub kept: usize,
 }
 
@@ -40,59 +40,59 @@ impl Default for Limits {
     }
 }
 
-/// A message and what was strange about it.
+/// A message and its oddities.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decoded<'a> {
     /// The message.
     pub message: Message<'a>,
-    /// What a reader may take as a sign of a wrong definition.
+    /// Possible signs of a wrong definition.
     pub oddities: Oddities,
 }
 
-/// What does not keep a message from being shown.
+/// Deviations that do not prevent a message from being shown.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Oddities {
     /// Bytes behind the last field, more than padding.
     pub trailing: usize,
     /// Strings that are not UTF-8 (UTF-16 for `wstring`).
     pub texts: usize,
-    /// Truth values that are neither 0 nor 1: they count as true.
+    /// Booleans that are neither 0 nor 1: they count as true.
     pub booleans: usize,
 }
 
 impl Oddities {
-    /// Whether there was any.
+    /// Returns whether any oddity occurred.
     pub fn any(&self) -> bool {
         *self != Self::default()
     }
 }
 
-/// Why a payload cannot be read as its type.
+/// Why a payload cannot be decoded as its type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub enum DecodeError {
-    /// Not even the encapsulation header is there.
+    /// The payload is shorter than the encapsulation header.
     #[error("the payload of {0} bytes has no encapsulation header")]
     NoEncapsulation(usize),
-    /// It is encoded in a way that is not read.
-    #[error("{name} (encapsulation {id:#06x}) is not read")]
+    /// The encoding is not supported.
+    #[error("{name} (encapsulation {id:#06x}) is not supported")]
     Encapsulation {
-        /// The header's number.
+        /// Encapsulation identifier in the header.
         id: u16,
-        /// Its name in the specification.
+        /// Name of the encoding in the specification.
         name: &'static str,
     },
     /// The bytes are not a message of this type.
     #[error("{0} (counted behind the encapsulation header)")]
     Malformed(#[from] WireError),
-    /// More values, or deeper ones, than are kept.
+    /// The message has more or deeper values than the limits allow.
     #[error("more than {0}")]
     Limit(&'static str),
 }
 
-/// Reads a payload that begins with its encapsulation header.
+/// Decodes a payload that begins with its encapsulation header.
 ///
 /// # Errors
-/// Where it cannot be of this type, or is larger than the limits.
+/// Fails if the payload cannot be of this type, or exceeds the limits.
 pub fn decode<'a>(
     message_type: &'a MessageType,
     payload: &'a [u8],
@@ -121,15 +121,15 @@ pub fn decode<'a>(
     })
 }
 
-/// How a payload is encoded (RTPS 2.5, 10.2; XTypes 1.3, 7.6.3.1.2).
+/// Encoding of a payload (RTPS 2.5, 10.2; XTypes 1.3, 7.6.3.1.2).
 #[derive(Debug, Clone, Copy)]
 struct Encoding {
     endianness: Endianness,
     /// Alignment of 64-bit numbers.
     widest: usize,
-    /// Collections of anything but numbers are preceded by their size in bytes.
+    /// Whether collections of anything but numbers are preceded by their size in bytes.
     sized: bool,
-    /// Structures are, too.
+    /// Whether structures are preceded by their size, too.
     delimited: bool,
 }
 
@@ -191,7 +191,8 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// What a structure's or collection's size in front of it leaves to read, if there is one.
+    /// Reads the size before a structure or collection, if the encoding has one, and returns the
+    /// bytes of its content.
     fn delimited(
         &self,
         there: bool,
@@ -319,7 +320,7 @@ impl<'a> Reader<'a> {
         length: usize,
         depth: usize,
     ) -> Result<Vec<Message<'a>>, DecodeError> {
-        // The smallest message is an octet, or its own size where that is written.
+        // The smallest message is an octet, or its own size if the encoding writes it.
         let least = if self.encoding.delimited { 4 } else { 1 };
         let kept = self.keep(cursor, length, least)?;
         let mut messages = Vec::with_capacity(kept);
@@ -349,7 +350,8 @@ impl<'a> Reader<'a> {
         Ok(texts)
     }
 
-    /// How many of `length` elements are kept; refuses more than there can be in what is left.
+    /// Returns how many of `length` elements are kept; fails if the remaining bytes cannot hold
+    /// them.
     fn keep(
         &mut self,
         cursor: &Cursor<'a>,
@@ -369,7 +371,7 @@ impl<'a> Reader<'a> {
         Ok(kept)
     }
 
-    /// Moves past what [`Self::message`] would read, and keeps nothing of it.
+    /// Skips what [`Self::message`] would read, keeping nothing.
     fn skip_message(
         &mut self,
         cursor: &mut Cursor<'a>,
@@ -437,13 +439,13 @@ impl<'a> Reader<'a> {
         let length = length(cursor, "string length")?;
         let (bound, characters, written) = match element {
             Element::WString { bound } if self.encoding.sized => {
-                // XTypes counts octets of UTF-16.
+                // XTypes counts the octets of UTF-16.
                 let bytes = cursor.take("wide string", length)?;
                 let units = Scalars::new(ScalarKind::UInt16, self.encoding.endianness, bytes);
                 (*bound, Characters::Wide(units), length / 2)
             }
             Element::WString { bound } => {
-                // Both RMWs write a character of UTF-16 in four octets.
+                // Both RMWs write each UTF-16 code unit in four octets.
                 let size = length.checked_mul(4);
                 let size = size.ok_or(cursor.error("wide string", Reason::BadLength))?;
                 let bytes = cursor.take("wide string", size)?;
@@ -466,11 +468,11 @@ impl<'a> Reader<'a> {
 
 enum Characters<'a> {
     Octets(&'a [u8]),
-    /// Units of UTF-16, each in a number of two or four octets.
+    /// UTF-16 code units, each in a number of two or four octets.
     Wide(Scalars<'a>),
 }
 
-/// A length field, aligned already.
+/// Reads a length field, already aligned.
 fn length(cursor: &mut Cursor<'_>, what: &'static str) -> Result<usize, DecodeError> {
     let length = cursor.u32(what)?;
     usize::try_from(length).map_err(|_| cursor.error(what, Reason::BadLength).into())
@@ -487,7 +489,7 @@ fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), Decode
     }
 }
 
-/// Text of UTF-16; a number that is no unit of it counts as a character of its own.
+/// Returns UTF-16 text; an invalid code unit counts as a character of its own.
 fn wide(units: &Scalars<'_>) -> String {
     let mut text = String::with_capacity(units.len());
     let mut pending = Vec::new();

@@ -1,8 +1,8 @@
-//! What a ROS message consists of: type names, fields, and a type with everything it is made of.
+//! Definition of a ROS message: type names, fields, and a type with all its nested types.
 //!
-//! A [`MessageType`] is closed (every nested type is there), free of recursion and no deeper than
-//! [`MAX_DEPTH`], so whoever walks it needs no checks of its own. Defaults and constants are not
-//! kept but in the text: neither is on the wire nor part of the type hash.
+//! A [`MessageType`] is closed (every nested type is included), free of recursion and no deeper
+//! than [`MAX_DEPTH`], so code that walks it needs no checks. Defaults and constants are kept only
+//! in the text: they are neither on the wire nor part of the type hash.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
@@ -12,24 +12,24 @@ use super::implicit_types::implicit_types;
 pub use super::name::{Kind, NotATypeName, TypeName};
 use super::parse::{self, ParseError};
 
-/// How deep types may be nested.
+/// Deepest nesting of types.
 pub const MAX_DEPTH: usize = 32;
-/// How many types one type may be made of.
+/// Most types in one type.
 pub const MAX_TYPES: usize = 1024;
-/// How much text may define one type, all its parts together.
+/// Most text that defines one type, including its nested types.
 pub const MAX_TEXT: usize = 4 << 20;
 /// One member of a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Field {
-    /// Its name.
+    /// Name of the field.
     pub name: String,
-    /// What it holds, or an array of it does.
+    /// Type of the value, or of an array's elements.
     pub element: Element,
-    /// How many.
+    /// Whether it is a single value or an array, and the array's length.
     pub shape: Shape,
 }
 
-/// What a field holds one or many of.
+/// Type of a field's value or elements.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Element {
     /// `bool`.
@@ -60,61 +60,61 @@ pub enum Element {
     Float64,
     /// `string`, `string<=N`.
     String {
-        /// How long at most.
+        /// Most characters; `None` = unbounded.
         bound: Option<u32>,
     },
     /// `wstring`, `wstring<=N`.
     WString {
-        /// How long at most.
+        /// Most characters; `None` = unbounded.
         bound: Option<u32>,
     },
     /// Another type.
     Nested(TypeName),
 }
 
-/// How many elements a field has.
+/// Number of elements of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shape {
-    /// One, no array.
+    /// A single value, not an array.
     Single,
-    /// `[N]`.
+    /// `[N]`: exactly N elements.
     Array(u32),
-    /// `[<=N]`.
+    /// `[<=N]`: at most N elements.
     Bounded(u32),
-    /// `[]`.
+    /// `[]`: any number of elements.
     Unbounded,
 }
 
-/// The members of one type. One without members is an octet on the wire, which rosidl calls
+/// The fields of one type. A type without fields is an octet on the wire, which rosidl calls
 /// `structure_needs_at_least_one_member`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Structure {
-    /// The type.
+    /// Name of the type.
     pub name: TypeName,
-    /// Its members, in the order of the wire.
+    /// Its fields, in wire order.
     pub fields: Vec<Field>,
 }
 
-/// One file: what it defines, including the types that services and actions imply.
+/// One file with its types, including those that services and actions imply.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Definition {
-    /// The type it is named after.
+    /// The type after which the file is named.
     pub name: TypeName,
-    /// The file as it was read; for an `.idl` file the `.msg` text that means the same.
+    /// Content of the file; for an `.idl` file the equivalent `.msg` text.
     pub text: Arc<str>,
     pub(super) structures: Vec<Arc<Structure>>,
-    /// The messages that the text itself names.
+    /// The message types that the text names.
     pub(super) uses: BTreeSet<TypeName>,
 }
 
 impl Definition {
-    /// Reads a `.msg`, `.srv` or `.action` file, whichever the name is of.
+    /// Parses a `.msg`, `.srv` or `.action` file, depending on the name.
     pub fn parse(name: TypeName, text: &str) -> Result<Self, ParseError> {
         let structures = parse::file(&name, text)?;
         Ok(Self::new(name, text.into(), structures))
     }
 
-    /// Reads an `.idl` file of the kind that the name is of.
+    /// Parses an `.idl` file of the name's kind.
     pub fn parse_idl(name: TypeName, text: &str) -> Result<Self, ParseError> {
         idl::definition(name, text)
     }
@@ -139,39 +139,39 @@ impl Definition {
     }
 }
 
-/// A type and all that it is made of.
+/// A type and all types nested in it.
 #[derive(Debug, PartialEq, Eq)]
 pub struct MessageType {
-    /// The type itself.
+    /// Name of the type itself.
     pub root: TypeName,
     pub(super) structures: BTreeMap<TypeName, Arc<Structure>>,
-    /// The files that it comes from, by what they are named after.
+    /// The files that define it, by name.
     pub(super) definitions: BTreeMap<TypeName, Arc<Definition>>,
 }
 
-/// Why a type cannot be put together.
+/// Why a type cannot be assembled.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NotClosed {
-    /// It, or something in it, is defined nowhere.
+    /// The type, or a nested one, has no definition.
     #[error("no definition of {0}")]
     Missing(TypeName),
-    /// It contains itself.
+    /// The type contains itself.
     #[error("{0} contains itself")]
     Recursive(TypeName),
-    /// Its types are nested too deeply.
+    /// The types are nested too deeply.
     #[error("nested deeper than {MAX_DEPTH} types")]
     TooDeep,
-    /// It has too many types.
+    /// The type has too many nested types.
     #[error("made of more than {MAX_TYPES} types")]
     TooMany,
-    /// Its definitions are too long.
+    /// The definitions are too long.
     #[error("defined by more than {MAX_TEXT} bytes of text")]
     TooLong,
 }
 
 impl MessageType {
-    /// Reads the text of a bag's schema in encoding `ros2msg`: the type's own definition, then
-    /// those that it needs, each below a line of 80 `=` and a line `MSG: package/Type`.
+    /// Parses the text of a bag's schema in encoding `ros2msg`: the type's own definition, then its
+    /// nested types, each below a line of 80 `=` and a line `MSG: package/Type`.
     pub fn parse(root: &TypeName, text: &str) -> Result<Self, SchemaError> {
         let mut definitions = HashMap::new();
         for (name, part) in super::schema::parts(root, text)? {
@@ -189,7 +189,7 @@ impl MessageType {
         })?)
     }
 
-    /// Puts a type together from its files; `find` is asked for each of them once or twice.
+    /// Assembles a type from its files; calls `find` once or twice per file.
     pub(super) fn assemble<E: From<NotClosed>>(
         root: &TypeName,
         mut find: impl FnMut(&TypeName) -> Result<Option<Arc<Definition>>, E>,
@@ -252,8 +252,8 @@ impl MessageType {
         Err(NotClosed::Missing(name.clone()).into())
     }
 
-    /// How deep a type is; refuses what contains itself. A level of the stack for each level of
-    /// types, no more than the limit.
+    /// Returns the depth of a type; fails if it contains itself. Recurses once per level, up to the
+    /// limit.
     fn check(
         &self,
         name: &TypeName,
@@ -288,30 +288,30 @@ impl MessageType {
         Ok(depth)
     }
 
-    /// The members of the type itself or of one that it is made of.
+    /// Returns the fields of the type itself or of a nested one.
     pub fn structure(&self, name: &TypeName) -> Option<&Structure> {
         self.structures.get(name).map(Arc::as_ref)
     }
 
-    /// Every type that it is made of, itself included, sorted by name.
+    /// Iterates over all its types, itself included, sorted by name.
     pub fn structures(&self) -> impl Iterator<Item = &Structure> {
         self.structures.values().map(Arc::as_ref)
     }
 }
 
-/// Why a schema's text cannot be used.
+/// Why a schema's text is invalid.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SchemaError {
     /// The line that names a part is not one of `MSG: package/Type`.
     #[error("line {line}: expected `MSG: package/Type` below the line of `=`")]
     Heading {
-        /// Which line.
+        /// Line number, counted from 1.
         line: usize,
     },
-    /// One of its definitions cannot be read.
+    /// One of its definitions cannot be parsed.
     #[error("definition of {0}")]
     Definition(TypeName, #[source] ParseError),
-    /// They do not belong together.
+    /// The definitions do not form one type.
     #[error(transparent)]
     NotClosed(#[from] NotClosed),
 }
@@ -360,7 +360,7 @@ mod tests {
         }
     }
 
-    /// A schema in which each of `count` types has a member of the next one.
+    /// Returns a schema of `count` types, each with a field of the next one.
     fn chain(count: usize) -> String {
         let mut text = String::from("T1 next\n");
         for index in 1..count {

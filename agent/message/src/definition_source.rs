@@ -1,4 +1,4 @@
-//! A place that may have definitions: a directory, an installed ROS, or the program.
+//! A source of definitions: a directory, an installed ROS, or the program itself.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _};
@@ -12,17 +12,17 @@ use super::embedded;
 use super::library::NotFound;
 use super::parse::{MAX_TEXT, ParseError, Problem};
 
-/// The extension of what defines a type where nothing else does.
+/// Extension of the file that defines a type without a `.msg`, `.srv` or `.action` file.
 const IDL: &str = "idl";
 
-/// Where to look.
+/// A source.
 #[derive(Debug)]
 pub(super) enum DefinitionSource {
-    /// Named by the user.
+    /// A directory named by the user.
     Directory(PathBuf),
-    /// An installed ROS.
+    /// The prefix of an installed ROS.
     Prefix(PathBuf),
-    /// In the program.
+    /// Definitions embedded in the program.
     Embedded(Dialect),
 }
 
@@ -41,8 +41,9 @@ impl DefinitionSource {
         }
     }
 
-    /// The file that defines a type; also one that cannot be read, which has to be told. An installed
-    /// package has an `.idl` file, too, for every other one: it counts where it is alone.
+    /// Returns the file that defines a type, even if it is unreadable, so that the error can be
+    /// reported. An installed package also has an `.idl` file for every other one; it counts only
+    /// if it is alone.
     fn file(&self, name: &TypeName) -> Option<PathBuf> {
         let kind = name.kind().as_str();
         let directories = match self {
@@ -96,8 +97,8 @@ fn is_absent(error: &io::Error) -> bool {
     )
 }
 
-/// Opens a regular file to read it. Opening never waits, as it would for a pipe without a writer; the
-/// open file is checked, so nothing can take its place in between.
+/// Opens a regular file for reading. The open never blocks, as it would on a pipe without a writer;
+/// the check is made on the open file, so the path cannot be swapped in between.
 fn open(path: &Path) -> io::Result<File> {
     let flags = libc::O_NONBLOCK | libc::O_NOCTTY;
     let mut options = OpenOptions::new();
@@ -111,7 +112,7 @@ fn open(path: &Path) -> io::Result<File> {
     }
 }
 
-/// A file's bytes; of one longer than [`MAX_TEXT`], one byte more than that.
+/// Reads a file; of one longer than [`MAX_TEXT`], one byte more than that.
 fn read_bytes(path: &Path) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?
@@ -120,7 +121,7 @@ fn read_bytes(path: &Path) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// A file's text, if the file exists. Fails for what is no regular file.
+/// Returns a file's text if the file exists. Fails if it is not a regular file.
 fn read(path: &Path) -> Result<Option<String>, NotFound> {
     let unreadable = |source: io::Error| NotFound::Unreadable {
         path: path.to_owned(),

@@ -1,11 +1,12 @@
-//! Distributions of ROS 2, whose definitions and command lines differ.
+//! Distributions of ROS 2 that differ in definitions and command-line output.
 
-/// A distribution of ROS 2 with those that have the same definitions and print alike, oldest first.
+/// A distribution of ROS 2, together with those that have the same definitions and print alike;
+/// oldest first.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Dialect {
-    /// Humble, and what is older.
+    /// Humble and older.
     Humble,
-    /// Jazzy, and Iron.
+    /// Iron and Jazzy.
     #[default]
     Jazzy,
     /// Kilted.
@@ -15,7 +16,7 @@ pub enum Dialect {
 }
 
 impl Dialect {
-    /// As `ROS_DISTRO` spells it.
+    /// Returns the name as in `ROS_DISTRO`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -26,7 +27,7 @@ impl Dialect {
         }
     }
 
-    /// Of `ROS_DISTRO`; `None` for one that is not known.
+    /// Parses `ROS_DISTRO`; returns `None` for an unknown distribution.
     #[must_use]
     pub fn of_distro(name: &str) -> Option<Self> {
         Some(match name {

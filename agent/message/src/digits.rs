@@ -1,12 +1,13 @@
 //! The shortest decimal digits of floats, chosen as Python and numpy choose them.
 //!
-//! Python and Rust agree on how many digits a float needs. Where two candidates of that length are
-//! equally near, Python takes the even one and Rust the larger one. Layout is not decided here.
+//! Python and Rust agree on the number of digits that a float needs. If two candidates of that
+//! length are equally near, Python takes the even one and Rust the larger one. This module does not
+//! decide the layout.
 
 use std::fmt::LowerExp;
 use std::str::FromStr;
 
-/// Digits with an exponent: `5.25e-7`. Infinities and NaN as Rust writes them.
+/// Returns digits with an exponent: `5.25e-7`. Infinities and NaN as Rust writes them.
 pub(super) fn scientific<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let shortest = format!("{value:e}");
     let mantissa = shortest.split('e').next().unwrap_or_default();
@@ -19,7 +20,7 @@ pub(super) fn scientific<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> 
     }
 }
 
-/// The same digits without an exponent: `0.000000525`, and `12` without a point.
+/// Returns the same digits without an exponent: `0.000000525`, and `12` without a point.
 pub(super) fn positional<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let text = scientific(value);
     let Some((mantissa, exponent)) = text.split_once('e') else {

@@ -1,12 +1,12 @@
-//! Definitions that come with the program: the common interface packages, without their comments.
+//! Embedded definitions: the common interface packages, without their comments.
 //!
-//! Plain text, a file for each package; `embedded/README.md` says where they are from, under which
-//! licences, and how they are written. Nothing is parsed before it is asked for.
+//! Plain text, one file per package; `embedded/README.md` names their origin, licences and format.
+//! A definition is parsed only on request.
 
 use super::definition::{Kind, TypeName};
 use super::dialect::Dialect;
 
-/// What a definition's heading begins with.
+/// Prefix of a definition's heading.
 const HEADING: &str = "== ";
 
 const PACKAGES: [(&str, &str); 26] = [
@@ -88,12 +88,12 @@ const PACKAGES: [(&str, &str); 26] = [
 struct Embedded {
     kind: Kind,
     name: &'static str,
-    /// The distributions that have it so, divided by spaces; empty where all have.
+    /// The distributions with this definition, separated by spaces; empty if all have it.
     distributions: &'static str,
     text: &'static str,
 }
 
-/// The file's text as a distribution has it.
+/// Returns the text of a file in a distribution.
 pub(super) fn find(file: &TypeName, dialect: Dialect) -> Option<&'static str> {
     let (_, text) = PACKAGES
         .iter()
@@ -110,12 +110,12 @@ impl Embedded {
     }
 }
 
-/// The definitions of a package.
+/// Iterates over the definitions of a package.
 fn definitions(text: &'static str) -> impl Iterator<Item = Embedded> {
     let mut rest = text;
     std::iter::from_fn(move || {
         let (heading, behind) = rest.strip_prefix(HEADING)?.split_once('\n')?;
-        // An empty line is between two definitions.
+        // An empty line separates two definitions.
         let (text, next) = match behind.find("\n== ") {
             Some(end) => (behind.get(..end)?, behind.get(end + 1..)?),
             None => (behind, ""),
@@ -153,7 +153,7 @@ mod tests {
         ("rolling", Dialect::Rolling),
     ];
 
-    /// Nothing but what comes with the program.
+    /// Returns a library with the embedded definitions only.
     fn library(dialect: Dialect) -> Library {
         Library::new(Sources {
             dialect,
@@ -233,7 +233,7 @@ mod tests {
             }
         }
         assert!(hashes.values().all(|count| *count == DIALECTS.len()));
-        // What the other implementation has no hash of still has to be complete.
+        // Definitions without a hash in the other implementation still must be complete.
         for (name, one) in all() {
             let definition = Definition::parse(name.clone(), one.text).unwrap();
             for structure in &definition.structures {
@@ -282,8 +282,8 @@ mod tests {
         assert_eq!(
             failure.to_string(),
             format!(
-                "the definition of std_msgs/msg/String that comes with ros2probe is another one \
-                 than the nodes use: its hash is \
+                "the definition of std_msgs/msg/String that comes with ros2probe differs from the \
+                 nodes': its hash is \
                  RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18, theirs \
                  {announced}; install their version of std_msgs, or name a directory that has it \
                  with --definitions"

@@ -1,9 +1,9 @@
 //! Conditions on messages: a subset of Python's expressions over `m`, for `--filter`.
 //!
-//! Attributes, indices, numbers, strings, comparisons (also chained), `in`, `and`, `or`, `not`,
-//! arithmetic, lists, and the functions `abs`, `all`, `any`, `bool`, `float`, `int`, `len`, `max`,
-//! `min`, `str` and `sum`. Nothing can be assigned, defined, imported or repeated: an expression ends,
-//! needs little memory, and changes nothing.
+//! Supports attributes, indices, numbers, strings, comparisons (also chained), `in`, `and`, `or`,
+//! `not`, arithmetic, lists, and the functions `abs`, `all`, `any`, `bool`, `float`, `int`, `len`,
+//! `max`, `min`, `str` and `sum`. Assignments, definitions, imports and loops do not exist: an
+//! expression terminates, needs little memory, and changes nothing.
 
 mod evaluate;
 mod parse;
@@ -13,21 +13,21 @@ use std::fmt;
 
 pub use evaluate::Subject;
 
-/// How long an expression may be.
+/// Longest expression, in bytes.
 const MAX_LENGTH: usize = 4096;
-/// How many words it may have: a chain of operators is as deep as it is long.
+/// Most tokens: a chain of operators is as deep as it is long.
 const MAX_WORDS: usize = 400;
 
 /// A condition.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Filter(Node);
 
-/// Why an expression is none, or has no value for a message.
+/// Why an expression is invalid, or has no value for a message.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FilterError {
-    /// Where in the expression, counted in characters from 1.
+    /// Position in the expression, counted in characters from 1.
     pub column: usize,
-    /// What is wrong there.
+    /// Description of the mistake.
     pub message: String,
 }
 
@@ -53,10 +53,10 @@ impl FilterError {
 }
 
 impl Filter {
-    /// Reads an expression.
+    /// Parses an expression.
     ///
     /// # Errors
-    /// Where it is outside the subset, too long or too deep.
+    /// Fails if it is outside of the subset, too long or too deep.
     pub fn parse(text: &str) -> Result<Self, FilterError> {
         if text.len() > MAX_LENGTH {
             return Err(FilterError::new(
@@ -74,17 +74,17 @@ impl Filter {
         parse::expression(&tokens).map(Self)
     }
 
-    /// Whether a message passes.
+    /// Returns whether a message passes.
     ///
     /// # Errors
-    /// Where Python would raise an exception: an attribute that is not there, a comparison of what
-    /// cannot be compared.
+    /// Fails if Python would raise an exception: for a missing attribute, or a comparison of
+    /// incomparable values.
     pub fn passes(&self, subject: Subject<'_>) -> Result<bool, FilterError> {
         evaluate::passes(&self.0, subject)
     }
 }
 
-/// A part of an expression and where it is written.
+/// A part of an expression and its position.
 #[derive(Debug, Clone, PartialEq)]
 struct Node {
     column: usize,
@@ -104,14 +104,14 @@ enum Kind {
     Attribute(Box<Node>, String),
     Index(Box<Node>, Box<Node>),
     Call(Function, Vec<Node>),
-    /// A string's method.
+    /// Call of a string's method.
     Method(Box<Node>, Method, Vec<Node>),
     Negative(Box<Node>),
     Not(Box<Node>),
     And(Box<Node>, Box<Node>),
     Or(Box<Node>, Box<Node>),
     Binary(Operator, Box<Node>, Box<Node>),
-    /// `a < b <= c`: the first and what it is compared with.
+    /// `a < b <= c`: the first operand, then each operator with its right operand.
     Compare(Box<Node>, Vec<(Comparison, Node)>),
 }
 
@@ -152,7 +152,7 @@ impl Comparison {
     }
 }
 
-/// The functions that an expression may call.
+/// Functions that an expression may call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Function {
     Abs,

@@ -1,7 +1,7 @@
 //! The type hash of ROS 2 from Iron on: REP-2011, version 01.
 //!
-//! SHA-256 of a JSON text that holds names and types of all members, with exactly the spaces that
-//! Python's `json.dumps` writes. Names are ASCII identifiers, so nothing has to be escaped.
+//! SHA-256 of a JSON text with names and types of all fields, with exactly the spaces that Python's
+//! `json.dumps` writes. Names are ASCII identifiers, so nothing needs escaping.
 
 use std::fmt::Write as _;
 
@@ -9,13 +9,14 @@ use sha2::{Digest as _, Sha256};
 
 use super::definition::{Element, MessageType, Shape, Structure};
 
-/// `type_description_interfaces/msg/FieldType`: what an array of a type adds to its number.
+/// `type_description_interfaces/msg/FieldType`: offset of an array type's number from its
+/// element's.
 const ARRAY: u8 = 48;
 const BOUNDED: u8 = 96;
 const UNBOUNDED: u8 = 144;
 
 impl MessageType {
-    /// `RIHS01_` and 64 hexadecimal digits, as discovery announces it.
+    /// Returns `RIHS01_` and 64 hexadecimal digits, as discovery announces it.
     pub fn type_hash(&self) -> String {
         let mut text = String::from(r#"{"type_description": "#);
         if let Some(root) = self.structure(&self.root) {
@@ -106,7 +107,7 @@ mod tests {
             .type_hash()
     }
 
-    /// Announced by nodes of ROS 2 Jazzy.
+    /// Hashes announced by nodes of ROS 2 Jazzy.
     #[test]
     fn a_string_has_the_hash_that_jazzy_announces() {
         assert_eq!(

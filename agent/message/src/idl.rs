@@ -1,8 +1,8 @@
-//! Reads `.idl` files as far as rosidl reads and writes them: modules, structures, typedefs of arrays,
-//! sequences, constants and annotations.
+//! Parses `.idl` files to the extent that rosidl reads and writes them: modules, structures,
+//! typedefs of arrays, sequences, constants and annotations.
 //!
-//! Only for types that have no `.msg`, `.srv` or `.action` file. What ROS cannot put on the wire
-//! through such a file (enumerations, unions, `wchar`, an IDL's own `char`) is refused by name.
+//! Used only for types without a `.msg`, `.srv` or `.action` file. Constructs that ROS cannot put
+//! on the wire (enumerations, unions, `wchar`, IDL's own `char`) are rejected by name.
 
 use std::collections::HashMap;
 
@@ -11,12 +11,12 @@ use super::name::is_identifier;
 use super::parse::{MAX_FIELDS, MAX_TEXT, ParseError, Problem, SEPARATOR, parts, shortened};
 use super::schema;
 
-/// How deep modules may be nested; two are in use.
+/// Deepest nesting of modules; ROS uses two.
 const MAX_MODULES: usize = 16;
-/// What rosidl gives to a type without members.
+/// Field that rosidl adds to a type without fields.
 const NO_MEMBER: &str = "structure_needs_at_least_one_member";
 
-/// The definition in an `.idl` file. Its text becomes that of the file it stands for.
+/// Parses an `.idl` file. The text of the definition is that of the equivalent `.msg` file.
 pub(super) fn definition(name: TypeName, text: &str) -> Result<Definition, ParseError> {
     if text.len() > MAX_TEXT {
         return Err(ParseError {
@@ -53,7 +53,7 @@ pub(super) fn definition(name: TypeName, text: &str) -> Result<Definition, Parse
     ))
 }
 
-/// Reads word by word.
+/// Reads token by token.
 struct Reader<'a> {
     name: &'a TypeName,
     rest: &'a str,
@@ -110,7 +110,7 @@ impl<'a> Reader<'a> {
         let name = self.identifier()?;
         let name = TypeName::new(self.name.package(), self.name.kind(), name)
             .map_err(|_| Problem::Name(shortened(name)))?;
-        // A structure elsewhere is read, for what it says has to be right, and left alone.
+        // A structure of another module is parsed, to validate it, and ignored.
         let own = [self.name.package(), self.name.kind().as_str()];
         let is_own = self.modules.as_slice() == own;
         self.expect("{")?;
@@ -152,7 +152,7 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// `name`, or `name[N]` of what is one so far.
+    /// Parses `name`, or `name[N]`, given the element type.
     fn declarator(
         &mut self,
         (element, shape): (Element, Shape),
@@ -262,7 +262,7 @@ impl<'a> Reader<'a> {
         {
             return Ok(declared.clone());
         }
-        // Members are messages, whose names begin so.
+        // Names of message types begin with this.
         let is_message =
             kind == "msg" && name.starts_with(|first: char| first.is_ascii_uppercase());
         TypeName::new(package, Kind::Message, name)
@@ -281,7 +281,7 @@ impl<'a> Reader<'a> {
         Ok(Some(bound))
     }
 
-    /// A number, or a constant that is one.
+    /// Parses a number, or a constant with a numeric value.
     fn size(&mut self) -> Result<u32, Problem> {
         let mut word = self.word()?;
         while self.take("::")? {
@@ -304,8 +304,8 @@ impl<'a> Reader<'a> {
         self.skip_until(";")
     }
 
-    /// Behind `@`: a name and, in brackets, whatever it says. It does not change what ROS puts on the
-    /// wire, but for `@optional`.
+    /// Parses an annotation behind `@`: a name and optional parentheses. Only `@optional` changes
+    /// the wire format of ROS.
     fn annotation(&mut self) -> Result<(), Problem> {
         let name = self.identifier()?;
         if name == "optional" {
@@ -318,7 +318,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Past a word; brackets in between are closed.
+    /// Skips to behind a token, over nested brackets.
     fn skip_until(&mut self, end: &str) -> Result<(), Problem> {
         let mut open = 0_usize;
         loop {
@@ -349,7 +349,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Whether this word is next; then it is read.
+    /// Consumes the next token if it is the expected one.
     fn take(&mut self, expected: &str) -> Result<bool, Problem> {
         let (line, rest) = (self.line, self.rest);
         if self.word()? == expected {
@@ -359,7 +359,7 @@ impl<'a> Reader<'a> {
         Ok(false)
     }
 
-    /// The next word, text in quotes or sign; empty at the end.
+    /// Returns the next word, quoted text or sign; empty at the end.
     fn word(&mut self) -> Result<&'a str, Problem> {
         self.skip_blanks()?;
         let length = match self.rest.bytes().next() {
@@ -378,7 +378,7 @@ impl<'a> Reader<'a> {
         Ok(self.advance(length))
     }
 
-    /// Spaces, comments, and lines for the preprocessor: what a file includes is found by its name.
+    /// Skips spaces, comments, and preprocessor lines: included files are found by name.
     fn skip_blanks(&mut self) -> Result<(), Problem> {
         loop {
             let blanks = self.rest.len() - self.rest.trim_start().len();
@@ -407,7 +407,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// How long a text in quotes is, both included.
+/// Returns the length of a quoted text, including both quotes.
 fn quoted(text: &str, quote: u8) -> Option<usize> {
     let mut escaped = false;
     for (index, byte) in text.bytes().enumerate().skip(1) {
@@ -436,7 +436,7 @@ mod tests {
         text.parse().unwrap()
     }
 
-    /// In the form in which `rosidl_adapter` writes a `.msg` file again.
+    /// The form in which `rosidl_adapter` writes a `.msg` file.
     const WRITTEN: &str = r#"// generated from rosidl_adapter/resource/msg.idl.em
 // with input from a/msg/B.msg
 
@@ -536,19 +536,19 @@ bool flag
             ),
             (
                 "struct B { long x[0]; };",
-                "line 2: `0` is no size from 1 to 4294967295",
+                "line 2: `0` is not a size from 1 to 4294967295",
             ),
             (
                 "struct B { string<N> x; };",
-                "line 2: `N` is no size from 1 to 4294967295",
+                "line 2: `N` is not a size from 1 to 4294967295",
             ),
-            ("struct B { long x, x; };", "line 2: `x` is there twice"),
-            ("struct B { b::C x; };", "line 2: `b::C` is no type"),
+            ("struct B { long x, x; };", "line 2: `x` is declared twice"),
+            ("struct B { b::C x; };", "line 2: `b::C` is not a type"),
             (
                 "struct B { b::srv::C x; };",
-                "line 2: `b::srv::C` is no type",
+                "line 2: `b::srv::C` is not a type",
             ),
-            ("struct B { eouble x; };", "line 2: `eouble` is no type"),
+            ("struct B { eouble x; };", "line 2: `eouble` is not a type"),
             ("struct B { long x };", "line 2: `;` is missing"),
             ("struct C { long x; };", "line 3: `struct B` is missing"),
             ("/* struct B", "line 2: `*/` is missing"),

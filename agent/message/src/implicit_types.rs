@@ -1,8 +1,8 @@
-//! The types that services and actions have besides what their files spell out.
+//! The types that services and actions imply, in addition to those in their files.
 
 use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
 
-/// As `rosidl_parser` composes them.
+/// Returns the types that `rosidl_parser` composes.
 pub(super) fn implicit_types(name: &TypeName) -> Vec<Structure> {
     let mut structures = Vec::new();
     match name.kind() {
@@ -58,7 +58,7 @@ pub(super) fn implicit_types(name: &TypeName) -> Vec<Structure> {
     structures
 }
 
-/// A service's event and the service itself, of which only the hash is ever seen.
+/// Adds a service's event and the service itself, of which only the hash is used.
 fn service(name: &TypeName, structures: &mut Vec<Structure>) {
     let nested = |suffix: &str| Element::Nested(name.with_suffix(suffix));
     let one_at_most = |member: &str, suffix: &str| Field {

@@ -1,11 +1,10 @@
-//! ROS messages without ROS: what a type consists of, where its definition comes from, its hash, and
-//! the text of a payload.
+//! ROS messages without ROS: definitions of types, their hashes, and the text of a payload.
 //!
-//! - [`Library`] finds the definition of a type in directories, in an installed ROS or among those
-//!   embedded here, by name and announced hash, and returns a [`MessageType`].
-//! - [`decode()`] reads a CDR payload of that type into a [`Value`] tree that borrows from it.
-//! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them,
-//!   [`Truncation`] says how much of them. [`filter`] evaluates an expression over a message.
+//! - [`Library`] finds the definition of a type in directories, in an installed ROS or among the
+//!   embedded ones, by name and announced hash, and returns a [`MessageType`].
+//! - [`decode()`] decodes a CDR payload of that type into a [`Value`] tree that borrows from it.
+//! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them; [`Truncation`]
+//!   limits their length. [`filter`] evaluates an expression over a message.
 //!
 //! Definitions are read from files as rosidl reads them; nothing is generated, loaded or executed.
 //! Files, names and payloads are untrusted: every size, number and depth is bounded.

@@ -1,8 +1,7 @@
-//! Where definitions come from: directories that are named, an installed ROS, else what comes with
-//! the program.
+//! Sources of definitions, in order: named directories, an installed ROS, embedded definitions.
 //!
-//! Two machines may have different definitions of one name. Where discovery announces a type's hash
-//! the definition has to agree with it, whatever place it is from; a wrong one is never used.
+//! Two machines may have different definitions of one name. If discovery announces a type's hash,
+//! the definition must match it, whichever source has it; a mismatching one is never used.
 
 use std::collections::HashMap;
 use std::ffi::OsStr;
@@ -16,30 +15,30 @@ use super::dialect::Dialect;
 use super::parse::ParseError;
 use super::search::Search;
 
-/// Where ROS is installed, one directory for each distribution.
+/// Directory of ROS installations, one subdirectory per distribution.
 const INSTALLED: &str = "/opt/ros";
-/// How many places are looked at: a workspace that is installed package by package has hundreds.
+/// Most sources searched: a workspace installed package by package has hundreds.
 pub(super) const MAX_SOURCES: usize = 1024;
-/// How many types are kept, and how much text.
+/// Most types kept, and most bytes of text.
 const MAX_KEPT: usize = 1024;
 const MAX_KEPT_TEXT: usize = 32 << 20;
-/// The only version of type hashes there is.
+/// Prefix of the only version of type hashes.
 const HASH: &str = "RIHS01_";
 
-/// Where to look, in this order.
+/// Sources to search, in this order.
 #[derive(Debug, Clone, Default)]
 pub struct Sources {
-    /// What the user named: `DIR/package/msg/Type.msg`, also below `DIR/share`.
+    /// Directories named by the user: `DIR/package/msg/Type.msg`, also below `DIR/share`.
     pub directories: Vec<PathBuf>,
     /// Prefixes of an installed ROS: `PREFIX/share/package/msg/Type.msg`.
     pub prefixes: Vec<PathBuf>,
-    /// Whose definitions are taken where distributions differ and no hash tells.
+    /// Distribution to prefer if definitions differ and no hash is announced.
     pub dialect: Dialect,
 }
 
 impl Sources {
-    /// Named directories, what `AMENT_PREFIX_PATH` holds, then what is installed in `/opt/ros`, the
-    /// dialect's distribution first.
+    /// Returns the named directories, those of `AMENT_PREFIX_PATH`, then the installations in
+    /// `/opt/ros`, the dialect's distribution first.
     pub fn new(
         directories: Vec<PathBuf>,
         ament_prefix_path: Option<&OsStr>,
@@ -65,7 +64,7 @@ impl Sources {
     }
 }
 
-/// The distributions in a directory, the dialect's first, then the newer before the older ones.
+/// Returns the distributions in a directory: the dialect's first, then the others, newest first.
 fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(directory) else {
         return Vec::new();
@@ -80,7 +79,7 @@ fn installed(directory: &Path, dialect: Dialect) -> Vec<PathBuf> {
     found
 }
 
-/// Finds definitions and keeps the types that were found.
+/// Finds definitions and caches the types found.
 #[derive(Debug)]
 pub struct Library {
     definition_sources: Vec<DefinitionSource>,
@@ -93,13 +92,13 @@ struct CachedDefinition {
     text: usize,
 }
 
-/// Why there is no definition that can be used.
+/// Why no usable definition was found.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum NotFound {
-    /// The name is none.
-    #[error("`{0}` is no type's name: it has to look like std_msgs/msg/String")]
+    /// The name is not a type's name.
+    #[error("`{0}` is not a type name such as std_msgs/msg/String")]
     NotATypeName(String),
-    /// No place has it, or has all that it is made of.
+    /// No source has the type, or a nested type is missing.
     #[error(
         "no definition of {missing}{} here: install the package {}, or name a directory that has \
          {}/{}/{}.{} with --definitions",
@@ -108,55 +107,55 @@ pub enum NotFound {
         missing.kind().as_str()
     )]
     Nowhere {
-        /// What is missing.
+        /// The missing type.
         missing: TypeName,
-        /// What was asked for.
+        /// The requested type.
         root: TypeName,
     },
-    /// Definitions, but none that the nodes use.
+    /// Definitions exist, but none matches the announced hash.
     #[error(
-        "the definition of {name} {location} is another one than the nodes use: its hash is {found}, \
+        "the definition of {name} {location} differs from the nodes': its hash is {found}, \
          theirs {announced}; install their version of {}, or name a directory that has it with \
          --definitions",
         name.package()
     )]
     Another {
-        /// The type.
+        /// Name of the type.
         name: TypeName,
-        /// Where the first one found is from.
+        /// Source of the first definition found.
         location: String,
-        /// Its hash.
+        /// Hash of that definition.
         found: String,
-        /// The hash that discovery announces.
+        /// Hash announced by discovery.
         announced: String,
     },
-    /// A file has a definition that is none.
+    /// A file contains an invalid definition.
     #[error("{}: {mistake}", path.display())]
     Mistake {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The mistake in the file.
         mistake: ParseError,
     },
     /// A file cannot be read.
     #[error("cannot read {}", path.display())]
     Unreadable {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: Arc<io::Error>,
     },
     /// The type is recursive or too large.
     #[error("{root} cannot be used: {reason}")]
     Refused {
-        /// What was asked for.
+        /// The requested type.
         root: TypeName,
-        /// Why it is refused.
+        /// Why it is rejected.
         reason: NotClosed,
     },
 }
 
-/// ` (in X)`, where it is not asked for itself.
+/// Returns ` (in X)` unless the missing type is the requested one.
 fn of(missing: &TypeName, root: &TypeName) -> String {
     if missing == root {
         String::new()
@@ -165,13 +164,13 @@ fn of(missing: &TypeName, root: &TypeName) -> String {
     }
 }
 
-/// What the file is called that defines a type.
+/// Returns the name of the file that defines a type.
 fn file_name(name: &TypeName) -> String {
     name.files().last().unwrap_or(name).name().to_owned()
 }
 
 impl Library {
-    /// Looks at these places from now on.
+    /// Creates a library over these sources.
     pub fn new(sources: Sources) -> Self {
         let Sources {
             directories,
@@ -199,8 +198,8 @@ impl Library {
         }
     }
 
-    /// The type of a name. With an announced hash the first place's that agrees with it, otherwise
-    /// the first place's. A hash of a version that is not known is as good as none.
+    /// Returns the type of a name: with an announced hash, the first definition that matches it;
+    /// otherwise the first definition. A hash of an unknown version is ignored.
     pub fn find(
         &self,
         name: &str,
@@ -252,7 +251,7 @@ mod tests {
     use super::super::parse::MAX_TEXT;
     use super::*;
 
-    /// An installed ROS with these files: `a/msg/B.msg` and its text.
+    /// An installed ROS with these files: path `a/msg/B.msg` and text.
     fn prefix(files: &[(&str, &str)]) -> TempDir {
         let directory = tempfile::tempdir().unwrap();
         for (name, text) in files {
@@ -292,7 +291,7 @@ mod tests {
                 *hash
             );
         }
-        // A version of hashes that is not known tells nothing.
+        // A hash of an unknown version is ignored.
         let found = library.find("a/msg/B", Some("RIHS02_00")).unwrap();
         assert_eq!(found.type_hash(), old_hash);
     }
@@ -334,7 +333,7 @@ mod tests {
         let library = library(&[&workspace, &below, &nodes]);
         let found = library.find("w/msg/W", Some(&announced)).unwrap();
         assert_eq!(found.type_hash(), announced);
-        // The rest is embedded.
+        // The other types are embedded.
         assert!(
             found
                 .structures()
@@ -386,7 +385,7 @@ mod tests {
                  \n{line}\nMSG: std_msgs/String\nstring data\n"
             )
         );
-        // What stands in no file is written so that it can be read again.
+        // A type without a file is printed so that it can be parsed again.
         let feedback = library.find("a/action/A_FeedbackMessage", None).unwrap();
         let text = feedback.schema_text().1;
         assert!(text.starts_with("unique_identifier_msgs/UUID goal_id\na/A_Feedback feedback\n"));
@@ -413,7 +412,7 @@ mod tests {
         );
         assert!(message("x/action/Y_SendGoal_Request").contains("x/action/Y.action"));
         assert!(message("x/srv/Y_Event").contains("x/srv/Y.srv"));
-        assert!(message("../etc/passwd").contains("no type's name"));
+        assert!(message("../etc/passwd").contains("not a type name"));
     }
 
     #[test]
@@ -423,9 +422,9 @@ mod tests {
         let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();
         assert_eq!(
             failure.to_string(),
-            format!("{}: line 2: `int9` is no type", path.display())
+            format!("{}: line 2: `int9` is not a type", path.display())
         );
-        // With a hash whatever place agrees is good.
+        // With a hash, any source that matches is used.
         let good = prefix(&[("a/msg/B.msg", "int8 x")]);
         let announced = hash("a/msg/B", &[&good]);
         library(&[&here, &good])
@@ -496,7 +495,7 @@ mod tests {
 
     #[test]
     fn hostile_trees_end_with_a_reason() {
-        // Each type of two places names two of the next: a tree of 2^40 paths, and every place has
+        // Each type of two sources names two of the next: a tree of 2^40 paths, and each source has
         // another variant.
         let make = |extra: &str| {
             let file = |index| {

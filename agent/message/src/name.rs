@@ -1,15 +1,15 @@
-//! Types' names: `sensor_msgs/msg/Imu`.
+//! Names of types: `sensor_msgs/msg/Imu`.
 //!
-//! Their parts are identifiers, so they can be names of files and stand in any text.
+//! Their parts are identifiers, so they are valid file names and safe in any text.
 
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
 
-/// How long a package's or a type's name may be: both are names of files.
+/// Longest name of a package or type: both are file names.
 const MAX_NAME: usize = 200;
 
-/// What kind of file a type is defined in.
+/// Kind of file that defines a type.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Kind {
     /// An `.action` file.
@@ -21,7 +21,7 @@ pub enum Kind {
 }
 
 impl Kind {
-    /// As it stands in a type's name; also the file's extension and its directory.
+    /// Returns the kind as in a type's name, which is also the file's extension and directory.
     pub fn as_str(self) -> &'static str {
         match self {
             Self::Action => "action",
@@ -31,7 +31,7 @@ impl Kind {
     }
 }
 
-/// A type's full name: `sensor_msgs/msg/Imu`. Ordered as its text is.
+/// Full name of a type: `sensor_msgs/msg/Imu`. Ordered like its text.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TypeName {
     package: Arc<str>,
@@ -39,13 +39,13 @@ pub struct TypeName {
     name: Arc<str>,
 }
 
-/// Why a text is no type's name.
+/// The text is not a type's name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-#[error("not a type's name: it has to look like std_msgs/msg/String")]
+#[error("not a type name such as std_msgs/msg/String")]
 pub struct NotATypeName;
 
 impl TypeName {
-    /// From its parts, which have to be identifiers.
+    /// Combines the parts, which must be identifiers.
     pub fn new(package: &str, kind: Kind, name: &str) -> Result<Self, NotATypeName> {
         if !is_identifier(package) || !is_identifier(name) {
             return Err(NotATypeName);
@@ -57,7 +57,7 @@ impl TypeName {
         })
     }
 
-    /// A message that this program itself names.
+    /// Creates the name of a message that this program refers to.
     pub(super) fn message(package: &'static str, name: &'static str) -> Self {
         Self {
             package: package.into(),
@@ -66,22 +66,22 @@ impl TypeName {
         }
     }
 
-    /// `sensor_msgs`.
+    /// Returns the package, such as `sensor_msgs`.
     pub fn package(&self) -> &str {
         &self.package
     }
 
-    /// What kind of file it is defined in.
+    /// Returns the kind of file that defines it.
     pub fn kind(&self) -> Kind {
         self.kind
     }
 
-    /// `Imu`.
+    /// Returns the name without the package, such as `Imu`.
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Another type of the same file: this one's name and an ending.
+    /// Returns another type of the same file: this name with a suffix.
     pub(super) fn with_suffix(&self, suffix: &str) -> Self {
         Self {
             package: self.package.clone(),
@@ -90,8 +90,8 @@ impl TypeName {
         }
     }
 
-    /// The types whose file may define this one: its own, and those whose name with one of the
-    /// endings that services and actions have gives this name.
+    /// Returns the files that may define this type: its own, and those of services and actions
+    /// whose name with an implied suffix gives this name.
     pub(super) fn files(&self) -> Vec<Self> {
         const SERVICE: [&str; 3] = ["_Request", "_Response", "_Event"];
         const ACTION: [&str; 12] = [
@@ -161,7 +161,7 @@ impl fmt::Display for TypeName {
     }
 }
 
-/// Whether a name of a package, type or field can be this.
+/// Returns whether the text is a valid name of a package, type or field.
 pub(super) fn is_identifier(text: &str) -> bool {
     text.len() <= MAX_NAME
         && text.starts_with(|first: char| first.is_ascii_alphabetic())

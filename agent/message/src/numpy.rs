@@ -1,6 +1,6 @@
 //! One-dimensional arrays as numpy prints them: columns of one width, wrapped at 75 characters.
 //!
-//! Of numpy's rules only those for numbers in one dimension are here, with its default options.
+//! Implements numpy's rules for numbers in one dimension only, with the default options.
 
 use super::digits;
 use super::python;
@@ -11,13 +11,13 @@ const PRECISION: usize = 8;
 const THRESHOLD: usize = 1000;
 const EDGE: usize = 3;
 const WIDTH: usize = 75;
-/// From here on, and below [`SMALL`], all numbers are written with an exponent.
+/// From this magnitude on, and below [`SMALL`], all numbers are written with an exponent.
 const LARGE: f64 = 1e8;
 const SMALL: f64 = 1e-4;
-/// So they are where the largest is more than so many times the smallest.
+/// The same applies if the largest number is more than this many times the smallest.
 const SPREAD: f64 = 1000.0;
 
-/// `str()` of an array: `[0.   0.25 1.  ]`.
+/// Returns `str()` of an array: `[0.   0.25 1.  ]`.
 pub fn str(scalars: Scalars<'_>) -> String {
     Layout {
         separator: " ",
@@ -27,7 +27,7 @@ pub fn str(scalars: Scalars<'_>) -> String {
     .lines(scalars)
 }
 
-/// `repr()` of an array: `array([1, 2], dtype=uint8)`.
+/// Returns `repr()` of an array: `array([1, 2], dtype=uint8)`.
 pub fn repr(scalars: Scalars<'_>) -> String {
     const PREFIX: &str = "array(";
     let dtype = match scalars.kind() {
@@ -106,7 +106,7 @@ impl Layout {
     }
 }
 
-/// All numbers in one width.
+/// Formats all numbers in one width.
 fn columns(scalars: &[Scalar]) -> Vec<String> {
     let floats = |scalar: &Scalar| match scalar {
         Scalar::Float32(number) => Some(Float::Single(*number)),
@@ -139,7 +139,7 @@ impl Float {
         }
     }
 
-    /// Shortest digits, at most as many behind the point as the precision: whole and fraction.
+    /// Returns the shortest digits, at most the precision behind the point, as whole and fraction.
     fn positional(self) -> (String, String) {
         let (short, exact) = match self {
             Self::Single(number) => (digits::positional(number), format!("{number:.PRECISION$}")),
@@ -148,7 +148,8 @@ impl Float {
         split(&short, &exact)
     }
 
-    /// With an exponent and so many digits behind the point, those beyond the shortest included.
+    /// Returns digits with an exponent and this many digits behind the point, including those
+    /// beyond the shortest.
     fn exact(self, precision: usize) -> (String, i32) {
         let text = match self {
             Self::Single(number) => format!("{number:.precision$e}"),
@@ -159,7 +160,7 @@ impl Float {
         (format!("{mantissa}{point}"), exponent.parse().unwrap_or(0))
     }
 
-    /// Shortest digits with an exponent: whole, fraction, exponent.
+    /// Returns the shortest digits with an exponent, as whole, fraction and exponent.
     fn scientific(self) -> (String, String, i32) {
         let (short, exact) = match self {
             Self::Single(number) => (digits::scientific(number), format!("{number:.PRECISION$e}")),
@@ -221,7 +222,7 @@ fn float_columns(floats: &[Float]) -> Vec<String> {
         left = width(&mut parts.iter().map(|(whole, _)| whole.len()));
         right = width(&mut parts.iter().map(|(_, fraction)| fraction.len()));
     }
-    // What stands right of the whole part; `nan` and `inf` may need more room than numbers.
+    // Characters right of the whole part; `nan` and `inf` may need more room than numbers.
     let behind = if scientific {
         right + exponents + 3
     } else {

@@ -1,78 +1,78 @@
-//! Reads `.msg`, `.srv` and `.action` files as `rosidl_adapter` reads them.
+//! Parses `.msg`, `.srv` and `.action` files as `rosidl_adapter` does.
 //!
-//! Constants and defaults are passed over, not interpreted. Where rosidl is strict only about style
-//! (capital letters in a field's name, spaces before it), this is not; what it cannot represent on
-//! the wire is refused.
+//! Constants and defaults are skipped, not interpreted. Style rules of rosidl (no capital letters
+//! in a field's name, no spaces before it) are not enforced; anything without a wire format is
+//! rejected.
 
 use std::collections::BTreeSet;
 
 use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
 use super::name::is_identifier;
 
-/// The longest file that is read: the longest in use have 30 kB.
+/// Longest file accepted, in bytes: the longest in use has 30 kB.
 pub(super) const MAX_TEXT: usize = 1 << 18;
-/// How many members a type may have.
+/// Most fields per type.
 pub(super) const MAX_FIELDS: usize = 4096;
-/// Between a service's request and response, and the parts of an action.
+/// Separates a service's request and response, and the parts of an action.
 pub(super) const SEPARATOR: &str = "---";
 
-/// Why a definition cannot be read, and where.
+/// Why a definition cannot be parsed, and where.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("line {line}: {problem}")]
 pub struct ParseError {
-    /// The line, counted from 1.
+    /// Line number, counted from 1.
     pub line: usize,
-    /// What is wrong with it.
+    /// Mistake in that line.
     pub problem: Problem,
 }
 
-/// What is wrong with a definition.
+/// A mistake in a definition.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum Problem {
-    /// The file is too long to be a definition.
+    /// The file is too long for a definition.
     #[error("longer than {MAX_TEXT} bytes")]
     TooLong,
-    /// It is not text.
+    /// The file is not text.
     #[error("not UTF-8")]
     NotText,
-    /// A type alone.
-    #[error("a type without a name behind it")]
+    /// A type without a field name.
+    #[error("a type is not followed by a name")]
     NoName,
-    /// A field's or a constant's name is none.
-    #[error("`{0}` is no name")]
+    /// The name of a field or constant is invalid.
+    #[error("`{0}` is not a valid name")]
     Name(String),
-    /// The same field twice.
-    #[error("`{0}` is there twice")]
+    /// A field is declared twice.
+    #[error("`{0}` is declared twice")]
     Twice(String),
     /// Neither a basic type nor the name of a message.
-    #[error("`{0}` is no type")]
+    #[error("`{0}` is not a type")]
     Type(String),
-    /// The bound of a string or an array.
-    #[error("`{0}` is no size from 1 to 4294967295")]
+    /// The bound of a string or an array is invalid.
+    #[error("`{0}` is not a size from 1 to 4294967295")]
     Size(String),
-    /// A constant of a type that has no constants, or without a value.
-    #[error("no constant can be like this")]
+    /// A constant of a type that cannot be constant, or without a value.
+    #[error("invalid constant: its type or value is not allowed")]
     Constant,
-    /// An annotation that changes what is on the wire.
+    /// An annotation that changes the wire format.
     #[error("`{0}` is not supported")]
     Unsupported(String),
-    /// A word or sign that has to be there.
+    /// An expected word or sign is missing.
     #[error("`{0}` is missing")]
     Missing(String),
-    /// Too many members.
+    /// Too many fields.
     #[error("more than {MAX_FIELDS} fields")]
     TooMany,
-    /// Not as many `---` as the kind of file has.
-    #[error("{expected} lines `---` expected, found {found}")]
+    /// The number of `---` lines does not match the kind of file.
+    #[error("expected {expected} `---` lines, found {found}")]
     Separators {
-        /// How many there should be.
+        /// Required number.
         expected: usize,
-        /// How many there are.
+        /// Number in the file.
         found: usize,
     },
 }
 
-/// The types that a file spells out: one for a message, two for a service, three for an action.
+/// Returns the types in a file: one for a message, two for a service, three for an action.
 pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseError> {
     if text.len() > MAX_TEXT {
         return Err(ParseError {
@@ -118,7 +118,7 @@ pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseE
     Ok(structures)
 }
 
-/// How the names of the types that a file spells out end.
+/// Returns the name suffixes of the types in a file.
 pub(super) fn parts(kind: Kind) -> &'static [&'static str] {
     match kind {
         Kind::Message => &[""],
@@ -127,7 +127,7 @@ pub(super) fn parts(kind: Kind) -> &'static [&'static str] {
     }
 }
 
-/// The members of the part that is being read.
+/// The fields of the current part.
 struct Members {
     structure: Structure,
     names: BTreeSet<String>,
@@ -182,8 +182,8 @@ impl Members {
     }
 }
 
-/// The line behind its annotations, if there is anything. `@key` says nothing about the encoding
-/// that ROS uses, any other may.
+/// Returns the line behind its annotations, if it is not empty. `@key` does not change ROS's
+/// encoding; any other annotation may.
 fn without_annotations(mut line: &str) -> Result<Option<&str>, Problem> {
     while line.starts_with('@') {
         let (annotation, rest) = line.split_once(char::is_whitespace).unwrap_or((line, ""));
@@ -199,7 +199,7 @@ fn check_constant(type_text: &str, name: &str, value: &str) -> Result<(), Proble
     if !is_identifier(name) {
         return Err(Problem::Name(shortened(name)));
     }
-    // A string's value may be empty where nothing but a comment is behind the sign.
+    // A string's value may be empty, or followed by a comment only.
     match basic(type_text)? {
         Some(Element::String { .. } | Element::WString { .. }) => Ok(()),
         Some(_) if !value.is_empty() => Ok(()),
@@ -207,7 +207,7 @@ fn check_constant(type_text: &str, name: &str, value: &str) -> Result<(), Proble
     }
 }
 
-/// `string<=5[<=3]`: an element, and behind it how many.
+/// Parses `string<=5[<=3]`: an element type, and behind it the number of elements.
 fn field_type(package: &str, text: &str) -> Result<(Element, Shape), Problem> {
     let no_type = || Problem::Type(shortened(text));
     let (element, shape) = match text.strip_suffix(']') {
@@ -233,7 +233,7 @@ fn field_type(package: &str, text: &str) -> Result<(Element, Shape), Problem> {
     Ok((Element::Nested(nested), shape))
 }
 
-/// One of the types that are not defined in a file.
+/// Parses a type that needs no file.
 fn basic(text: &str) -> Result<Option<Element>, Problem> {
     let (name, bound) = match text.split_once("<=") {
         Some((name, bound)) => (name, Some(size(bound)?)),
@@ -269,7 +269,7 @@ fn size(text: &str) -> Result<u32, Problem> {
     number.ok_or_else(|| Problem::Size(shortened(text)))
 }
 
-/// As much of a text as an error shows.
+/// Returns the text shortened for an error.
 pub(super) fn shortened(text: &str) -> String {
     text.chars().take(60).collect()
 }
@@ -344,30 +344,51 @@ mod tests {
             error.to_string()
         };
         for (text, expected) in [
-            ("int8", "line 3: a type without a name behind it"),
-            ("int8 9x", "line 3: `9x` is no name"),
-            ("int8 a-b", "line 3: `a-b` is no name"),
-            ("int8 ok", "line 3: `ok` is there twice"),
-            ("time x", "line 3: `time` is no type"),
-            ("a/b/C x", "line 3: `a/b/C` is no type"),
-            ("../C x", "line 3: `../C` is no type"),
-            ("int8] x", "line 3: `int8]` is no type"),
-            ("int8<=5 x", "line 3: `int8<=5` is no type"),
-            ("int8[][] x", "line 3: `int8[][]` is no type"),
-            ("int8[0] x", "line 3: `0` is no size from 1 to 4294967295"),
+            ("int8", "line 3: a type is not followed by a name"),
+            ("int8 9x", "line 3: `9x` is not a valid name"),
+            ("int8 a-b", "line 3: `a-b` is not a valid name"),
+            ("int8 ok", "line 3: `ok` is declared twice"),
+            ("time x", "line 3: `time` is not a type"),
+            ("a/b/C x", "line 3: `a/b/C` is not a type"),
+            ("../C x", "line 3: `../C` is not a type"),
+            ("int8] x", "line 3: `int8]` is not a type"),
+            ("int8<=5 x", "line 3: `int8<=5` is not a type"),
+            ("int8[][] x", "line 3: `int8[][]` is not a type"),
+            (
+                "int8[0] x",
+                "line 3: `0` is not a size from 1 to 4294967295",
+            ),
             (
                 "int8[4294967296] x",
-                "line 3: `4294967296` is no size from 1 to 4294967295",
+                "line 3: `4294967296` is not a size from 1 to 4294967295",
             ),
-            ("int8[+1] x", "line 3: `+1` is no size from 1 to 4294967295"),
-            ("int8[<=] x", "line 3: `` is no size from 1 to 4294967295"),
-            ("string<= x", "line 3: `` is no size from 1 to 4294967295"),
-            ("Point P=1", "line 3: no constant can be like this"),
-            ("int8 P=", "line 3: no constant can be like this"),
-            ("int8[2] P=1", "line 3: no constant can be like this"),
-            ("int8 =1", "line 3: `` is no name"),
+            (
+                "int8[+1] x",
+                "line 3: `+1` is not a size from 1 to 4294967295",
+            ),
+            (
+                "int8[<=] x",
+                "line 3: `` is not a size from 1 to 4294967295",
+            ),
+            (
+                "string<= x",
+                "line 3: `` is not a size from 1 to 4294967295",
+            ),
+            (
+                "Point P=1",
+                "line 3: invalid constant: its type or value is not allowed",
+            ),
+            (
+                "int8 P=",
+                "line 3: invalid constant: its type or value is not allowed",
+            ),
+            (
+                "int8[2] P=1",
+                "line 3: invalid constant: its type or value is not allowed",
+            ),
+            ("int8 =1", "line 3: `` is not a valid name"),
             ("@optional int8 x", "line 3: `@optional` is not supported"),
-            ("---", "line 3: a type without a name behind it"),
+            ("---", "line 3: a type is not followed by a name"),
         ] {
             assert_eq!(problem(text), expected, "{text}");
         }
@@ -378,7 +399,7 @@ mod tests {
         let service = file(&name("a/srv/A"), "int8 x\n---   \n---").unwrap_err();
         assert_eq!(
             service.to_string(),
-            "line 3: 1 lines `---` expected, found 2"
+            "line 3: expected 1 `---` lines, found 2"
         );
         let parts = file(&name("a/srv/A"), "int8 x\r\n---\r\nB y\r\n").unwrap();
         assert_eq!(parts.len(), 2);
@@ -389,7 +410,7 @@ mod tests {
             .collect();
         assert_eq!(counts, [("A_Goal", 0), ("A_Result", 0), ("A_Feedback", 1)]);
         let empty = file(&name("a/action/A"), "").unwrap_err();
-        assert_eq!(empty.to_string(), "line 1: 2 lines `---` expected, found 0");
+        assert_eq!(empty.to_string(), "line 1: expected 2 `---` lines, found 0");
     }
 
     #[test]

@@ -1,7 +1,7 @@
-//! Values as Python writes them: what `print()` makes of a field, and numbers in all outputs.
+//! Values as Python prints them: `print()` of a field, and numbers in all outputs.
 //!
 //! ROS keeps arrays of a fixed length in numpy arrays, sequences of numbers in `array.array` and
-//! everything else in lists; each of them prints in its own way.
+//! everything else in lists; each has its own format.
 
 use std::fmt::{LowerExp, Write as _};
 use std::str::FromStr;
@@ -10,7 +10,7 @@ use super::digits;
 use super::numpy;
 use super::value::{Array, Items, Message, Scalar, ScalarKind, Value};
 
-/// `str()` of a value: what `--field` prints where it selects no message.
+/// Returns `str()` of a value: the output of `--field` unless it selects a message.
 pub fn str(value: &Value<'_>) -> String {
     match value {
         Value::Text(text) => text.clone().into_owned(),
@@ -22,24 +22,24 @@ pub fn str(value: &Value<'_>) -> String {
     }
 }
 
-/// `repr()` of a value.
+/// Returns `repr()` of a value.
 pub fn repr(value: &Value<'_>) -> String {
     let mut text = String::new();
     write_repr(&mut text, value);
     text
 }
 
-/// `repr()` of a float.
+/// Returns `repr()` of a float.
 pub fn float(value: f64) -> String {
     laid_out(value)
 }
 
-/// `str()` of a numpy `float32`: the digits that it takes to tell it from its neighbours.
+/// Returns `str()` of a numpy `float32`: the digits that distinguish it from its neighbours.
 pub fn float32(value: f32) -> String {
     laid_out(value)
 }
 
-/// `str()` of a scalar.
+/// Returns `str()` of a scalar.
 pub fn scalar(value: Scalar) -> String {
     match value {
         Scalar::Bool(true) => "True".to_owned(),
@@ -52,7 +52,7 @@ pub fn scalar(value: Scalar) -> String {
     }
 }
 
-/// `repr()` of bytes.
+/// Returns `repr()` of bytes.
 pub fn bytes(bytes: &[u8]) -> String {
     let quote = quote(bytes.contains(&b'\''), bytes.contains(&b'"'));
     let mut text = String::with_capacity(bytes.len() * 4 + 3);
@@ -76,7 +76,7 @@ pub fn bytes(bytes: &[u8]) -> String {
     text
 }
 
-/// `repr()` of a string.
+/// Returns `repr()` of a string.
 pub fn string(value: &str) -> String {
     let quote = quote(value.contains('\''), value.contains('"'));
     let mut text = String::with_capacity(value.len() + 2);
@@ -102,7 +102,7 @@ pub fn string(value: &str) -> String {
     text
 }
 
-/// What Python calls the type of a value, for messages about attributes that it has not.
+/// Returns Python's name of a value's type, for errors about missing attributes.
 pub fn type_name<'a>(value: &Value<'a>) -> &'a str {
     match value {
         Value::Scalar(Scalar::Bool(_)) => "bool",
@@ -117,7 +117,7 @@ pub fn type_name<'a>(value: &Value<'a>) -> &'a str {
     }
 }
 
-/// Whether it is kept in an `array.array` or a numpy array: truth values and octets are not.
+/// Returns whether it is kept in an `array.array` or a numpy array: booleans and octets are not.
 fn is_numeric(array: &Array<'_>) -> bool {
     match &array.items {
         Items::Scalars(scalars) => !matches!(scalars.kind(), ScalarKind::Bool | ScalarKind::Byte),
@@ -129,17 +129,19 @@ fn quote(single: bool, double: bool) -> char {
     if single && !double { '"' } else { '\'' }
 }
 
-/// As `str.isprintable()`, by the same categories of Unicode in a newer version than Humble's Python.
+/// Implements `str.isprintable()`, by the same Unicode categories in a newer version than Humble's
+/// Python.
 fn is_printable(character: char) -> bool {
     if character.is_ascii() {
         return !character.is_control();
     }
-    // Behind another character Rust escapes combining ones only where they are not printable.
+    // Behind another character Rust escapes combining ones only if they are not printable.
     let text: String = ['a', character].iter().collect();
     text.escape_debug().count() == 2
 }
 
-/// Below 1e-4 and from 1e16 on with an exponent, which has a sign and at least two digits.
+/// Formats with an exponent below 1e-4 and from 1e16 on; the exponent has a sign and at least two
+/// digits.
 fn laid_out<T: LowerExp + FromStr + PartialEq + Copy>(value: T) -> String {
     let text = digits::scientific(value);
     let Some((mantissa, exponent)) = text.split_once('e') else {
@@ -201,7 +203,7 @@ fn write_list<T>(
     text.push(']');
 }
 
-/// As `rosidl_generator_py` has messages print themselves: a sequence of numbers as a list.
+/// Prints a message as `rosidl_generator_py` does: a sequence of numbers as a list.
 fn write_message(text: &mut String, message: &Message<'_>) {
     let name = &message.structure.name;
     let _ = write!(
@@ -231,7 +233,7 @@ fn write_message(text: &mut String, message: &Message<'_>) {
     text.push(')');
 }
 
-/// The type code of the `array` module.
+/// Returns the type code of the `array` module.
 fn type_code(kind: ScalarKind) -> char {
     match kind {
         ScalarKind::Int8 => 'b',

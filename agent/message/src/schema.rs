@@ -1,7 +1,7 @@
-//! A type's definition as one text, the way bags carry it (encoding `ros2msg` of MCAP's registry).
+//! A type's definition as one text, in the form of bags (encoding `ros2msg` of MCAP's registry).
 //!
-//! In the order in which `rosbag2_cpp` writes it: the type's own text, then below a line of `=`
-//! each message it needs, once, sorted within a file and each followed by its own.
+//! Uses the order of `rosbag2_cpp`: the type's own text, then each nested message once, below a
+//! line of `=`, sorted within a file and each followed by its own nested messages.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -16,9 +16,9 @@ const LINE: &str =
 const ENCODING: &str = "ros2msg";
 
 impl MessageType {
-    /// Encoding and text for a bag's schema: the files as they were read. Of a service's event it is
-    /// the service's file below a heading, as `rosbag2` has it. The other types that services and
-    /// actions imply stand in no file: their text is made from their members.
+    /// Returns encoding and text for a bag's schema: the files as they were read. A service's event
+    /// has the service's file below a heading, as in `rosbag2`. Other types implied by services and
+    /// actions have no file: their text is generated from their fields.
     pub fn schema_text(&self) -> (&'static str, String) {
         let mut text = String::new();
         let mut written = BTreeSet::new();
@@ -43,7 +43,8 @@ impl MessageType {
             .map(AsRef::as_ref)
     }
 
-    /// A file and what it uses. As deep as types are nested, which is bounded.
+    /// Appends a file and the types that it uses. Recurses as deep as types are nested, which is
+    /// bounded.
     fn append_file<'a>(
         &'a self,
         text: &mut String,
@@ -62,7 +63,7 @@ impl MessageType {
         }
     }
 
-    /// A type that stands in no file, and what it uses.
+    /// Appends a type without a file, and the types that it uses.
     fn append_structure<'a>(
         &'a self,
         text: &mut String,
@@ -94,7 +95,7 @@ impl MessageType {
     }
 }
 
-/// `package/Type`: as it is written in a `.msg` file.
+/// Returns `package/Type`, the form used in a `.msg` file.
 fn short(name: &TypeName) -> String {
     format!("{}/{}", name.package(), name.name())
 }
@@ -103,7 +104,7 @@ fn heading(text: &mut String, kind: &str, name: &str) {
     let _ = writeln!(text, "{LINE}\n{kind}: {name}");
 }
 
-/// The lines of a `.msg` file that has these members.
+/// Returns the lines of a `.msg` file with these fields.
 pub(super) fn members(structure: &Structure) -> String {
     let mut text = String::new();
     for field in &structure.fields {
@@ -138,7 +139,7 @@ pub(super) fn members(structure: &Structure) -> String {
     text
 }
 
-/// The definitions in a schema's text, each with the type that it is of.
+/// Returns the definitions in a schema's text, each with the type that it defines.
 pub(super) fn parts<'a>(
     root: &TypeName,
     text: &'a str,
@@ -164,7 +165,7 @@ pub(super) fn parts<'a>(
     Ok(parts)
 }
 
-/// `package/Type`, or `package/msg/Type` as some writers have it.
+/// Parses `package/Type`, or `package/msg/Type` as some writers have it.
 fn message(text: &str) -> Option<TypeName> {
     if let Ok(name) = text.parse() {
         return Some(name);
@@ -215,7 +216,7 @@ uint32 nanosec
     fn a_schema_is_written_as_it_was_read() {
         let root = "geometry_msgs/msg/PointStamped".parse().unwrap();
         let parsed = MessageType::parse(&root, STAMPED).unwrap();
-        // What is between two definitions ends with an empty line that belongs to the separator.
+        // The text between two definitions ends with an empty line that belongs to the separator.
         let tight = STAMPED.replace("\n\n====", "\n====");
         let again = MessageType::parse(&root, &tight).unwrap();
         assert_eq!(again.schema_text(), (ENCODING, STAMPED.to_owned()));
@@ -235,12 +236,12 @@ uint32 nanosec
         }
     }
 
-    /// What a real bag has: its files, one after the other, with their comments.
+    /// Returns the files in a real bag, one after the other, with their comments.
     fn real() -> Vec<(String, String)> {
         let bag =
             "../../../shared/fixtures/cyclonedds/bag-record-2ns/bag_default/bag_default_0.mcap.gz";
         let bag = Path::new(env!("CARGO_MANIFEST_DIR")).join(bag);
-        // Not in a clone.
+        // The bag is not part of the repository.
         let Ok(file) = File::open(bag) else {
             return Vec::new();
         };
@@ -292,7 +293,7 @@ uint32 nanosec
             let text = members(&structure);
             let read = Definition::parse(structure.name.clone(), &text).unwrap();
             prop_assert_eq!(&*read.structures[0], &structure);
-            // The same as a part of another.
+            // The same as a nested type.
             let root = "a/msg/Root".parse().unwrap();
             let text = format!("B b\n{}{LINE}\nMSG: a/B\n{}", members(&more), members(&structure));
             if let Ok(read) = MessageType::parse(&root, &text) {
@@ -319,7 +320,7 @@ uint32 nanosec
         }
     }
 
-    /// What definitions are made of, in any order.
+    /// Tokens of definitions, combined in any order.
     const WORDS: &[&str] = &[
         "\n",
         "\n",

@@ -1,6 +1,6 @@
-//! One search for one type: which places have its parts, and which of them belong together.
+//! One search for one type: finds the sources of its parts, and the combination that matches.
 //!
-//! Bounded in what it asks the file system, reads and tries, whatever the places hold.
+//! File system queries, bytes read and attempts are bounded, whatever the sources contain.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
@@ -9,24 +9,24 @@ use super::definition::{Definition, MessageType, NotClosed, TypeName};
 use super::definition_source::DefinitionSource;
 use super::library::{MAX_SOURCES, NotFound};
 
-/// How often a type is put together at most until it has the announced hash.
+/// Most attempts to assemble a type with the announced hash.
 const MAX_TRIES: usize = 256;
-/// How many times one search asks the file system whether a file is there.
+/// Most file system queries of one search.
 const MAX_ASKED: usize = 1 << 18;
-/// How much text a search holds.
+/// Most bytes of text held by a search.
 const MAX_HELD: usize = 16 << 20;
 
-/// What a file holds, if it is still there.
+/// Content of a file, if it still exists.
 type Read = Result<Option<Arc<Definition>>, NotFound>;
 
 /// One search for one type.
 pub(super) struct Search<'a> {
     sources: &'a [DefinitionSource],
     root: &'a TypeName,
-    /// Which places have a file, and how often they were asked.
+    /// The sources of each file, and the number of queries.
     having: HashMap<TypeName, Vec<usize>>,
     asked: usize,
-    /// What was read, by place and file, and how much text that is.
+    /// Files read, by source and name, and their total length.
     read: HashMap<(usize, TypeName), Read>,
     held: usize,
 }
@@ -44,9 +44,9 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// The first type that can be put together, or that agrees with the hash. Usually all parts are
-    /// of one place and those behind it; a workspace that lies over another ROS than the nodes'
-    /// needs the type from the one and the rest from the other.
+    /// Returns the first type that can be assembled, or that matches the hash. Usually all parts
+    /// are from one source and those after it. A workspace over another ROS than the nodes' may
+    /// need the type from one source and the rest from another.
     pub(super) fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
         let mut firsts = BTreeSet::new();
         for file in self.root.files() {
@@ -56,7 +56,7 @@ impl<'a> Search<'a> {
             let Some(first) = firsts.first() else {
                 return Err(self.nowhere(self.root.clone()));
             };
-            // Nothing says that what comes later is right: it is not guessed.
+            // Without a hash, later sources are no better: do not guess.
             return self.assemble(*first, *first);
         };
         let mut tries: Vec<_> = firsts.iter().map(|first| (*first, *first)).collect();
@@ -107,8 +107,8 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// The type with each part from `first` if it is there, then `second` and what is behind it, at
-    /// last from what is before it.
+    /// Assembles the type, taking each part from `first`, else from `second` and the sources after
+    /// it, else from those before it.
     fn assemble(&mut self, first: usize, second: usize) -> Result<MessageType, NotFound> {
         let root = self.root.clone();
         let rank = |source: usize| match source {
@@ -133,7 +133,7 @@ impl<'a> Search<'a> {
         })
     }
 
-    /// The places that have a file, readable or not.
+    /// Returns the sources that have a file, readable or not.
     fn sources_of(&mut self, file: &TypeName) -> Result<Vec<usize>, NotFound> {
         if let Some(known) = self.having.get(file) {
             return Ok(known.clone());
@@ -175,9 +175,9 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Why parts could not be put together.
+/// Why parts could not be assembled.
 enum Failure {
-    /// What was found of one.
+    /// A part's own error.
     Known(NotFound),
     NotClosed(NotClosed),
 }

@@ -1,28 +1,28 @@
-//! How much of a message is shown: the options that all outputs of `echo` share, and the words that
-//! stand for what is left out (`rosidl_runtime_py`'s).
+//! Truncation of messages: the options shared by all outputs of `echo`, and the text in place of
+//! omitted values (`rosidl_runtime_py`'s).
 
 use super::definition::{Element, Shape};
 use super::value::Array;
 
-/// What is shown of arrays and strings.
+/// Limits of the printed arrays and strings.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Truncation {
-    /// Elements and characters at most, `...` standing for the others.
+    /// Most elements and characters; `...` replaces the others.
     pub truncate: Option<usize>,
-    /// Arrays only by type and length.
+    /// Print arrays only by type and length.
     pub no_arrays: bool,
-    /// Strings only by length.
+    /// Print strings only by length.
     pub no_strings: bool,
 }
 
 impl Truncation {
-    /// A string, as far as it is shown.
+    /// Returns a string within the limits; `None` if it is unchanged.
     pub fn text(&self, text: &str) -> Option<String> {
         if self.no_strings {
             return Some(format!("<string length: <{}>>", text.chars().count()));
         }
         let limit = self.truncate?;
-        // No character has more bytes than it is characters.
+        // A string has no more characters than bytes.
         if text.len() <= limit {
             return None;
         }
@@ -30,7 +30,7 @@ impl Truncation {
         Some(format!("{}...", text.get(..end).unwrap_or_default()))
     }
 
-    /// How many elements are shown of so many, and whether `...` follows.
+    /// Returns how many of `length` elements are printed, and whether `...` follows.
     pub fn elements(&self, length: usize) -> (usize, bool) {
         match self.truncate {
             Some(limit) if length > limit => (limit, true),
@@ -38,7 +38,7 @@ impl Truncation {
         }
     }
 
-    /// The words for an array that is not shown.
+    /// Returns the text for an array that is not printed.
     pub fn array(&self, array: &Array<'_>) -> Option<String> {
         if !self.no_arrays {
             return None;
@@ -57,7 +57,7 @@ impl Truncation {
     }
 }
 
-/// An element's type in IDL, which ROS messages become.
+/// Returns an element's type name in IDL, to which ROS converts messages.
 fn element_name(element: &Element) -> String {
     match element {
         Element::Bool => "boolean".to_owned(),

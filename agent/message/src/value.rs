@@ -1,7 +1,7 @@
-//! A message that was read: its fields in the order of its definition, numbers in their width.
+//! A decoded message: its fields in the order of its definition, numbers in their width.
 //!
-//! It borrows from the payload and from the type. Arrays of numbers stay the bytes that they came
-//! in, so reading a point cloud costs no more than its header; what is looked at is converted then.
+//! It borrows from the payload and from the type. Arrays of numbers stay in the payload's bytes, so
+//! decoding a point cloud costs no more than its header; elements are converted on access.
 
 use std::borrow::Cow;
 
@@ -9,35 +9,35 @@ use ros2probe_wire::cursor::Endianness;
 
 use super::definition::{Element, Field, Shape, Structure};
 
-/// What a field holds.
+/// Value of a field.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value<'a> {
-    /// A number, a truth value or an octet.
+    /// A number, boolean or octet.
     Scalar(Scalar),
     /// A `string` or `wstring`.
     Text(Cow<'a, str>),
-    /// Many of something.
+    /// Array of values.
     Array(Array<'a>),
-    /// Another message.
+    /// Nested message.
     Message(Message<'a>),
 }
 
-/// A message's values.
+/// Values of a message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message<'a> {
-    /// Its type.
+    /// Type of the message.
     pub structure: &'a Structure,
-    /// One for each of the type's fields.
+    /// One value per field of the type.
     pub values: Vec<Value<'a>>,
 }
 
 impl<'a> Message<'a> {
-    /// Fields and their values, in the order of the definition.
+    /// Iterates over fields and their values, in the order of the definition.
     pub fn fields(&self) -> impl Iterator<Item = (&'a Field, &Value<'a>)> {
         self.structure.fields.iter().zip(&self.values)
     }
 
-    /// A field's value.
+    /// Returns a field's value.
     pub fn get(&self, name: &str) -> Option<&Value<'a>> {
         self.fields()
             .find(|(field, _)| field.name == name)
@@ -48,21 +48,21 @@ impl<'a> Message<'a> {
 /// The elements of an array or sequence.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array<'a> {
-    /// The field that it is in: bounds and the element's type.
+    /// The field with the array: its bounds and the element's type.
     pub field: &'a Field,
-    /// How many there are, also where not all were kept.
+    /// Number of elements, including those that were not kept.
     pub length: usize,
-    /// The elements, from the first on.
+    /// The kept elements, starting with the first.
     pub items: Items<'a>,
 }
 
 impl Array<'_> {
-    /// Whether the type gives it a fixed length.
+    /// Returns whether the type gives it a fixed length.
     pub fn is_fixed(&self) -> bool {
         matches!(self.field.shape, Shape::Array(_))
     }
 
-    /// An element, where it was kept.
+    /// Returns an element, if it was kept.
     pub fn get(&self, index: usize) -> Option<Value<'_>> {
         match &self.items {
             Items::Scalars(scalars) => scalars.get(index).map(Value::Scalar),
@@ -74,10 +74,10 @@ impl Array<'_> {
     }
 }
 
-/// Elements of one kind.
+/// Elements of one type.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Items<'a> {
-    /// Numbers, truth values or octets.
+    /// Numbers, booleans or octets.
     Scalars(Scalars<'a>),
     /// Strings.
     Texts(Vec<Cow<'a, str>>),
@@ -85,7 +85,7 @@ pub enum Items<'a> {
     Messages(Vec<Message<'a>>),
 }
 
-/// Numbers as they were sent, one behind the other.
+/// Numbers in wire format, one after the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scalars<'a> {
     kind: ScalarKind,
@@ -94,7 +94,7 @@ pub struct Scalars<'a> {
 }
 
 impl<'a> Scalars<'a> {
-    /// Over whole elements; what is left at the end is not looked at.
+    /// Wraps whole elements; remaining bytes at the end are ignored.
     pub fn new(kind: ScalarKind, endianness: Endianness, bytes: &'a [u8]) -> Self {
         Self {
             kind,
@@ -103,28 +103,28 @@ impl<'a> Scalars<'a> {
         }
     }
 
-    /// What each of them is.
+    /// Returns the kind of the elements.
     pub fn kind(&self) -> ScalarKind {
         self.kind
     }
 
-    /// How many there are.
+    /// Returns the number of elements.
     pub fn len(&self) -> usize {
         self.bytes.len() / self.kind.size()
     }
 
-    /// Whether there is none.
+    /// Returns whether it has no elements.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// One of them.
+    /// Returns one element.
     pub fn get(&self, index: usize) -> Option<Scalar> {
         let start = index.checked_mul(self.kind.size())?;
         Scalar::read(self.kind, self.endianness, self.bytes.get(start..)?)
     }
 
-    /// All of them in order.
+    /// Iterates over the elements in order.
     pub fn iter(&self) -> impl Iterator<Item = Scalar> + use<'a> {
         let Self {
             kind,
@@ -137,7 +137,7 @@ impl<'a> Scalars<'a> {
     }
 }
 
-/// What a scalar is. `char` is an 8-bit number in ROS 2.
+/// Kind of a scalar. `char` is an 8-bit number in ROS 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ScalarKind {
     /// `bool`.
@@ -167,7 +167,7 @@ pub enum ScalarKind {
 }
 
 impl ScalarKind {
-    /// Of an element that is neither text nor message.
+    /// Returns the kind of an element; `None` for text and messages.
     pub fn of(element: &Element) -> Option<Self> {
         Some(match element {
             Element::Bool => Self::Bool,
@@ -186,7 +186,7 @@ impl ScalarKind {
         })
     }
 
-    /// Bytes of one on the wire.
+    /// Returns the number of bytes on the wire.
     pub const fn size(self) -> usize {
         match self {
             Self::Bool | Self::Byte | Self::Int8 | Self::UInt8 => 1,
@@ -202,7 +202,7 @@ impl ScalarKind {
 pub enum Scalar {
     /// `bool`.
     Bool(bool),
-    /// `byte`, which Python shows as a string of one byte.
+    /// `byte`, which Python prints as a string of one byte.
     Byte(u8),
     /// A signed number.
     Int(i64),
@@ -215,7 +215,7 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// From its bytes, which may go on behind it.
+    /// Reads a scalar from the start of `bytes`.
     pub fn read(kind: ScalarKind, endianness: Endianness, bytes: &[u8]) -> Option<Self> {
         let word = |size: usize| -> Option<u64> {
             let bytes = bytes.get(..size)?;

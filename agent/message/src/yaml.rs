@@ -1,7 +1,7 @@
-//! Messages as YAML, byte for byte as PyYAML's `dump` prints what `rosidl_runtime_py` makes of them.
+//! Messages as YAML, byte for byte as PyYAML's `dump` prints the output of `rosidl_runtime_py`.
 //!
-//! Of YAML only that subset is written: block or flow style, keys in the order of the definition,
-//! lines never wrapped, characters beyond ASCII as they are. It reads nothing.
+//! Writes only that subset of YAML: block or flow style, keys in the order of the definition, lines
+//! never wrapped, non-ASCII characters unescaped. It parses nothing.
 
 use std::fmt::Write as _;
 use std::sync::LazyLock;
@@ -12,22 +12,22 @@ use super::python;
 use super::truncation::Truncation;
 use super::value::{Array, Items, Message, Scalar, Value};
 
-/// Spaces of one level.
+/// Spaces per level.
 const STEP: usize = 2;
-/// What ends a line in YAML 1.1.
+/// Characters that end a line in YAML 1.1.
 const BREAKS: [char; 4] = ['\n', '\u{85}', '\u{2028}', '\u{2029}'];
 
-/// How sequences are written. Mappings outside of sequences are always in block style: PyYAML has no
-/// style of its own for the ordered mappings that messages become.
+/// Style of sequences. Mappings outside of sequences are always in block style: PyYAML has no style
+/// for the ordered mappings that represent messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Style {
-    /// A line for each value.
+    /// One line per value.
     Block,
-    /// Each sequence in one line, with the mappings in it.
+    /// Each sequence in one line, including its mappings.
     Flow,
 }
 
-/// The whole document, its last line ended.
+/// Returns the whole document with a final line break.
 pub fn document(message: &Message<'_>, shown: &Truncation, style: Style) -> String {
     let mut writer = Writer {
         text: String::new(),
@@ -52,7 +52,7 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    /// Key by key; the first stands behind a dash where the message is in a sequence.
+    /// Writes key by key; in a sequence, the first key follows a dash.
     fn block(&mut self, message: &Message<'_>, indent: usize, behind_dash: bool) {
         for (index, (field, value)) in message.fields().enumerate() {
             if index > 0 || !behind_dash {
@@ -170,7 +170,7 @@ impl Writer<'_> {
         self.is_in_flow = outside;
     }
 
-    /// A value that stays in its line, behind key or dash.
+    /// Writes a value on the line of its key or dash.
     fn inline(&mut self, value: &Value<'_>, indent: usize) {
         match value {
             Value::Scalar(value) => self.scalar(*value, indent),
@@ -213,7 +213,7 @@ impl Writer<'_> {
         }
     }
 
-    /// A string in the plainest form that reads back as the same string.
+    /// Writes a string in the plainest form that reads back as the same string.
     fn string(&mut self, text: &str, indent: usize) {
         let forms = Forms::of(text);
         let plain = if self.is_in_flow {
@@ -230,7 +230,8 @@ impl Writer<'_> {
         }
     }
 
-    /// Line breaks are doubled: a single one would read back as a space.
+    /// Writes a single-quoted string. Line breaks are doubled: a single one would read back as a
+    /// space.
     fn single_quoted(&mut self, text: &str, indent: usize) {
         self.text.push('\'');
         let mut in_breaks = false;
@@ -304,7 +305,7 @@ impl Writer<'_> {
     }
 }
 
-/// A float as YAML 1.1 has it: with a point, also before an exponent.
+/// Returns a float in YAML 1.1: with a point, also before an exponent.
 fn float(number: f64) -> String {
     if number.is_nan() {
         return ".nan".to_owned();
@@ -320,7 +321,7 @@ fn float(number: f64) -> String {
     }
 }
 
-/// Whether the plain text would be read as a number, a truth value, nothing or a time.
+/// Returns whether the plain text would be read as a number, boolean, null or time.
 fn reads_as_other(text: &str) -> bool {
     static OTHER: LazyLock<Option<Regex>> = LazyLock::new(|| {
         let float =
@@ -350,7 +351,7 @@ fn reads_as_other(text: &str) -> bool {
     }
 }
 
-/// In which forms a string can be written.
+/// The styles in which a string can be written.
 struct Forms {
     block_plain: bool,
     flow_plain: bool,
@@ -358,7 +359,7 @@ struct Forms {
 }
 
 impl Forms {
-    /// As PyYAML's `analyze_scalar` decides.
+    /// Follows PyYAML's `analyze_scalar`.
     fn of(text: &str) -> Self {
         let blank = |character: Option<&char>| {
             character.is_none_or(|character| {

@@ -1,4 +1,4 @@
-//! What a real `ros2 topic echo` printed of 154 payloads, against what is printed here.
+//! Compares the output for 154 payloads with that of a real `ros2 topic echo`.
 
 #![expect(
     clippy::unwrap_used,
@@ -17,7 +17,7 @@ use ros2probe_message::value::{Items, Scalar};
 use ros2probe_message::yaml::{self, Style};
 use ros2probe_message::{Decoded, Limits, Truncation, Value, csv, decode};
 
-/// What `ros2 topic echo` shows of arrays and strings unless told otherwise.
+/// The defaults of `ros2 topic echo` for arrays and strings.
 const ECHO: Truncation = Truncation {
     truncate: Some(128),
     no_arrays: false,
@@ -55,7 +55,7 @@ fn every_golden_payload_prints_as_the_original_prints_it() {
     assert_eq!(count, 154);
 }
 
-/// What Python, PyYAML and numpy print (`data/python/forms.py`).
+/// Compares with the output of Python, PyYAML and numpy (`data/python/forms.py`).
 #[test]
 fn strings_numbers_and_arrays_print_as_python_prints_them() {
     let mut wrong = 0;
@@ -72,7 +72,8 @@ fn strings_numbers_and_arrays_print_as_python_prints_them() {
     assert_eq!(wrong, 0);
 }
 
-/// Whatever is cut off or changed: an answer, and the same one whether elements are kept or not.
+/// However a payload is cut or changed, decoding returns, and with the same result whether elements
+/// are kept or not.
 #[test]
 fn damaged_payloads_are_read_or_refused_and_never_more() {
     let library = library();
@@ -127,7 +128,7 @@ fn rosbags_reads_the_same_values() {
         }
         let message_type = library.find(&case.message_type, None).unwrap();
         let decoded = decode(&message_type, &case.payload, &Limits::default()).unwrap();
-        // rosbags refuses what is behind the last field.
+        // rosbags rejects bytes behind the last field.
         let length = case.payload.len() - decoded.oddities.trailing;
         let payload = golden::hex(&case.payload[..length]);
         lines.push_str(&serde_json::to_string(&(&case.message_type, payload)).unwrap());
@@ -145,11 +146,11 @@ fn rosbags_reads_the_same_values() {
     }
 }
 
-/// As `read.py` writes it.
+/// Returns a value in the form that `read.py` writes.
 fn plain(value: &Value<'_>) -> serde_json::Value {
     let scalar = |scalar: Scalar| match scalar {
         Scalar::Bool(value) => value.into(),
-        // rosbags takes an octet for a signed number.
+        // rosbags reads an octet as a signed number.
         Scalar::Byte(byte) => byte.cast_signed().into(),
         Scalar::Int(number) => number.into(),
         Scalar::UInt(number) => number.into(),

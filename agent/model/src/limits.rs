@@ -40,18 +40,18 @@ pub enum Limit {
 pub struct Row {
     /// Its key below `limits`, and the label `limit`.
     pub key: &'static str,
-    /// When nobody says otherwise.
+    /// Default value.
     pub default: usize,
-    /// Smallest and largest value that is accepted.
+    /// Smallest and largest accepted value.
     pub range: (usize, usize),
-    /// What is counted.
+    /// Entries that count against the cap.
     pub what: &'static str,
-    /// What becomes of the next one.
+    /// Effect on the next entry.
     pub reached: &'static str,
-    /// Which metrics tell more than `ros2probe_limit_reached_total` does.
-    pub told_by: &'static str,
-    /// Bytes that one takes at most on a robot with names of usual length, with two snapshots and
-    /// two pages of metrics that tell of it; 1 where bytes are counted.
+    /// Metric with more details than `ros2probe_limit_reached_total`; empty if there is none.
+    pub metric: &'static str,
+    /// Most bytes per entry on a robot with names of usual length, including two snapshots and two
+    /// metrics pages; 1 if the cap counts bytes.
     pub bytes: usize,
 }
 
@@ -89,10 +89,10 @@ const PARTICIPANTS: Row = Row {
     default: 1_000,
     range: (1, 100_000),
     what: "DDS participants",
-    reached: "one that is no longer heard makes room (for 5 s, if it was there for \
-        less than 2 s, else for 90 s), or the least worthy one for a newcomer that is \
-        worth more; otherwise the newcomer is left out",
-    told_by: "ros2probe_table_evictions_total",
+    reached: "a silent one makes room (silent for 5 s if it is younger than 2 s, else for 90 s), \
+              or the one with the lowest priority for a newcomer with a higher one; otherwise \
+              the newcomer is rejected",
+    metric: "ros2probe_table_evictions_total",
     bytes: 2 << 10,
 };
 const ENDPOINTS: Row = Row {
@@ -100,30 +100,29 @@ const ENDPOINTS: Row = Row {
     default: 8_192,
     range: (1, 1_000_000),
     what: "Writers and readers",
-    reached: "a participant that is no longer heard makes room with all its entries, \
-        or the least worthy entry for a newcomer that is worth more; otherwise the \
-        newcomer waits until there is room",
-    told_by: "ros2probe_table_evictions_total",
+    reached: "a silent participant makes room with all its entries, or the entry with the lowest \
+              priority for a newcomer with a higher one; otherwise the newcomer waits for a free \
+              entry",
+    metric: "ros2probe_table_evictions_total",
     bytes: 5_632,
 };
 const TOPICS: Row = Row {
     key: "topics",
     default: 1_000,
     range: (1, 100_000),
-    what: "Measured topics with series of their own",
-    reached: "one that has vanished makes room, or the latest one that is not watched \
-        by its exact name for one that is; otherwise the newcomer is listed but not \
-        measured until an entry is free",
-    told_by: "ros2probe_topics_rejected_total",
+    what: "Measured topics with their own series",
+    reached: "a vanished one makes room, or the latest one not watched by its exact name for one \
+              that is; otherwise the newcomer is listed but not measured until an entry is free",
+    metric: "ros2probe_topics_rejected_total",
     bytes: 15 << 10,
 };
 const WATCHES: Row = Row {
     key: "watches",
     default: 1_000,
     range: (1, 10_000),
-    what: "Watches of the configuration, the command line and clients together",
-    reached: "a client's is refused (409), and so is a configuration that lists more",
-    told_by: "",
+    what: "Watches from the configuration, the command line and clients together",
+    reached: "a client's watch is refused (409), and so is a configuration with more",
+    metric: "",
     bytes: 1 << 10,
 };
 const UNKNOWN_WRITERS: Row = Row {
@@ -131,9 +130,9 @@ const UNKNOWN_WRITERS: Row = Row {
     default: 256,
     range: (1, 100_000),
     what: "Writers whose announcement was missed",
-    reached: "one that sent less than 10 messages and nothing for 3 s makes room; \
-              otherwise the newcomer is not followed",
-    told_by: "ros2probe_table_evictions_total",
+    reached: "one with fewer than 10 messages and none for 3 s makes room; otherwise the \
+              newcomer is not tracked",
+    metric: "ros2probe_table_evictions_total",
     bytes: 4 << 10,
 };
 const FLOWS: Row = Row {
@@ -142,47 +141,47 @@ const FLOWS: Row = Row {
     range: (1, 1_000_000),
     what: "Pairs of a measured writer and one receiver, or one destination, of its \
            messages",
-    reached: "those that were silent for 10 s make room; until then the newcomer is not \
-              followed, and its topic's own counts stay right",
-    told_by: "ros2probe_table_evictions_total",
+    reached: "pairs that were silent for 10 s make room; until then the newcomer is not tracked, \
+              and its topic's own counts stay correct",
+    metric: "ros2probe_table_evictions_total",
     bytes: 2 << 10,
 };
 const REASSEMBLY_BYTES: Row = Row {
     key: "reassembly_bytes",
     default: 4 << 20,
     range: (65_536, 1 << 30),
-    what: "Bytes of captured datagrams of which fragments are missing",
+    what: "Bytes of captured datagrams with missing fragments",
     reached: "the oldest datagram is dropped",
-    told_by: "ros2probe_incomplete_datagrams_total",
+    metric: "ros2probe_incomplete_datagrams_total",
     bytes: 1,
 };
 const SUBSCRIPTIONS: Row = Row {
     key: "subscriptions",
     default: 32,
     range: (1, 1_000),
-    what: "Clients that get messages one by one, recordings and snapshots",
+    what: "Clients that receive single messages, recordings and snapshots",
     reached: "the next one is refused (503)",
-    told_by: "ros2probe_subscriptions_refused_total",
+    metric: "ros2probe_subscriptions_refused_total",
     bytes: 8 << 10,
 };
 const PAYLOAD_BYTES: Row = Row {
     key: "payload_bytes",
     default: 40 << 20,
     range: (1 << 20, 16 << 30),
-    what: "Bytes of messages that are put together for them (one half), or wait to be \
-           read (the other)",
+    what: "Bytes of messages being assembled for them (one half), or waiting to be read (the \
+           other)",
     reached: "the oldest message of the longest queue is dropped, or the least \
         complete one, and reported to its readers",
-    told_by: "ros2probe_missed_messages_total",
+    metric: "ros2probe_missed_messages_total",
     bytes: 1,
 };
 const RECORDINGS: Row = Row {
     key: "recordings",
     default: 4,
     range: (1, 100),
-    what: "Bags that the agent writes at once on request",
+    what: "Requested bags that the agent writes at the same time",
     reached: "the next one is refused (409)",
-    told_by: "",
+    metric: "",
     bytes: 6 << 20,
 };
 const API_CLIENTS: Row = Row {
@@ -190,8 +189,9 @@ const API_CLIENTS: Row = Row {
     default: 64,
     range: (1, 10_000),
     what: "Connections to each listener of the control API",
-    reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed",
-    told_by: "",
+    reached: "the connection that has been idle longest makes room; if none is idle, the next \
+              one is answered 503 and closed",
+    metric: "",
     bytes: 32 << 10,
 };
 const METRICS_CLIENTS: Row = Row {
@@ -199,8 +199,9 @@ const METRICS_CLIENTS: Row = Row {
     default: 32,
     range: (1, 10_000),
     what: "Connections to the metrics listener",
-    reached: "the one that waits longest makes room; where none waits, the next one is answered 503 and closed; with TLS it is closed",
-    told_by: "",
+    reached: "the connection that has been idle longest makes room; if none is idle, the next \
+              one is answered 503 and closed; with TLS it is closed",
+    metric: "",
     bytes: 32 << 10,
 };
 

@@ -51,7 +51,7 @@ pub enum ChoiceError {
         reason: PatternError,
     },
     /// No regular expression, or one that is too large.
-    #[error("`{pattern}` is no regular expression that can be used")]
+    #[error("`{pattern}` is not a supported regular expression")]
     Regex {
         /// As given.
         pattern: String,

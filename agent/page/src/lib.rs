@@ -1,4 +1,4 @@
-//! Files of the page for browsers, as the folder around this crate holds them.
+//! Files of the web page, as the folder around this crate holds them.
 //!
 //! ```
 //! let index = ros2probe_page::FILES.iter().find(|file| file.path == "index.html");
@@ -14,7 +14,7 @@ pub struct File {
     pub path: &'static str,
     /// Value of `Content-Type`.
     pub media_type: &'static str,
-    /// Content, not compressed.
+    /// Content, uncompressed.
     pub bytes: &'static [u8],
 }
 
@@ -28,7 +28,7 @@ impl File {
     }
 }
 
-/// Each file, by its path below `/page/`; `index.html` is served at `/`, too.
+/// Every file, by its path below `/page/`; `index.html` is also served at `/`.
 pub static FILES: [File; 34] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),

@@ -58,7 +58,7 @@ test('hostile names stay text, with what cannot be seen shown', () => {
   assert.equal(format.visible('\ud800'), '\\u{d800}');
   assert.equal(format.visible('\u{e0101}\u{1f600}'), '\\u{e0101}\u{1f600}');
   assert.equal(format.visible('/ü/日本/שלום'), '/ü/日本/שלום');
-  // What looks like one of our escapes is told apart from one.
+  // A text that looks like an escape is distinguishable from one.
   assert.notEqual(format.visible('\\u{202e}'), format.visible('\u202e'));
   assert.equal(format.visible(null), '');
 });

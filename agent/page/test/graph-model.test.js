@@ -119,7 +119,7 @@ test('hosts are boxes, and processes of several nodes', () => {
   const state = robot(['/a', '/b', '/c', '/d'], [['/x', ['/a'], ['/d']]]);
   const graph = build(state, { ...ALL, boxes: 'process' });
   const by = Object.fromEntries(graph.vertices.map((vertex) => [vertex.name, vertex]));
-  // Nodes 1 and 4 share the participant of process 2 on host a; the others are alone in theirs.
+  // Nodes 1 and 4 share the participant of process 2 on host a; each other node has its own.
   assert.equal(by['/a'].parent, 'box:a 2');
   assert.equal(by['/d'].parent, 'box:a 2');
   assert.equal(by['/x'].parent, 'box:a 2');

@@ -42,7 +42,7 @@ test('a cycle is drawn, with one edge that leads back', () => {
   });
   assert.equal(back.length, 1);
   assert.equal(result.edges.length, 3);
-  // Even the one that leads back begins right of its source and ends left of its target.
+  // Even an edge that leads back starts right of its source and ends left of its target.
   const route = /** @type {any} */ (result.edges.find((edge) => edge.id === back[0].id));
   const from = /** @type {any} */ (at.get(back[0].from));
   assert.equal(route.points[0].x, from.x + from.w / 2);

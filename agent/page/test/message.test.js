@@ -1,7 +1,7 @@
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
-// message.js draws as well, and the drawing modules look for a document when they are loaded.
+// message.js imports rendering modules, which access a document when they are loaded.
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.sessionStorage = /** @type {any} */ ({ getItem: () => null });

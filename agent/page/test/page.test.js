@@ -28,12 +28,12 @@ test('the whole page is at most 120 KB, compressed', (context) => {
 test('every module is loaded ahead, and nothing that does not exist', () => {
   const named = [...text('index.html').matchAll(/(?:href|src)="page\/([^"]+)"/g)]
     .map(([, path]) => path);
-  // The worker loads the layout by itself.
+  // The worker imports the layout.
   const late = new Set(['index.html', 'layout.js', 'layout-worker.js']);
   assert.deepEqual(named.sort(), served.filter((path) => !late.has(path)));
 });
 
-// Statements of modules, and of the minified ones that stand in one line.
+// Statements of modules, including minified ones in a single line.
 const IMPORT = /(?:^|[;}])\s*(?:import|export)[^'"`;]*from\s*['"]([^'"]+)['"]/gm;
 
 test('imports lead to files of the page', () => {
@@ -48,7 +48,7 @@ test('imports lead to files of the page', () => {
 test('nothing leads to another origin, and nothing is inline', () => {
   for (const path of own) {
     const addresses = text(path).match(/(?:https?:)?\/\/[a-z0-9.-]+\.[a-z]{2,}[^\s'"]*/gi) ?? [];
-    // The name of the SVG language is no address that anything asks.
+    // SVG's namespace is a name, not an address that is requested.
     const foreign = addresses.filter((each) => !each.startsWith('http://www.w3.org/'));
     assert.deepEqual(foreign, [], path);
     assert.doesNotMatch(text(path), /innerHTML|dangerouslySetInnerHTML|\beval\(|new Function/, path);

@@ -75,7 +75,7 @@ test('a topic that goes takes its figures along', () => {
   assert.equal(state.figures.size, 0);
   assert.equal(state.series.size, 0);
   assert.ok(state.structure > before);
-  // A row that comes late for it is ignored.
+  // A late row for it is ignored.
   feed(state, values(103, [[1, 5, 5, 5, 0, 0, null, null, 0, 1]]));
   assert.equal(state.figures.size, 0);
 });

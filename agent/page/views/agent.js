@@ -1,4 +1,4 @@
-// The agent itself: its source, what it is able to see, limits in use, and what it dropped.
+// The agent itself: its source, its abilities, the use of limits, and its drops.
 
 import { bytes, count, duration, percent } from '../format.js';
 import { address } from '../router.js';
@@ -22,11 +22,11 @@ export function Agent() {
   const open = state.open ?? {};
   const drops = data ? /** @type {[string, number|null][]} */ ([
     ['Packets the kernel dropped before the agent', data.dropped_packets],
-    ['Records that found no room', data.dropped_records],
-    ['Datagrams that found no room', data.dropped_datagrams],
-    ['Datagrams given up because several ran at once', data.contended_datagrams],
+    ['Records that did not fit the ring', data.dropped_records],
+    ['Datagrams that did not fit the ring', data.dropped_datagrams],
+    ['Datagrams skipped because too many programs ran at once', data.contended_datagrams],
     ['Topics not measured because limits.topics is reached', data.topics_rejected],
-    ['Writers that send without an announcement seen', data.unknown_writers],
+    ['Active writers whose announcement was missed', data.unknown_writers],
   ]) : [];
   return html`<h1 tabindex="-1">Agent</h1>
     <${Failed} problem=${problem} what="No facts about the agent" />

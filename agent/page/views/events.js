@@ -1,4 +1,4 @@
-// Events: what has happened since the agent started, as far as it is kept, and as it happens.
+// Events: those kept since the agent started, and new ones as they happen.
 
 import { useEffect, useState } from '../vendor/hooks.mjs';
 import { request } from '../api.js';
@@ -7,7 +7,7 @@ import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { Filter, html, Mark, matches, Name } from '../ui.js';
 
-/** Events in the document; the filter finds older ones. */
+/** Most events in the document; the filter finds older ones. */
 const MOST_SHOWN = 300;
 
 const SEVERITY = /** @type {Record<string, string>} */ ({
@@ -15,7 +15,7 @@ const SEVERITY = /** @type {Record<string, string>} */ ({
 });
 
 /**
- * The events of a stream of server-sent events that has ended.
+ * Parses the events of a finished stream of server-sent events.
  * @param {string} text
  * @returns {import('../state.js').Event[]}
  */
@@ -30,7 +30,7 @@ export function parseEvents(text) {
   return events;
 }
 
-/** An event's attributes, in words. @param {Record<string, unknown>} attributes */
+/** Formats an event's attributes. @param {Record<string, unknown>} attributes */
 export function attributesText(attributes) {
   return Object.entries(attributes).map(([name, value]) => {
     const text = typeof value === 'string' ? value : JSON.stringify(value);

@@ -1,4 +1,4 @@
-// The graph: nodes and topics from left to right, with what flows and where it fails.
+// The graph: nodes and topics from left to right, with traffic and failures.
 
 import { useEffect, useMemo, useRef, useState } from '../vendor/hooks.mjs';
 import { bandwidth, count, rate, several, shortened, visible } from '../format.js';
@@ -8,10 +8,10 @@ import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { Badges, download, Failed, html, Mark, Name, PASSAGES, worst } from '../ui.js';
 import { Camera } from '../camera.js';
 
-/** The layout follows a change of the structure after this. */
+/** Delay between a change of the structure and its layout. */
 const SETTLE_MS = 500;
 
-/** The look of an edge by the way its messages go. @param {number} mask @param {string} kind */
+/** Returns an edge's style for its passages. @param {number} mask @param {string} kind */
 function way(mask, kind) {
   if (kind === 'calls' || kind === 'served_by') return 'service';
   const names = state.passagesOf(mask);
@@ -19,7 +19,7 @@ function way(mask, kind) {
   return ['network', 'shared_memory'].find((name) => names.includes(name)) ?? 'unseen';
 }
 
-/** Pixels of an edge by its bytes a second. @param {number} bytes */
+/** Returns an edge's width in pixels for its bytes per second. @param {number} bytes */
 export function thickness(bytes) {
   return bytes > 0 ? Math.min(7, 1 + Math.log10(1 + bytes / 1000) * 1.2) : 1;
 }
@@ -49,7 +49,7 @@ function worse(one, other) {
   return ORDER[Math.min(ORDER.indexOf(one), ORDER.indexOf(other))];
 }
 
-/** Endpoints of incompatible pairs. */
+/** Returns the endpoints of incompatible pairs. */
 function brokenEnds() {
   const guids = new Set();
   for (const finding of state.findings) {
@@ -60,7 +60,7 @@ function brokenEnds() {
   return guids;
 }
 
-/** How a vertex fares, by key of what it stands for. */
+/** Returns the worst severity of each topic and node. */
 function healths() {
   /** @type {Map<number, string>} */
   const nodes = new Map();
@@ -140,7 +140,7 @@ export function Graph({ query }) {
     <${Failed} problem=${asked.problem} what="No services and actions" />
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
-      ? 'What the graph should focus on does not exist now.' : 'No node has been announced yet.'}</p>`}
+      ? 'The selected node or topic does not exist now.' : 'No node has been announced yet.'}</p>`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
         toggle=${toggle} own=${drawing} />
@@ -160,7 +160,7 @@ function FocusField({ focus, hops, change }) {
 }
 
 /**
- * The picture of a graph, made in a worker when the structure has changed and rested.
+ * Returns the layout of a graph, computed in a worker some time after a change of the structure.
  * @param {import('../graph-model.js').Graph} graph
  */
 function useLayout(graph) {
@@ -221,15 +221,15 @@ function index(result) {
   };
 }
 
-/** Pixels within which an edge that leads back turns. */
+/** Pixels within which a backward edge turns. */
 const TURN = 40;
 
-/** A smooth path through the points of an edge. @param {import('../layout.js').Point[]} points */
+/** Returns a smooth path through an edge's points. @param {import('../layout.js').Point[]} points */
 export function curve(points) {
   let path = `M${points[0].x.toFixed(1)} ${points[0].y.toFixed(1)}`;
   for (let at = 1; at < points.length; at += 1) {
     const [a, b] = [points[at - 1], points[at]];
-    // An edge that leads back leaves to the right, turns, and turns again before its end.
+    // A backward edge starts to the right, turns, and turns again before its end.
     const half = (b.x - a.x) / 2;
     const out = half < 0 && at === 1 ? TURN : half;
     const into = half < 0 && at === points.length - 1 ? TURN : half;
@@ -288,7 +288,7 @@ function Drawing({ graph, picture, chosen, choose, toggle, own }) {
   const labels = graph.edges.length <= 60;
   const few = graph.edges.length <= 400;
   return html`<div class="canvas"><svg ref=${own} role="group" onKeyDown=${keys}
-    aria-label="Graph of ${several(graph.nodes, 'node')}. Arrow keys walk along the edges. The list
+    aria-label="Graph of ${several(graph.nodes, 'node')}. Arrow keys move along the edges. The list
       of topics shows the same."
     onClick=${(/** @type {MouseEvent} */ event) => {
       if (event.target === own.current && !camera.current?.moved) choose(null);
@@ -350,7 +350,7 @@ function neighbours(graph) {
 }
 
 /**
- * Where an arrow key leads: along an edge, or to the next vertex of the column.
+ * Returns the target of an arrow key: along an edge, or the next vertex in the column.
  * @param {Picture} picture
  * @param {Map<string, {out: string[], into: string[]}>} near
  * @param {string} from
@@ -380,7 +380,7 @@ function step(picture, near, from, key) {
   }
 }
 
-/** Whether a key presses a button. @param {KeyboardEvent} event */
+/** Returns whether a key activates a button. @param {KeyboardEvent} event */
 const pressed = (event) => event.key === 'Enter' || event.key === ' ';
 
 /** @param {any} props */
@@ -459,7 +459,7 @@ function healthOf(key, nodes) {
   return node ? nodes.get(node.id) ?? 'good' : 'good';
 }
 
-/** What is chosen, in words and with links. @param {any} props */
+/** Describes the selection in words and with links. @param {any} props */
 function Panel({ graph, chosen, change, toggle, choose, names }) {
   const vertex = graph.vertices.find((/** @type {any} */ each) => each.key === chosen);
   const edge = vertex ? null : graph.edges.find((/** @type {any} */ each) => each.id === chosen);
@@ -517,17 +517,17 @@ function Legend() {
   return html`<details class="legend"><summary>Legend</summary><ul>
     ${rows.map(([kind, words]) => html`<li key=${kind}><svg viewBox="0 0 48 12" aria-hidden="true"
       class="edge ${kind}"><path class="line" d="M2 6L46 6" stroke-width="2.5" /></svg> ${words}</li>`)}
-    <li>Width: bytes a second of the edge’s topics.</li>
+    <li>Width: bytes per second of the edge’s topics.</li>
     <li><${Mark} severity="error" /> incompatible QoS, types or a violated expectation;
       <${Mark} severity="warning" /> loss or silence.</li>
     <li>Round: node. Square: topic. Boxes: namespaces, or hosts and processes.</li></ul></details>`;
 }
 
-// Colours of a picture that leaves the page, by the names of the page's variables.
+// CSS variables whose colours are copied into an exported picture.
 const VARIABLES = ['--paper', '--ink', '--dim', '--grid', '--panel', '--node', '--error',
   '--warning', '--note', '--accent', '--edge'];
 
-/** The drawing as a file of its own. @param {SVGSVGElement|null} svg */
+/** Returns the drawing as a standalone file. @param {SVGSVGElement|null} svg */
 export function standalone(svg) {
   if (!svg) return '';
   const copy = /** @type {SVGSVGElement} */ (svg.cloneNode(true));

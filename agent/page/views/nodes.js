@@ -1,4 +1,4 @@
-// ROS nodes: where they live, what their processes cost, and what they are joined to.
+// ROS nodes: host and process, resource usage, and connections.
 
 import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
@@ -12,11 +12,11 @@ import { Findings } from './overview.js';
 
 const EVERY_MS = 2000;
 
-/** Services by which a node with parameters is known. */
+/** Services that identify a node with parameters. */
 const PARAMETER_SERVICES = ['list_parameters', 'get_parameters'];
 
 /**
- * Processes by id, each with the part of a core it uses between the last two answers.
+ * Returns processes by id, each with its share of a core between the last two answers.
  * @returns {{byId: Map<number, any>, answer: {data: any, problem: any}}}
  */
 function useProcesses() {
@@ -48,7 +48,7 @@ function useProcesses() {
   return { byId, answer };
 }
 
-/** Topics a node publishes and subscribes to. */
+/** Returns the topics that each node publishes and subscribes to. */
 function ends() {
   /** @type {Map<number, {publishers: Set<number>, subscriptions: Set<number>}>} */
   const found = new Map();

@@ -1,4 +1,4 @@
-// What is wrong, since when, and what to do; then totals; then what the agent cannot see.
+// Findings with their age and remedy, then totals, then the agent's blind spots.
 
 import { age, bandwidth, clock, count, percent, rate, several } from '../format.js';
 import { address, nodeAddress, topicAddress } from '../router.js';
@@ -32,8 +32,8 @@ export function Overview() {
           ${finding.remedy && html`<br /><span class="dim">Remedy: <${Name} text=${finding.remedy}
             /></span>`}</span></li>`)}</ul>`
         : html`<p>${state.open?.source === 'replay'
-          ? 'This is a capture. It holds what passed the interface it was taken on: nothing of sockets, processes and shared memory.'
-          : 'Everything the agent can look at is open to it.'}${' '}
+          ? 'This is a capture: it contains the traffic of an interface, but nothing about sockets, processes and shared memory.'
+          : 'The agent has all of its abilities.'}${' '}
           <a href=${address('agent')}>Abilities and limits</a></p>`}
     </section>`;
 }
@@ -55,10 +55,10 @@ export function Findings({ list }) {
 }
 
 /**
- * Endpoints of a topic that have no counterpart as one finding: all nodes may listen to `/clock`.
+ * Groups unmatched endpoints of a topic into one finding: all nodes may subscribe to `/clock`.
  * @param {import('../state.js').Finding[]} list
  * @returns {[import('../state.js').Finding[], Map<import('../state.js').Finding, number>]} the first
- *   of each topic, and how many follow it
+ *   of each topic, and how many more it has
  */
 export function grouped(list) {
   /** @type {Map<string, import('../state.js').Finding>} */
@@ -75,14 +75,14 @@ export function grouped(list) {
   return [firsts, more];
 }
 
-/** A finding's text without the name of its topic before it. @param {any} finding */
+/** Returns a finding's text without its leading topic name. @param {any} finding */
 function rest(finding) {
   const name = state.topics.get(finding.topic)?.name;
   return name && finding.text.startsWith(`${name} `) ? finding.text.slice(name.length + 1)
     : finding.text;
 }
 
-/** The link to what a finding is about. @param {{finding: import('../state.js').Finding}} props */
+/** A link to a finding's subject. @param {{finding: import('../state.js').Finding}} props */
 function Place({ finding }) {
   const topic = finding.topic == null ? null : state.topics.get(finding.topic);
   if (topic) return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} /></a>:`;

@@ -1,4 +1,4 @@
-// Recordings of the agent, and snapshots of the last seconds it keeps in memory.
+// Recordings of the agent, and snapshots of the last seconds in its memory.
 
 import { useRef, useState } from '../vendor/hooks.mjs';
 import { json, post, remove, request } from '../api.js';
@@ -15,7 +15,7 @@ export function Recordings() {
   const snapshots = usePoll(may ? 'snapshots' : null, EVERY_MS);
   if (!may) {
     return html`<h1 tabindex="-1">Recordings</h1>
-      <p>Recordings hold what the robot sees. They need a token with the right <strong>all</strong>:
+      <p>Recordings contain what the robot sees. They need a token with the right <strong>all</strong>:
       run <code>rp page</code> on the robot. <${AskButton} /></p>`;
   }
   const { data } = recordings;

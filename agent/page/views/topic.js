@@ -1,4 +1,4 @@
-// One topic: its course, its endpoints and their QoS, where its messages die, and what they hold.
+// One topic: its figures over time, its endpoints and their QoS, its losses, and its messages.
 
 import { useEffect, useRef, useState } from '../vendor/hooks.mjs';
 import { json, named } from '../api.js';
@@ -67,7 +67,7 @@ export function Topic({ name, query }) {
     <${LiveMessage} key=${`message ${topic.id}`} topic=${topic} scope=${scope} name=${apiName(topic)} />`;
 }
 
-/** Topics without a ROS name have the DDS name in addresses. @param {any} topic */
+/** Returns the name for addresses: the DDS name if it has no ROS name. @param {any} topic */
 function apiName(topic) {
   return topic.kind === 'dds' ? topic.ddsName : topic.name;
 }
@@ -87,7 +87,7 @@ function Charts({ topic, scope }) {
           columns.current = COLUMNS.map((column) => history[column] ?? []);
           draw((/** @type {number} */ value) => value + 1);
         } catch {
-          // The stream's figures go on; the next request may succeed.
+          // The stream's figures continue; the next request may succeed.
         }
       }
       if (!abort.signal.aborted) timer = setTimeout(ask, HISTORY_AGAIN_MS);
@@ -99,7 +99,7 @@ function Charts({ topic, scope }) {
     };
   }, [path]);
   const [times] = columns.current;
-  // Between two requests the stream gives the latest second.
+  // Between two requests the stream provides the latest second.
   const { rate: hertz, bandwidth: size, lostNow, p50, p99 } = state.figuresOf(topic.id);
   const last = times[times.length - 1] ?? 0;
   if (hertz != null && state.time >= Number(last) + 0.9) {
@@ -133,7 +133,7 @@ function Charts({ topic, scope }) {
     </div></section>`;
 }
 
-/** The definition of the topic's type, asked for when it is opened. @param {{path: string}} props */
+/** The definition of the topic's type, requested when it is opened. @param {{path: string}} props */
 function Definition({ path }) {
   const [open, turn] = useState(false);
   const { data, problem } = usePoll(open ? path : null, 0);
@@ -147,29 +147,29 @@ function Definition({ path }) {
         known: <${Name} text=${data.reason ?? 'no file has it'} /></p>`)}</section>`;
 }
 
-/** The stations at which a message can die, in their order. */
+/** Places at which a message can be lost, in order of its path. */
 const STATIONS = /** @type {[string, string][]} */ ([
   ['lost_before_host_messages', 'before this host'],
   ['lost_in_reassembly_messages', 'in IP reassembly'],
   ['lost_in_socket_buffer_messages', 'in the socket buffer'],
-  ['pending_messages', 'at a place not known yet'],
+  ['pending_messages', 'at an unknown place so far'],
 ]);
 
-/** Sent, what died at each station, delivered: for each subscriber. @param {{details: any}} props */
+/** Messages sent, lost at each place, and delivered, per subscriber. @param {{details: any}} props */
 function Waterfall({ details }) {
   const received = details.deliveries.filter((/** @type {any} */ each) =>
     each.direction === 'received');
   const sent = details.deliveries.filter((/** @type {any} */ each) => each.direction === 'sent');
   const owners = new Map([...details.publishers, ...details.subscriptions].map(
     (/** @type {any} */ each) => [each.guid, each.node]));
-  const title = html`<h2 id="waterfall">Where messages die</h2>`;
+  const title = html`<h2 id="waterfall">Where messages are lost</h2>`;
   if (!received.length) {
     const out = sent.reduce((/** @type {number} */ sum, /** @type {any} */ each) =>
       sum + each.delivered.messages, 0);
     return html`<section aria-labelledby="waterfall">${title}
       <p class="dim">${sent.length
         ? `${count(out)} messages left this host; what arrives elsewhere is seen there.`
-        : 'No delivery to a subscriber has been seen by its socket yet.'}</p></section>`;
+        : 'No delivery to a subscriber’s socket has been seen yet.'}</p></section>`;
   }
   return html`<section aria-labelledby="waterfall">${title}
     <div class="scroll" tabindex="0" role="group" aria-labelledby="waterfall"><table>
@@ -209,20 +209,20 @@ function Bar({ delivered, total }) {
     ${' '}${percent(delivered.messages / total)}`;
 }
 
-/** How messages go from publishers to subscribers. @param {{details: any}} props */
+/** The passages of messages to subscribers. @param {{details: any}} props */
 function Passages({ details }) {
   const { passages, acknowledgements, breakdown } = details;
   const late = acknowledgements.filter((/** @type {any} */ each) => each.lag_messages > 0);
   const stages = /** @type {[string, string][]} */ ([
-    ['send_delay', 'from the timestamp to leaving'], ['transit', 'from leaving to arriving'],
-    ['transfer', 'first to last datagram'], ['retransmission', 'until a lost one came again']]);
+    ['send_delay', 'from the timestamp to sending'], ['transit', 'from sending to arrival'],
+    ['transfer', 'first to last datagram'], ['retransmission', 'until a lost datagram was repeated']]);
   const spent = stages.filter(([key]) => breakdown?.[key]);
   if (!passages.length && !late.length && !spent.length) return null;
-  return html`<section aria-labelledby="ways"><h2 id="ways">How messages go</h2>
+  return html`<section aria-labelledby="ways"><h2 id="ways">Paths of messages</h2>
     ${passages.length > 0 && html`<p>${passages.map((/** @type {any} */ each) =>
       `${PASSAGES[each.passage] ?? each.passage}: ${count(each.pairs)} ${each.pairs === 1
         ? 'pair' : 'pairs'}${each.view ? ` (view: ${each.view})` : ''}`).join('; ')}</p>`}
-    ${spent.length > 0 && html`<table><caption>Where time goes on this host</caption><thead><tr>
+    ${spent.length > 0 && html`<table><caption>Delays on this host</caption><thead><tr>
       <th scope="col">Part</th><th scope="col" class="number">p50</th>
       <th scope="col" class="number">p99</th></tr></thead><tbody>${spent.map(([key, name]) => html`
       <tr key=${key}><th scope="row">${name}</th><td class="number">${duration(

@@ -9,7 +9,7 @@ import { Act, Badges, FLAGS, Filter, html, matches, Name, Spark, TopicLink, wors
 
 const SEVERITY = /** @type {Record<string, number>} */ ({ error: 0, warning: 1, note: 2, good: 3 });
 
-/** How lists of topics are narrowed. */
+/** Filters of the list of topics. */
 const ONLY = /** @type {Record<string, [string, (topic: any) => boolean]>} */ ({
   all: ['all', () => true],
   wrong: ['with problems', (topic) => ['error', 'warning'].includes(worst(state.flagsOf(topic.id)))],
@@ -23,12 +23,12 @@ export function watch(topic) {
   return topic.measured ? remove(path) : post(path);
 }
 
-// Topics without a ROS name are watched by their DDS name.
+// A topic without a ROS name is watched by its DDS name.
 function watchName(/** @type {import('../state.js').Topic} */ topic) {
   return topic.kind === 'dds' ? topic.ddsName : topic.name;
 }
 
-/** Why a topic cannot be switched off here; null where it can. @param {any} topic */
+/** Returns why measuring cannot be switched off here, or null. @param {any} topic */
 function fixed(topic) {
   if (!topic.measured || topic.watched === 0) return null;
   if (topic.watched & 4) return 'A watch with a pattern measures it.';

@@ -1,4 +1,4 @@
-//! Bags as the PyPI readers `mcap` and `rosbags` read them.
+//! Reads bags with the PyPI readers `mcap` and `rosbags`.
 
 use std::path::Path;
 use std::process::Command;
@@ -7,7 +7,8 @@ use serde_json::Value;
 
 use crate::repository;
 
-/// What both find in each of these bags (`bag_readers.py` has the form).
+/// Returns the results of both readers for each of these bags (`bag_readers.py` documents the
+/// form).
 #[must_use]
 pub fn read_by_others(bags: &[&Path]) -> Vec<Value> {
     let python = repository("target/tools/bags/bin/python");

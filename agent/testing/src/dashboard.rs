@@ -1,5 +1,6 @@
-//! The shipped Grafana dashboards as their JSON says: panels, their queries, the variables in them.
-//! It knows nothing of Grafana; what a file may hold is checked against Grafana's own types.
+//! The shipped Grafana dashboards, read from their JSON: panels, their queries, the variables in
+//! them. This module does not use Grafana; another test checks the files against Grafana's own
+//! types.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -8,7 +9,7 @@ use crate::repository;
 use anyhow::{Context as _, Result, ensure};
 use serde_json::Value;
 
-/// The template variable that every panel takes its data from.
+/// The template variable with every panel's data source.
 pub const DATA_SOURCE: &str = "${datasource}";
 
 pub struct Dashboard {
@@ -31,12 +32,12 @@ pub struct Target<'a> {
     pub legend: &'a str,
 }
 
-/// What the dashboards are in.
+/// Returns the directory of the dashboards.
 pub fn directory() -> PathBuf {
     repository("dashboards")
 }
 
-/// Every dashboard that is shipped.
+/// Returns every shipped dashboard.
 pub fn all() -> Result<Vec<Dashboard>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(directory())? {
@@ -59,7 +60,7 @@ pub fn all() -> Result<Vec<Dashboard>> {
 }
 
 impl Dashboard {
-    /// All panels but the headings of rows.
+    /// Returns all panels except the headings of rows.
     pub fn panels(&self) -> Vec<Panel<'_>> {
         let panels = list(&self.json, "/panels");
         let panels = panels.iter().filter(|panel| text(panel, "/type") != "row");
@@ -71,7 +72,7 @@ impl Dashboard {
         panels.map(panel).collect()
     }
 
-    /// The queries that fill template variables: variable, metric with its selector, label.
+    /// Returns the queries that fill template variables: variable, metric with its selector, label.
     pub fn variables(&self) -> Result<Vec<(String, String, String)>> {
         let variables = list(&self.json, "/templating/list").iter();
         let queries = variables.filter(|variable| text(variable, "/type") == "query");
@@ -112,7 +113,7 @@ impl<'a> Panel<'a> {
         targets.map(target).collect()
     }
 
-    /// Labels that a table gives a heading to, which its queries must therefore have.
+    /// Returns the labels with a heading in a table, which its queries must therefore have.
     pub fn columns(&self) -> Vec<&'a str> {
         let transformations = list(self.json, "/transformations").iter();
         let renamed =
@@ -125,7 +126,7 @@ impl<'a> Panel<'a> {
     }
 }
 
-/// The text between `{{` and `}}` in a legend.
+/// Returns the names between `{{` and `}}` in a legend.
 pub fn legend_labels(legend: &str) -> Vec<&str> {
     let after = legend.split("{{").skip(1);
     after
@@ -133,10 +134,10 @@ pub fn legend_labels(legend: &str) -> Vec<&str> {
         .collect()
 }
 
-/// An expression as Grafana would send it.
+/// Returns an expression as Grafana would send it.
 ///
 /// # Errors
-/// A variable in it has no value here.
+/// Fails if a variable in it has no value here.
 pub fn resolved(expression: &str, values: &BTreeMap<&str, String>) -> Result<String> {
     let mut rest = expression;
     let mut resolved = String::new();

@@ -1,9 +1,9 @@
-//! What the tests, benchmarks and examples of `ros2probe` share. Nothing of it is shipped.
+//! Shared code of the tests, benchmarks and examples of `ros2probe`; not shipped.
 //!
-//! [`harness`] starts agents and DDS peers in network namespaces, [`local_agent`] starts an agent on
-//! a capture without any privilege, [`forged`] sends RTPS that no real participant would, and
-//! [`model`] writes the same for a model in virtual time. Where something is missing, these fail and
-//! name what to install.
+//! [`harness`] starts agents and DDS peers in network namespaces, [`local_agent`] starts an agent
+//! on a capture without any privilege, [`forged`] sends RTPS that no real participant would, and
+//! [`model`] writes the same for a model in virtual time. If a tool is missing, these fail and name
+//! the package to install.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -27,12 +27,12 @@ pub mod truth;
 
 use std::path::{Path, PathBuf};
 
-/// The directory of the whole corpus of captures, which `ROS2PROBE_FIXTURES` names
-/// (`make test-corpus`).
+/// Returns the directory of the whole corpus of captures, named by `ROS2PROBE_FIXTURES` (`make
+/// test-corpus`).
 ///
 /// # Panics
 ///
-/// Panics if nothing is there: a test that needs it must not pass without it.
+/// Panics if the directory does not exist: a test that needs it must not pass without it.
 #[must_use]
 pub fn corpus() -> PathBuf {
     let named = std::env::var_os("ROS2PROBE_FIXTURES").map(PathBuf::from);
@@ -45,7 +45,7 @@ pub fn corpus() -> PathBuf {
     corpus
 }
 
-/// A file of the repository, named from its top.
+/// Returns a file of the repository, given its path from the top.
 #[must_use]
 pub fn repository(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -12,13 +12,13 @@ use serde_json::Value;
 /// Longest wait for anything.
 pub const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A small capture of the repository.
+/// Returns a small capture of the repository.
 pub fn capture() -> PathBuf {
     let data = repository("wire/tests/data");
     data.join("cyclonedds-samehost-any.pcap.gz")
 }
 
-/// `program`, with an environment that does not leak into it. A test names `rp` by
+/// Returns a command for `program` with a clean environment. A test names `rp` by
 /// `env!("CARGO_BIN_EXE_rp")`, which cargo sets for integration tests only.
 pub fn rp(program: &str) -> Command {
     let mut command = Command::new(program);
@@ -30,14 +30,14 @@ pub fn rp(program: &str) -> Command {
     command
 }
 
-/// A running agent; killed with its value.
+/// A running agent; dropping the value kills it.
 pub struct LocalAgent {
     child: Child,
     log: Receiver<String>,
     seen: Vec<String>,
-    /// The metrics listener's.
+    /// Address of the metrics listener.
     pub address: SocketAddr,
-    /// The control API's.
+    /// Address of the control API.
     pub api: SocketAddr,
 }
 
@@ -54,11 +54,11 @@ impl LocalAgent {
         Self::replay(rp, &capture(), arguments)
     }
 
-    /// As [`Self::start`], on another capture.
+    /// Starts as [`Self::start`] does, on another capture.
     pub fn replay(rp: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
         let mut child = rp
             .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
-            // Each test has a host of its own, as far as it knows.
+            // Each test treats this host as its own.
             .args(["--api-loopback", "all", "--replay"])
             .arg(capture)
             .args(arguments)
@@ -94,12 +94,12 @@ impl LocalAgent {
         address.unwrap().trim_matches('"').parse().unwrap()
     }
 
-    /// Its process.
+    /// Returns its process id.
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// The next line of the log that contains `text`.
+    /// Returns the next line of the log that contains `text`.
     pub fn wait_for_log(&mut self, text: &str) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -117,7 +117,7 @@ impl LocalAgent {
         }
     }
 
-    /// All of the log so far, and to its last line once the agent has ended.
+    /// Returns the log so far; the whole log after the agent has ended.
     pub fn log(&mut self) -> String {
         if matches!(self.child.try_wait(), Ok(Some(_))) {
             self.seen.extend(self.log.iter());
@@ -146,7 +146,7 @@ impl LocalAgent {
         request(self.address, method, path, headers)
     }
 
-    /// Scrapes until a series has a value that is wanted; panics with the last page otherwise.
+    /// Scrapes until `wanted` accepts the value of a series; panics with the last page otherwise.
     pub fn wait_for_metric(&self, series: &str, wanted: impl Fn(f64) -> bool) -> f64 {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -159,7 +159,7 @@ impl LocalAgent {
         }
     }
 
-    /// Waits for the end.
+    /// Waits for the end of the process.
     pub fn wait(&mut self) -> ExitStatus {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -179,7 +179,7 @@ impl Drop for LocalAgent {
     }
 }
 
-/// One request on its own connection.
+/// Sends one request on a new connection.
 pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Answer {
     let stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -187,7 +187,8 @@ pub fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> 
     exchange(stream, &head, "")
 }
 
-/// Asks the control API: the status, and the JSON of the body or null without one.
+/// Sends a request to the control API; returns the status, and the body's JSON or null if it is
+/// empty.
 pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value) {
     let stream = TcpStream::connect(api).unwrap();
     stream.set_read_timeout(Some(PATIENCE)).unwrap();
@@ -204,7 +205,7 @@ pub fn ask(api: SocketAddr, method: &str, path: &str, body: &str) -> (u16, Value
     (status, body)
 }
 
-/// Sends a request of this head, without its last line, and this body; reads the answer.
+/// Sends a request with this head, without its last line, and this body; reads the answer.
 pub fn exchange(mut stream: impl Read + Write, head: &str, body: &str) -> Answer {
     let request = format!("{head}Connection: close\r\n\r\n{body}");
     stream.write_all(request.as_bytes()).unwrap();
@@ -219,13 +220,13 @@ pub fn exchange(mut stream: impl Read + Write, head: &str, body: &str) -> Answer
     }
 }
 
-/// The value of a series, written as on the page.
+/// Returns the value of a series, named as on the page.
 pub fn metric(page: &str, series: &str) -> Option<f64> {
     page.lines()
         .find_map(|line| line.strip_prefix(series)?.strip_prefix(' ')?.parse().ok())
 }
 
-/// What promtool finds wrong with a page in classic format.
+/// Returns promtool's complaints about a page in classic format.
 pub fn promtool(page: &str) -> String {
     let mut promtool = Command::new("promtool")
         .args(["check", "metrics"])

@@ -1,4 +1,4 @@
-//! Runs the kernel filter on frames of the test's own making.
+//! Runs the kernel filter on frames built by a test.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -16,26 +16,26 @@ use ros2probe_wire::record::{Record, Verdict, kind};
 use ros2probe_wire::walk::{self, Envelope};
 use ros2probe_wire::{Guid, Timestamp};
 
-/// Interface index that frames seem to come from.
+/// Interface index of the frames.
 pub const INTERFACE: u32 = 1;
 
-/// What became of one frame.
+/// Result for one frame.
 pub struct Seen {
-    /// User space gets it.
+    /// Whether user space receives it.
     pub kept: bool,
-    /// Records that may count now.
+    /// Valid records.
     pub records: Vec<Record>,
 }
 
-/// What became of one datagram at a socket.
+/// Result for one datagram at a socket.
 pub struct SeenAtSocket {
-    /// Its first piece and all its bytes, when user space gets it.
+    /// Its first piece and all its bytes, if it is captured.
     pub captured: Option<(Piece, Vec<u8>)>,
-    /// Its records, also those that would have waited for more fragments.
+    /// Its records, including those held back for more fragments.
     pub records: Vec<Record>,
 }
 
-/// Which of the kernel's programs.
+/// One of the kernel programs.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Hook {
     Wire,
@@ -43,7 +43,7 @@ pub enum Hook {
     Egress,
 }
 
-/// A loaded filter, and the user-space side of fragments.
+/// A loaded filter, and user space's processing of fragments.
 pub struct Kernel {
     pub filter: Filter,
     hook: Hook,
@@ -104,17 +104,17 @@ impl Kernel {
         self.identification
     }
 
-    /// Records that user space read from what the filter handed over since the last call.
+    /// Returns records that user space read from handed-over datagrams since the last call.
     pub fn take_rest(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.rest)
     }
 
-    /// Runs of fragments that nobody has continued.
+    /// Returns incomplete runs of fragments.
     pub fn take_stalled(&mut self) -> Vec<Record> {
         self.filter.stalled_runs(u64::MAX)
     }
 
-    /// One IP packet.
+    /// Runs the program on one IP packet.
     pub fn frame(&mut self, packet: &[u8]) -> Seen {
         let (kept, _) = self.run(packet, 1);
         let kept = kept != 0;
@@ -150,7 +150,7 @@ impl Kernel {
         Seen { kept, records }
     }
 
-    /// One datagram in one IP packet, shown to a program of the host hook.
+    /// Runs a program of the host hook on one datagram in one IP packet.
     pub fn datagram(&mut self, packet: &[u8]) -> SeenAtSocket {
         let (verdict, _) = self.run(packet, 1);
         assert_eq!(verdict, 1, "a datagram was dropped: {packet:02x?}");
@@ -188,19 +188,19 @@ impl Kernel {
         }
     }
 
-    /// How long the program takes over one IP packet, `repeat` times in a row.
+    /// Returns the time of the program for one IP packet, run `repeat` times.
     pub fn time(&self, packet: &[u8], repeat: u32) -> Duration {
         let (_, mean) = self.run(packet, repeat);
         mean * repeat
     }
 
-    /// Forgets the records and pieces that nobody has read.
+    /// Discards unread records and pieces.
     pub fn drain(&mut self) {
         while self.filter.next_record().is_some() {}
         while self.filter.next_piece().is_some() {}
     }
 
-    /// The program that [`Self::run`] runs.
+    /// Returns the program that [`Self::run`] runs.
     pub fn program(&self) -> BorrowedFd<'_> {
         match self.hook {
             Hook::Wire | Hook::Ingress => self.filter.program(),
@@ -208,7 +208,7 @@ impl Kernel {
         }
     }
 
-    /// The program's own instructions as the kernel runs them, without those of the functions that
+    /// Returns the program's own instructions after verification, without those of functions that
     /// it calls (BPF_OBJ_GET_INFO_BY_FD).
     pub fn verified_main(&self) -> Vec<[u8; 8]> {
         /// The head of `struct bpf_prog_info` (linux/bpf.h).
@@ -248,8 +248,8 @@ impl Kernel {
                 len: u32::try_from(size_of::<ProgramInfo>()).unwrap(),
                 info: (&raw mut *info) as u64,
             };
-            // SAFETY: the attribute and the information have the sizes given, and the buffers that
-            // the information names have those that the kernel asked for.
+            // SAFETY: the attribute and the information have the sizes passed, and the buffers in
+            // the information have the sizes that the kernel returned.
             let result = unsafe {
                 libc::syscall(
                     libc::SYS_bpf,
@@ -275,19 +275,19 @@ impl Kernel {
             ..ProgramInfo::default()
         };
         ask(&mut info);
-        // The first function is the program, the next begins where it ends.
+        // The first function is the program; the next one begins at its end.
         let end = functions.get(1).map_or(usize::MAX, |each| each[0] as usize);
         instructions.truncate(end);
         instructions
     }
 
-    /// As [`run`], of this hook's program.
+    /// Runs this hook's program as [`run`] does.
     pub fn run(&self, packet: &[u8], repeat: u32) -> (u32, Duration) {
         run(self.program(), packet, repeat)
     }
 }
 
-/// BPF_PROG_TEST_RUN: what the program returns, and the mean time it takes.
+/// Runs BPF_PROG_TEST_RUN; returns the program's result, and its mean time.
 pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duration) {
     /// The head of `union bpf_attr` for BPF_PROG_TEST_RUN (linux/bpf.h).
     #[repr(C)]
@@ -325,7 +325,7 @@ pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duratio
         repeat,
         ..TestRun::default()
     };
-    // SAFETY: the attribute's size is given, and `frame` outlives the call.
+    // SAFETY: the attribute's size is passed, and `frame` outlives the call.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,
@@ -345,9 +345,9 @@ pub fn run(program: BorrowedFd<'_>, packet: &[u8], repeat: u32) -> (u32, Duratio
     )
 }
 
-/// Keeps this thread on the CPU that it is on, which another test may leave alone.
+/// Keeps this thread on its current CPU.
 fn stay_on_cpu() {
-    // SAFETY: takes nothing.
+    // SAFETY: takes no arguments.
     let cpu = unsafe { libc::sched_getcpu() };
     go_to_cpu(usize::try_from(cpu).unwrap());
 }
@@ -368,7 +368,7 @@ pub fn go_to_cpu(cpu: usize) {
     );
 }
 
-/// An RTPS message of one DATA per sequence number, each with `size` bytes of payload.
+/// Returns an RTPS message of one DATA per sequence number, each with `size` bytes of payload.
 pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
     bytes.extend_from_slice(&writer.prefix.0);
@@ -384,12 +384,12 @@ pub fn message(writer: Guid, numbers: RangeInclusive<u32>, size: usize) -> Vec<u
     bytes
 }
 
-/// One DATA as an IPv4 packet.
+/// Returns one DATA as an IPv4 packet.
 pub fn data(writer: Guid, number: u32, size: usize) -> Vec<u8> {
     datagram(&message(writer, number..=number, size))
 }
 
-/// One DATA_FRAG with one fragment of 1000 bytes, as an IPv4 packet.
+/// Returns one DATA_FRAG with one fragment of 1000 bytes, as an IPv4 packet.
 pub fn fragment(writer: Guid, number: u32, start: u32, of: u32) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x04\x01\x12".to_vec();
     bytes.extend_from_slice(&writer.prefix.0);
@@ -406,17 +406,17 @@ pub fn fragment(writer: Guid, number: u32, start: u32, of: u32) -> Vec<u8> {
     datagram(&bytes)
 }
 
-/// A UDP payload as an IPv4 packet.
+/// Returns a UDP payload as an IPv4 packet.
 pub fn datagram(payload: &[u8]) -> Vec<u8> {
     fragments(payload, 65_000, false, 0).remove(0)
 }
 
-/// A UDP payload as IP packets that carry at most `size` bytes of IP payload.
+/// Returns a UDP payload as IP packets that carry at most `size` bytes of IP payload.
 pub fn fragments(payload: &[u8], size: usize, ipv6: bool, identification: u32) -> Vec<Vec<u8>> {
     fragments_of(payload, &[size], ipv6, identification)
 }
 
-/// As [`fragments`], of these sizes in turn.
+/// Returns fragments as [`fragments`] does, of these sizes in turn.
 pub fn fragments_of(
     payload: &[u8],
     sizes: &[usize],

@@ -1,4 +1,4 @@
-//! A program on a pseudo-terminal, and what a person would see there.
+//! A program on a pseudo-terminal, and its screen.
 
 use std::fs::File;
 use std::io::{Read as _, Write as _};
@@ -11,11 +11,11 @@ use std::time::{Duration, Instant};
 /// Longest wait for anything.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A running program; killed with its value.
+/// A running program; dropping the value kills it.
 pub struct Terminal {
     child: Child,
     master: File,
-    /// Kept open: its settings are looked at after the program has ended.
+    /// Kept open: its settings are read after the program has ended.
     slave: OwnedFd,
     before: libc::termios,
     written: Receiver<Vec<u8>>,
@@ -28,7 +28,7 @@ impl Terminal {
     pub fn start(command: &mut Command) -> Self {
         let (mut master, mut slave) = (-1, -1);
         let size = window(80, 24);
-        // SAFETY: both descriptors are written to; no name and no settings are given.
+        // SAFETY: both descriptors are written to; name and settings are null.
         let opened = unsafe {
             libc::openpty(
                 &raw mut master,
@@ -39,14 +39,14 @@ impl Terminal {
             )
         };
         assert_eq!(opened, 0, "openpty: {}", std::io::Error::last_os_error());
-        // SAFETY: openpty has just opened it and nobody else owns it.
+        // SAFETY: openpty has just opened it, without another owner.
         let master = unsafe { File::from_raw_fd(master) };
-        // SAFETY: likewise.
+        // SAFETY: as above.
         let slave = unsafe { OwnedFd::from_raw_fd(slave) };
         let end = || Stdio::from(slave.try_clone().unwrap());
         command.stdin(end()).stdout(end()).stderr(end());
         let lead = || {
-            // SAFETY: a fresh child leads no group.
+            // SAFETY: a new child leads no group.
             let led = unsafe { libc::setsid() };
             // SAFETY: standard input is the terminal.
             let owned = unsafe { libc::ioctl(0, libc::TIOCSCTTY, 0) };
@@ -87,13 +87,13 @@ impl Terminal {
     pub fn resize(&mut self, width: u16, height: u16) {
         let size = window(width, height);
         let descriptor = self.master.as_raw_fd();
-        // SAFETY: the descriptor is open and the size is of the type that is asked for.
+        // SAFETY: the descriptor is open and the size has the requested type.
         let resized = unsafe { libc::ioctl(descriptor, libc::TIOCSWINSZ, &raw const size) };
         assert_eq!(resized, 0);
         self.screen = Screen::new(width.into(), height.into());
     }
 
-    /// From now on the terminal takes no output, as one on a line that hangs.
+    /// Stops the terminal's output, as on a line that hangs.
     pub fn stop_output(&self) {
         // SAFETY: the descriptor is open; nothing else is passed.
         let stopped = unsafe { libc::tcflow(self.slave.as_raw_fd(), libc::TCOOFF) };
@@ -111,7 +111,7 @@ impl Terminal {
         );
     }
 
-    /// Waits until this is on the screen.
+    /// Waits until this text is on the screen.
     pub fn wait_for(&mut self, text: &str) {
         let deadline = Instant::now() + PATIENCE;
         while !self.screen().contains(text) {
@@ -127,7 +127,7 @@ impl Terminal {
         self.screen.text()
     }
 
-    /// Waits for the end; the exit code, `None` when a signal was the end.
+    /// Waits for the end; returns the exit code, `None` after a signal.
     pub fn ends(&mut self) -> Option<i32> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -140,19 +140,19 @@ impl Terminal {
         }
     }
 
-    /// All that was written so far.
+    /// Returns all output so far.
     pub fn written(&self) -> String {
         String::from_utf8_lossy(&self.all).into_owned()
     }
 
-    /// The terminal's settings are as they were.
+    /// Asserts that the terminal's settings are restored.
     pub fn assert_settings_given_back(&self) {
         let now = settings(&self.slave);
         let flags = |it: &libc::termios| (it.c_iflag, it.c_oflag, it.c_cflag, it.c_lflag, it.c_cc);
         assert_eq!(flags(&now), flags(&self.before));
     }
 
-    /// The terminal is as it was: settings, screen and cursor.
+    /// Asserts that the terminal's settings, screen and cursor are restored.
     pub fn assert_given_back(&self) {
         self.assert_settings_given_back();
         let text = self.written();
@@ -167,7 +167,7 @@ impl Terminal {
         );
     }
 
-    /// Whether anything came before the deadline.
+    /// Returns whether any output arrived before the deadline.
     fn read(&mut self, deadline: Instant) -> bool {
         let left = deadline.saturating_duration_since(Instant::now());
         match self.written.recv_timeout(left) {
@@ -198,7 +198,7 @@ const fn window(width: u16, height: u16) -> libc::winsize {
 }
 
 fn settings(terminal: &OwnedFd) -> libc::termios {
-    // SAFETY: plain numbers, for which zero is a value.
+    // SAFETY: plain integers, for which zero is valid.
     let mut settings = unsafe { std::mem::zeroed() };
     // SAFETY: the descriptor is open and the settings are written to.
     let read = unsafe { libc::tcgetattr(terminal.as_raw_fd(), &raw mut settings) };
@@ -206,12 +206,12 @@ fn settings(terminal: &OwnedFd) -> libc::termios {
     settings
 }
 
-/// As much of a terminal as the program uses: text, cursor positions, clearing.
+/// The parts of a terminal that the program uses: text, cursor positions, clearing.
 struct Screen {
     cells: Vec<Vec<char>>,
     row: usize,
     column: usize,
-    /// The beginning of a sequence or character whose end has not come yet.
+    /// The start of an incomplete sequence or character.
     rest: Vec<u8>,
 }
 

@@ -1,4 +1,4 @@
-//! A real OpenTelemetry receiver, rotel, and what it printed of all it got.
+//! A real OpenTelemetry receiver, rotel, and its printed output.
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::net::{SocketAddr, TcpListener};
@@ -11,14 +11,14 @@ use crate::repository;
 /// Longest wait for anything.
 const PATIENCE: Duration = Duration::from_secs(30);
 
-/// A running receiver; killed with its value, what it printed stays.
+/// A running receiver; dropping the value kills it, its output stays.
 pub struct Rotel {
     child: Child,
     output: PathBuf,
     pub address: SocketAddr,
 }
 
-/// One data point, span or record as printed: fields and attributes by name.
+/// One printed data point, span or record: fields and attributes by name.
 #[derive(Clone, Debug, Default)]
 pub struct Item {
     /// `Name`, `Unit`, `Value`, `Trace ID`, ...
@@ -28,7 +28,7 @@ pub struct Item {
     pub buckets: Vec<u64>,
 }
 
-/// What came in one request.
+/// Content of one request.
 #[derive(Clone, Debug, Default)]
 pub struct Export {
     pub resource: BTreeMap<String, String>,
@@ -36,7 +36,7 @@ pub struct Export {
 }
 
 impl Rotel {
-    /// Starts one on a free port, or on this one again, printing into `directory`.
+    /// Starts a receiver on a free port, or again on this one, printing into `directory`.
     pub fn start(command: &mut Command, directory: &Path, address: Option<SocketAddr>) -> Self {
         let free = || {
             let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -75,7 +75,7 @@ impl Rotel {
         rotel
     }
 
-    /// The binary, as the prerequisites install it.
+    /// Returns the binary installed by the prerequisites.
     pub fn binary() -> PathBuf {
         let tools = repository("target/tools/rotel/lib");
         let directories = fs::read_dir(&tools).into_iter().flatten().flatten();
@@ -86,12 +86,12 @@ impl Rotel {
             .unwrap_or_else(|| panic!("no rotel in {}: run `make prerequisites`", tools.display()))
     }
 
-    /// Everything printed so far.
+    /// Returns all output so far.
     pub fn text(&self) -> String {
         fs::read_to_string(&self.output).unwrap()
     }
 
-    /// Waits until what it printed is as wanted, and gives it.
+    /// Waits until `wanted` accepts the output, and returns it.
     pub fn wait_for(&mut self, what: &str, wanted: impl Fn(&str) -> bool) -> String {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -117,7 +117,7 @@ impl Drop for Rotel {
     }
 }
 
-/// The names of all that came, and how often.
+/// Returns all names in the output, with their number.
 fn names(text: &str) -> String {
     let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
     for line in text.lines().map(str::trim_start) {
@@ -131,7 +131,7 @@ fn names(text: &str) -> String {
     format!("{counts:#?}")
 }
 
-/// What was printed, by request. The last one may be cut.
+/// Returns the output, by request. The last one may be truncated.
 pub fn exports(text: &str) -> Vec<Export> {
     let mut exports: Vec<Export> = Vec::new();
     let mut family = BTreeMap::new();
@@ -179,7 +179,7 @@ pub fn exports(text: &str) -> Vec<Export> {
     exports
 }
 
-/// The value in `Str(value)` or `Int(value)`.
+/// Returns the value in `Str(value)` or `Int(value)`.
 fn plain(value: &str) -> Option<String> {
     let inner = ["Str(", "Int(", "Double(", "Bool("]
         .into_iter()

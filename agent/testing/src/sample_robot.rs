@@ -1,4 +1,4 @@
-//! A robot of any size as the model would describe it, with every fact filled in.
+//! A robot of any size as the model describes it, with every fact filled in.
 
 use std::net::Ipv4Addr;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
 
-/// Everything an agent knows of a robot with topics of these names, all watched by `/**`.
+/// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     let guid = Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 0xc1]));
     let topics: Vec<TopicFacts> = names.into_iter().map(topic).collect();
@@ -104,7 +104,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
     }
 }
 
-/// One finding of each kind.
+/// Returns one finding of each kind.
 fn diagnoses() -> Diagnoses {
     let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
     let (writer, reader) = (guid([0, 0, 1, 3]), guid([0, 0, 2, 4]));
@@ -175,7 +175,7 @@ fn process() -> ProcessFacts {
     }
 }
 
-/// An agent in the midst of it.
+/// Returns the facts of a running agent.
 pub fn agent() -> AgentFacts {
     AgentFacts {
         interfaces: vec![InterfaceFacts {
@@ -203,7 +203,7 @@ pub fn agent() -> AgentFacts {
     }
 }
 
-/// A measured topic with one publisher and one subscription.
+/// Returns a measured topic with one publisher and one subscription.
 pub fn topic(name: &str) -> TopicFacts {
     let guid = |entity: u8| Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, entity, 3]));
     let endpoint = |guid: Guid| EndpointFacts {
@@ -259,7 +259,8 @@ pub fn topic(name: &str) -> TopicFacts {
     }
 }
 
-/// What one writer sends to the destination of one subscriber, or what that one received.
+/// Returns the samples that one writer sends to a subscriber's destination, or that the subscriber
+/// received.
 pub fn delivery(direction: Direction) -> DeliveryFacts {
     let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
     let received = direction == Direction::Received;

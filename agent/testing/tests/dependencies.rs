@@ -1,4 +1,5 @@
-//! Which crate may depend on which. An arrow upwards fails here with one line that names it.
+//! Permitted dependencies between the crates. A dependency upwards fails here with one line that
+//! names it.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -12,8 +13,8 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// Each crate with the crates of this workspace that it may depend on, lowest first. A crate may
-/// depend on those above it in this list alone, so no cycle can be allowed by mistake.
+/// Each crate with the crates of this workspace on which it may depend, lowest first. A crate may
+/// depend only on crates above it in this list, so no cycle can be allowed by mistake.
 const ALLOWED: &[(&str, &[&str])] = &[
     ("wire", &[]),
     ("model", &["wire"]),
@@ -27,16 +28,9 @@ const ALLOWED: &[(&str, &[&str])] = &[
         "daemon",
         &["wire", "model", "capture", "message", "bag", "api", "page"],
     ),
-    // The package is called ros2probe. A running agent is asked through the API alone. What needs
-    // more: a replay within the process (`client/replay_agent.rs`) and `rp discover` (`ask.rs`)
-    // compose a capture and a model; `rp doctor` examines this host as the capture does; `rp bag
-    // record` (`client/samples.rs`) gives the daemon's recorder samples of the model.
-    (
-        "cli",
-        &[
-            "wire", "model", "capture", "message", "bag", "api", "daemon",
-        ],
-    ),
+    // The package is called ros2probe. It asks a running agent through the API alone; the daemon
+    // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.
+    ("cli", &["message", "bag", "api", "daemon"]),
 ];
 
 /// Libraries that must not be in the model's tree: it has no I/O, no clock, no configuration.
@@ -124,13 +118,13 @@ impl Workspace {
         }
     }
 
-    /// Names of what a crate depends on, directly.
+    /// Returns the names of a crate's direct dependencies.
     fn direct(&self, name: &str) -> BTreeSet<&str> {
         let dependencies = self.dependencies[&self.ids[name]].iter();
         dependencies.map(|id| self.names[id].as_str()).collect()
     }
 
-    /// Names of all that a crate is built from, without itself.
+    /// Returns the names of all dependencies of a crate, without itself.
     fn tree(&self, name: &str) -> BTreeSet<&str> {
         let mut waiting = vec![&self.ids[name]];
         let mut seen = BTreeSet::new();

@@ -1,4 +1,4 @@
-//! Documents name files that exist, link to pages and headings that exist, and stay readable.
+//! Documents refer to existing files, pages and headings, and stay readable.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -21,10 +21,10 @@ const MAX_COLUMNS: usize = 100;
 /// Pages that may be longer: SECURITY.md names the tests of each claim.
 const LONG: [&str; 1] = ["SECURITY.md"];
 
-/// Documents with a list of panels that the dashboards generate.
+/// Documents with a list of panels generated from the dashboards.
 const GENERATED: [&str; 1] = ["dashboards/README.md"];
 
-/// Paths of the Rust sources below a folder, `/` before each name.
+/// Collects paths of the Rust sources below a folder, with `/` before each name.
 fn sources(folder: &Path, into: &mut Vec<String>) {
     for entry in fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -80,7 +80,7 @@ fn links(line: &str) -> Vec<String> {
     targets.map(|(target, _)| target.to_owned()).collect()
 }
 
-/// What a Git host and mdBook call the heading in a link.
+/// Returns the anchor that a Git host and mdBook generate for a heading.
 fn anchor(heading: &str) -> String {
     let kept = |c: &char| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_');
     let name = heading.to_lowercase();

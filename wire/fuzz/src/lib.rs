@@ -1,11 +1,11 @@
-//! What the fuzz targets do with their bytes: plain functions, so that the tests run them too, over
-//! the committed seeds and all their truncations (`wire/tests/fuzz_seeds.rs`). In this directory:
-//! `cargo +nightly fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery` and
-//! `entities` with their directories under `seeds`.
+//! Bodies of the fuzz targets: plain functions, so that the tests run them too, over the committed
+//! seeds and all their truncations (`wire/tests/fuzz_seeds.rs`). In this directory: `cargo +nightly
+//! fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery` and `entities` with
+//! their directories under `seeds`.
 //!
-//! Each reads like the agent does and asserts what must hold whatever the bytes are: no panic, no
-//! list beyond its bound, nothing kept that was not shown to exist, and the kernel filter's walk
-//! agreeing with the oracle (`wire/tests/oracle`).
+//! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
+//! panics, no list exceeds its bound, nothing is kept that does not exist in the input, and the
+//! kernel filter's walk agrees with the oracle (`wire/tests/oracle`).
 
 use ros2probe_wire::discovery::{self, Discovery, Role};
 use ros2probe_wire::entities::ParticipantEntities;
@@ -21,7 +21,7 @@ pub mod oracle;
 use oracle::sets::SequenceNumberSet;
 use oracle::{Body, Message, Submessage};
 
-/// A UDP payload, through everything that looks into it.
+/// Reads a UDP payload with every parser.
 pub fn datagram(bytes: &[u8]) {
     let Ok(message) = Message::parse(bytes) else {
         return;
@@ -72,7 +72,7 @@ pub fn datagram(bytes: &[u8]) {
     }
 }
 
-/// A discovery sample: the first byte chooses what it is taken for, the rest is its payload.
+/// Reads a discovery sample: the first byte chooses its kind, the rest is its payload.
 pub fn discovery(bytes: &[u8]) {
     let Some((choice, bytes)) = bytes.split_first() else {
         return;
@@ -99,7 +99,7 @@ pub fn discovery(bytes: &[u8]) {
     }
 }
 
-/// The payload of a `ros_discovery_info` sample.
+/// Reads the payload of a `ros_discovery_info` sample.
 pub fn entities(bytes: &[u8]) {
     let Ok(entities) = ParticipantEntities::parse(bytes) else {
         return;
@@ -165,7 +165,7 @@ fn endpoint(role: Role, vendor: VendorId, payload: Payload<'_>, inline_qos: &Inl
     assert!(endpoint.type_name.service().as_str().len() <= endpoint.type_name.as_str().len());
 }
 
-/// Every record of the kernel filter's walk with the offset of its submessage.
+/// Returns every record of the kernel filter's walk with the offset of its submessage.
 fn walk(bytes: &[u8], prefix: [u8; 12]) -> Vec<(usize, Record)> {
     let Ok(length) = u32::try_from(bytes.len()) else {
         return Vec::new();
@@ -188,8 +188,8 @@ fn walk(bytes: &[u8], prefix: [u8; 12]) -> Vec<(usize, Record)> {
     }
 }
 
-/// Whether the walk saw what the oracle saw. The other direction need not hold: the walk lets
-/// numbers pass that the oracle refuses.
+/// Checks that the walk saw what the oracle saw. The opposite need not hold: the walk accepts
+/// numbers that the oracle rejects.
 fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     let (kind, writer, reader, number) = match submessage.body {
         Body::Data(data) => (kind::DATA, data.writer, data.reader, data.sequence_number),
@@ -230,7 +230,7 @@ fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     bodies_agree(submessage, record);
 }
 
-/// Whether the record's body, read as its kind, says what the oracle read.
+/// Checks that the record's body, interpreted by its kind, matches the oracle's.
 fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
     match (submessage.body, record.body()) {
         (Body::Data(data), record::Body::Sample(Sample::Data(ours))) => {
@@ -271,13 +271,13 @@ fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
     }
 }
 
-/// A record has the first numbers of a long set only.
+/// Checks the sets; a record holds only the first numbers of a long set.
 fn sets_agree(ours: &record::SequenceNumberSet, theirs: &SequenceNumberSet<'_>) {
     assert_eq!(ours.base, theirs.base.0.cast_unsigned());
     assert_eq!(ours.num_bits, theirs.num_bits());
     let end = ours.base.saturating_add(Record::BITMAP_BITS.into());
     let numbers = theirs.iter().map(|number| number.0.cast_unsigned());
-    // Beyond the largest sequence number the oracle has none.
+    // The oracle yields no numbers beyond the largest sequence number.
     let largest = i64::MAX.cast_unsigned();
     assert!(
         ours.iter()
@@ -286,7 +286,7 @@ fn sets_agree(ours: &record::SequenceNumberSet, theirs: &SequenceNumberSet<'_>) 
     );
 }
 
-/// Whether payload and inline QoS of each DATA are where the oracle finds them.
+/// Checks that the payload and inline QoS of each DATA are where the oracle finds them.
 fn samples_agree(bytes: &[u8], message: Message<'_>) {
     let mut found = Vec::new();
     walk::datagram(bytes, &Envelope::default(), None, |each| {
@@ -304,7 +304,7 @@ fn samples_agree(bytes: &[u8], message: Message<'_>) {
         let ours = &found[index];
         let list = data.inline_qos.map(|list| InlineQos::parse(list, vendor));
         let inline_qos = list.unwrap_or(Ok(InlineQos::default()));
-        // Offsets are those in the datagram there, and in the submessage here.
+        // The oracle's offsets are those in the datagram, the walk's those in the submessage.
         assert_eq!(
             ours.inline_qos(vendor).map_err(|error| error.reason),
             inline_qos.map_err(|error| error.reason)

@@ -11,16 +11,16 @@ use crate::qos::{Qos, Role};
 use crate::rtps::{Locator, VendorId};
 use crate::text;
 
-/// What is said about one endpoint.
+/// The announcement of one endpoint.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct EndpointAnnouncement {
-    /// Which endpoint.
+    /// GUID of the endpoint.
     pub guid: Guid,
-    /// Whose.
+    /// GUID of its participant.
     pub participant: Guid,
     /// Writer or reader.
     pub role: Role,
-    /// Its implementation.
+    /// Vendor of its DDS implementation.
     pub vendor: VendorId,
     /// Its topic.
     pub topic: DdsTopic,
@@ -28,29 +28,29 @@ pub struct EndpointAnnouncement {
     pub type_name: DdsType,
     /// Its quality of service.
     pub qos: Qos,
-    /// Its ROS type's hash; Humble says none.
+    /// Hash of its ROS type; `None` from Humble, which announces no hash.
     pub type_hash: Option<TypeHash>,
-    /// Of a service's endpoint, the service type's hash; Lyrical and later.
+    /// Hash of the service type, for a service's endpoint in Lyrical and later.
     pub service_type_hash: Option<TypeHash>,
-    /// Where it is reached, when elsewhere than its participant's other endpoints.
+    /// Unicast locators, if they differ from its participant's default ones.
     pub unicast: Vec<Locator>,
-    /// Where it is reached by multicast.
+    /// Multicast locators, if they differ from its participant's default ones.
     pub multicast: Vec<Locator>,
-    /// Fast DDS: it can share its history in memory with endpoints of its host.
+    /// Fast DDS: whether it can share its history in memory with endpoints on its host.
     pub datasharing: bool,
-    /// A reader that has the writer leave samples out: a gap for it is not a loss.
+    /// Whether the reader uses a content filter: then a gap in its samples is not a loss.
     pub content_filter: bool,
-    /// DDS Security protects it.
+    /// Whether DDS Security protects it.
     pub is_secured: bool,
-    /// There were more locators than are kept.
+    /// Whether it announced more locators than are kept.
     pub is_truncated: bool,
 }
 
 impl EndpointAnnouncement {
-    /// From a payload of the SEDP writer for `role`.
+    /// Parses a payload of the SEDP writer for `role`.
     ///
     /// # Errors
-    /// The list is malformed, does not say which endpoint, topic and type, or contradicts itself.
+    /// Fails if the list is malformed, lacks the GUID, topic or type, or contradicts itself.
     pub fn parse(role: Role, payload: &[u8], sender: VendorId) -> Result<Self, WireError> {
         let parameters = ParameterList::encapsulated(payload)?;
         let bad = |what| WireError {
@@ -68,7 +68,7 @@ impl EndpointAnnouncement {
         if !fits {
             return Err(bad("PID_ENDPOINT_GUID"));
         }
-        // Cyclone DDS leaves it out. One that differs would put the endpoint under somebody else.
+        // Cyclone DDS omits it. A different one would assign the endpoint to another participant.
         let participant = Guid::new(guid.prefix, EntityId::PARTICIPANT);
         if let Some(mut value) = parameters.find(ParameterId::PARTICIPANT_GUID)?
             && Guid::from_bytes(value.array("PID_PARTICIPANT_GUID")?) != participant

@@ -1,9 +1,10 @@
-//! Discovery data: what SPDP says about participants and SEDP about endpoints (RTPS 2.5, 8.5).
+//! Discovery data: SPDP announcements of participants and SEDP announcements of endpoints (RTPS
+//! 2.5, 8.5).
 //!
-//! One sample in, one statement out: this is alive with these properties, or it is gone. Identity
-//! is taken from the payload (or its key hash), never from the message's header: a Discovery
-//! Server relays what others say. Nothing is remembered here and no default is invented for what
-//! identifies; lists are bounded, and what is cut is said.
+//! One sample yields one statement: the entity is alive with these properties, or it is gone. The
+//! identity comes from the payload (or its key hash), never from the message's header: a Discovery
+//! Server relays announcements of others. This module keeps no state and invents no default for an
+//! identity. Lists are bounded, and a flag marks truncated ones.
 
 mod endpoint;
 mod participant;
@@ -21,25 +22,24 @@ pub use endpoint::EndpointAnnouncement;
 pub use participant::{BuiltinEndpoints, ParticipantAnnouncement, Property};
 pub use user_data::{TypeHash, UserData};
 
-/// What one discovery sample says.
+/// The statement of one discovery sample.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Discovery<T> {
-    /// It is there, and this is what it is like now.
+    /// The entity is alive, with its current properties.
     Alive(T),
-    /// It was disposed or unregistered.
+    /// The entity was disposed or unregistered.
     Gone {
-        /// What is gone.
+        /// GUID of the entity.
         guid: Guid,
-        /// Which of the two, or both.
+        /// Disposed, unregistered, or both.
         status: StatusInfo,
     },
 }
 
-/// Reads a sample of the SPDP writer. `vendor` is the sender's, for the case that the payload does
-/// not say.
+/// Parses a sample of the SPDP writer. `vendor` is the sender's, used if the payload has none.
 ///
 /// # Errors
-/// The payload is malformed or does not say whom it is about.
+/// Fails if the payload is malformed or does not identify the participant.
 pub fn participant(
     vendor: VendorId,
     payload: Payload<'_>,
@@ -56,11 +56,11 @@ pub fn participant(
     )
 }
 
-/// Reads a sample of the SEDP publications (`role` writer) or subscriptions (`role` reader) writer.
-/// `vendor` is the sender's, for the case that the payload does not say.
+/// Parses a sample of the SEDP publications (`role` writer) or subscriptions (`role` reader)
+/// writer. `vendor` is the sender's, used if the payload has none.
 ///
 /// # Errors
-/// The payload is malformed or does not say which endpoint it is about.
+/// Fails if the payload is malformed or does not identify the endpoint.
 pub fn endpoint(
     role: Role,
     vendor: VendorId,
@@ -78,8 +78,9 @@ pub fn endpoint(
     )
 }
 
-/// Who is gone, when the sample says that somebody is. Cyclone DDS sends the key as a payload,
-/// Fast DDS no payload and the key hash, which for discovery data is the GUID, in the inline QoS.
+/// Returns the entity that the sample disposes or unregisters. Cyclone DDS sends the key as a
+/// payload. Fast DDS sends no payload and puts the key hash, which for discovery data is the GUID,
+/// into the inline QoS.
 fn gone(
     payload: Payload<'_>,
     inline_qos: &InlineQos,
@@ -109,7 +110,7 @@ fn gone(
         .ok_or(missing)
 }
 
-/// The instance's GUID, from its own parameter or from the key hash beside it.
+/// Returns the instance's GUID, from its own parameter or from the key hash beside it.
 fn guid(parameters: ParameterList<'_>, key: ParameterId) -> Result<Option<Guid>, WireError> {
     for id in [key, ParameterId::KEY_HASH] {
         if let Some(mut value) = parameters.find(id)? {
@@ -119,7 +120,7 @@ fn guid(parameters: ParameterList<'_>, key: ParameterId) -> Result<Option<Guid>,
     Ok(None)
 }
 
-/// Whose vendor-specific parameters these are.
+/// Returns the vendor that defines these vendor-specific parameters.
 fn vendor(parameters: ParameterList<'_>, sender: VendorId) -> Result<VendorId, WireError> {
     match parameters.find(ParameterId::VENDORID)? {
         Some(mut value) => Ok(VendorId(value.array("PID_VENDORID")?)),
@@ -127,11 +128,11 @@ fn vendor(parameters: ParameterList<'_>, sender: VendorId) -> Result<VendorId, W
     }
 }
 
-/// Most locators kept of one kind of one participant or endpoint. A host with many container
-/// bridges announces one or two for each.
+/// Most locators kept of one kind per participant or endpoint. A host with many container bridges
+/// announces one or two per bridge.
 const MAX_LOCATORS: usize = 64;
 
-/// Takes one more locator over, or says that the list is full.
+/// Adds a locator, or sets the truncation flag if the list is full.
 fn push_locator(
     locators: &mut Vec<Locator>,
     mut value: Cursor<'_>,

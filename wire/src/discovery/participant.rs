@@ -14,69 +14,70 @@ use crate::rtps::{Locator, ProtocolVersion, VendorId};
 use crate::text;
 use crate::time::Duration;
 
-/// What holds when a participant does not say how long it may be silent (RTPS 2.5, 9.6.2.2.1).
+/// Lease of a participant that announces none (RTPS 2.5, 9.6.2.2.1).
 const DEFAULT_LEASE: Duration = Duration::Finite(100_000_000_000);
-/// Most properties kept of one participant, and the longest name or value of one.
+/// Most properties kept per participant, and the longest name or value of one.
 const MAX_PROPERTIES: usize = 32;
 const MAX_PROPERTY_LEN: usize = 256;
 /// Longest entity name, enclave or domain tag.
 const MAX_NAME_LEN: usize = 256;
 
-/// Which discovery endpoints a participant has (RTPS 2.5, 9.3.2.12).
+/// Bit set of a participant's discovery endpoints (RTPS 2.5, 9.3.2.12).
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
 pub struct BuiltinEndpoints(pub u32);
 
 /// One pair of a property list.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Property {
-    /// Its name.
+    /// Name of the property.
     pub name: Box<str>,
-    /// Its value.
+    /// Value of the property.
     pub value: Box<str>,
 }
 
-/// What a participant says about itself.
+/// The announcement of one participant.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct ParticipantAnnouncement {
-    /// Who.
+    /// GUID of the participant.
     pub guid: Guid,
-    /// Its implementation.
+    /// Vendor of its DDS implementation.
     pub vendor: VendorId,
-    /// The protocol version it speaks; zero when not said.
+    /// The protocol version it speaks; zero if not announced.
     pub protocol_version: ProtocolVersion,
-    /// Silent for longer than this, it is gone.
+    /// Time without a message after which the participant is gone.
     pub lease: Duration,
-    /// Its domain; Fast DDS 2.x does not say, there the port tells.
+    /// Its domain; `None` from Fast DDS 2.x, where the port implies it.
     pub domain_id: Option<DomainId>,
     /// Its domain's tag; empty is the default.
     pub domain_tag: String,
-    /// Its entity name, where it is plain text; Fast DDS puts the enclave here.
+    /// Its entity name if it is plain text; Fast DDS puts the enclave here.
     pub entity_name: String,
-    /// The ROS enclave; only ROS participants have one.
+    /// The ROS enclave; `None` if the participant is not ROS.
     pub enclave: Option<String>,
-    /// Its properties.
+    /// Its properties, in announced order.
     pub properties: Vec<Property>,
-    /// Where its discovery endpoints are reached.
+    /// Unicast locators of its discovery endpoints.
     pub metatraffic_unicast: Vec<Locator>,
-    /// Where they are reached by multicast.
+    /// Multicast locators of its discovery endpoints.
     pub metatraffic_multicast: Vec<Locator>,
-    /// Where its other endpoints are reached.
+    /// Unicast locators of its other endpoints.
     pub default_unicast: Vec<Locator>,
-    /// Where those are reached by multicast.
+    /// Multicast locators of its other endpoints.
     pub default_multicast: Vec<Locator>,
-    /// Which discovery endpoints it has.
+    /// Its discovery endpoints.
     pub builtin_endpoints: BuiltinEndpoints,
-    /// It authenticates its peers (DDS Security); what it says further may be encrypted.
+    /// Whether it authenticates its peers (DDS Security); its further discovery data may be
+    /// encrypted.
     pub is_secured: bool,
-    /// There were more locators or properties than are kept, or unreadable ones.
+    /// Whether it announced more locators or properties than are kept, or unreadable ones.
     pub is_truncated: bool,
 }
 
 impl ParticipantAnnouncement {
-    /// From a payload.
+    /// Parses an SPDP payload.
     ///
     /// # Errors
-    /// The list is malformed or does not say who announces itself.
+    /// Fails if the list is malformed or lacks the participant's GUID.
     pub fn parse(payload: &[u8], sender: VendorId) -> Result<Self, WireError> {
         let parameters = ParameterList::encapsulated(payload)?;
         let nobody = WireError {
@@ -127,7 +128,7 @@ impl ParticipantAnnouncement {
                 self.domain_tag = text::name(&mut value, "PID_DOMAIN_TAG", MAX_NAME_LEN)?.into();
             }
             ParameterId::ENTITY_NAME => {
-                // Not an identity, and free text where ROS did not set it.
+                // Not an identity; free text unless ROS set it.
                 match text::name(&mut value, "PID_ENTITY_NAME", MAX_NAME_LEN) {
                     Ok(name) => self.entity_name = name.into(),
                     Err(_) => *truncated = true,
@@ -166,13 +167,13 @@ impl ParticipantAnnouncement {
         Ok(())
     }
 
-    /// Whether ROS made it.
+    /// Returns whether ROS created the participant.
     #[must_use]
     pub const fn is_ros(&self) -> bool {
         self.enclave.is_some()
     }
 
-    /// Value of a property.
+    /// Returns the value of a property.
     #[must_use]
     pub fn property(&self, name: &str) -> Option<&str> {
         self.properties
@@ -181,26 +182,26 @@ impl ParticipantAnnouncement {
             .map(|found| &*found.value)
     }
 
-    /// Its host's name, as Cyclone DDS always and Fast DDS sometimes says.
+    /// Returns its host's name, which Cyclone DDS always and Fast DDS sometimes announces.
     #[must_use]
     pub fn host_name(&self) -> Option<&str> {
         self.property("__Hostname")
             .or_else(|| self.property("fastdds.physical_data.host"))
     }
 
-    /// Its process's name, as Cyclone DDS says.
+    /// Returns its process's name, which Cyclone DDS announces.
     #[must_use]
     pub fn process_name(&self) -> Option<&str> {
         self.property("__ProcessName")
     }
 
-    /// Its process's number, as Cyclone DDS says, in its own PID namespace.
+    /// Returns its process id in its own PID namespace, which Cyclone DDS announces.
     #[must_use]
     pub fn process_id(&self) -> Option<u32> {
         self.property("__Pid")?.parse().ok()
     }
 
-    /// The low 16 bits of its process's number, which Fast DDS puts into its GUIDs.
+    /// Returns the low 16 bits of its process id, which Fast DDS puts into its GUIDs.
     #[must_use]
     pub fn process_id_low_bits(&self) -> Option<u16> {
         let prefix = Cursor::new(&self.guid.prefix.0, Endianness::Little);
@@ -211,7 +212,7 @@ impl ParticipantAnnouncement {
     }
 }
 
-/// Keeps the readable properties that fit; the others are only missed by whoever asks for them.
+/// Parses the properties, keeping the readable ones that fit; the others are optional information.
 fn properties(
     value: &mut Cursor<'_>,
     properties: &mut Vec<Property>,

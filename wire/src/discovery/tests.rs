@@ -49,7 +49,7 @@ fn udp(locators: &[Locator]) -> Vec<String> {
     locators.iter().map(ToString::to_string).collect()
 }
 
-/// A payload of parameters; the sentinel is left to the end of the payload.
+/// A payload of parameters; each test adds the sentinel.
 fn list(endianness: Endianness) -> Encoder {
     let mut list = Encoder::new(endianness);
     list.raw(&[0, if endianness == Endianness::Big { 2 } else { 3 }, 0, 0]);
@@ -169,7 +169,7 @@ fn endpoints_as_fast_dds_announces_them() {
     assert_eq!(writer.qos.durability, Durability::TRANSIENT_LOCAL);
     assert_eq!(writer.qos.deadline, Duration::Infinite);
     assert_eq!(writer.qos.liveliness, Liveliness::AUTOMATIC);
-    // Not announced and not a default either.
+    // Neither announced nor set to a default.
     assert_eq!(writer.qos.history, None);
     assert_eq!(writer.type_hash, None);
     assert_eq!(udp(&writer.unicast), ["udp:10.99.0.2:7411"]);
@@ -215,7 +215,7 @@ fn what_rustdds_announces() {
     );
     assert_eq!(participant.vendor, VendorId::RUSTDDS);
     assert_eq!(participant.lease, Duration::Finite(50_000_000_000));
-    // A ROS participant that says neither its enclave nor its domain.
+    // A ROS participant that announces neither its enclave nor its domain.
     assert!(!participant.is_ros() && participant.domain_id.is_none());
     let [writer, events, _] = captured_endpoints(testing::RUSTDDS_SEDP)
         .into_iter()
@@ -223,14 +223,14 @@ fn what_rustdds_announces() {
         .collect::<Vec<_>>()
         .try_into()
         .unwrap();
-    // The vendor is the sender's, the history is not said, and the entity key 0 is in use.
+    // The vendor is the sender's, the history is not announced, and the entity key 0 is in use.
     assert_eq!(
         (writer.vendor, writer.qos.history),
         (VendorId::RUSTDDS, None)
     );
     assert_eq!(writer.guid.entity, EntityId([0, 0, 0, 3]));
     assert_eq!(events.topic.as_str(), "rt/parameter_events");
-    // It disposes of its builtin readers too.
+    // The participant disposes of its builtin readers too.
     let gone = captured_endpoints(testing::RUSTDDS_SEDP_DISPOSE);
     let builtin = gone.iter().filter(|discovery| match discovery {
         Discovery::Gone { guid, .. } => guid.entity.is_builtin(),
@@ -282,7 +282,7 @@ fn all_four_forms_of_disposal_name_who_is_gone() {
         endpoint(testing::CYCLONE_SEDP_DISPOSE),
         gone("01101843e6f7a0a9745a36cc", [0, 0, 7, 3])
     );
-    // No payload, the key hash inline.
+    // No payload; the key hash is inline.
     assert_eq!(
         participant(testing::FAST_SPDP_DISPOSE),
         gone("010f2b7d6a474f3300000000", [0, 0, 1, 0xc1])
@@ -308,7 +308,7 @@ fn a_disposal_of_nobody_is_an_error() {
         assert_eq!(error.reason, Reason::BadValue);
         assert!(endpoint(Role::Reader, VendorId::EPROSIMA, payload, &status).is_err());
     }
-    // Neither alive nor disposed: a key or nothing at all without a status.
+    // Neither alive nor disposed: a key or no payload, without a status.
     assert!(participant(VendorId::EPROSIMA, Payload::None, &NO_INLINE_QOS).is_err());
 }
 
@@ -375,7 +375,7 @@ fn vendor_parameters_mean_what_their_vendor_means() {
             .unwrap()
             .datasharing
     );
-    // The payload's vendor wins over the sender's, wherever in the list it stands.
+    // The payload's vendor wins over the sender's, at any position in the list.
     payload.parameter(0x0016, &[1, 0x10, 0, 0]);
     let endpoint = writer(&payload.bytes, VendorId::EPROSIMA).unwrap();
     assert_eq!(
@@ -456,7 +456,7 @@ fn lists_are_bounded_and_say_when_they_are_cut() {
         (32, true)
     );
 
-    // A count that the bytes do not bear out.
+    // A count larger than the bytes allow.
     let mut payload = participant_list();
     payload.parameter(0x0059, &[0xff; 4]);
     assert_eq!(

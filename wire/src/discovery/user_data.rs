@@ -1,19 +1,19 @@
-//! What ROS hides in DDS user data: `key=value;` pairs.
+//! ROS properties in DDS user data: `key=value;` pairs.
 
 use core::fmt;
 
-/// Longest user data looked at.
+/// Most bytes of user data that are read.
 const MAX_LEN: usize = 4096;
 
-/// The pairs of one USER_DATA value; borrowed, in any order, NULs and other text tolerated.
+/// The pairs of one USER_DATA value; borrowed, in any order. NULs and other text are tolerated.
 #[derive(Clone, Copy, Debug)]
 pub struct UserData<'a>(&'a str);
 
 impl<'a> UserData<'a> {
-    /// Over the octets of USER_DATA. What is not text has no pairs.
+    /// Wraps the octets of USER_DATA. Octets that are not text have no pairs.
     #[must_use]
     pub fn new(octets: &'a [u8]) -> Self {
-        // Fast DDS counts a NUL into the value, Cyclone DDS does not.
+        // Fast DDS includes a NUL in the value, Cyclone DDS does not.
         let octets = octets.get(..MAX_LEN).unwrap_or(octets);
         let end = octets
             .iter()
@@ -27,7 +27,7 @@ impl<'a> UserData<'a> {
         )
     }
 
-    /// Value of the first pair with this key.
+    /// Returns the value of the first pair with this key.
     #[must_use]
     pub fn find(self, key: &str) -> Option<&'a str> {
         self.0.split(';').find_map(|pair| {
@@ -42,7 +42,7 @@ impl<'a> UserData<'a> {
 pub struct TypeHash(pub [u8; 32]);
 
 impl TypeHash {
-    /// From `RIHS01_` and 64 hexadecimal digits; other versions are not known here.
+    /// Parses `RIHS01_` and 64 hexadecimal digits; returns `None` for other versions.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         let digits = text.strip_prefix("RIHS01_")?.as_bytes();

@@ -1,19 +1,19 @@
 //! IPv4 (RFC 791) and IPv6 (RFC 8200) down to UDP (RFC 768).
 //!
-//! Packets that the receiving kernel would discard for their lengths are errors here, so that
-//! nothing is counted which no socket can have got.
+//! Packets whose lengths make the receiving kernel discard them are errors here, so that nothing
+//! counts that no socket can have received.
 
 use super::{Datagram, Fragment, Packet, Payload};
 use crate::cursor::{Cursor, Reason, WireError};
 
 const UDP: u8 = 17;
 const UDP_HEADER: usize = 8;
-/// Fragments address a datagram with 16 bits.
+/// Offsets of fragments are limited to 16 bits.
 const LARGEST_DATAGRAM: u32 = 65_535;
-/// RFC 8200 names each header once and destination options twice; a few more do no harm.
+/// RFC 8200 has each header once and destination options twice; a few more are accepted.
 const MOST_EXTENSION_HEADERS: usize = 8;
 
-/// Reads an IPv4 packet. `length` is the true length of what the cursor's outermost slice shows.
+/// Parses an IPv4 packet. `length` is the true length of the cursor's outermost slice.
 pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
     let start = cursor;
     let available = length.saturating_sub(cursor.offset());
@@ -32,7 +32,7 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     let source = mapped(cursor.array("IPv4 source")?);
     let destination = mapped(cursor.array("IPv4 destination")?);
     if protocol != UDP {
-        // Before the lengths are judged: segmentation offload shows TCP with a total length of 0.
+        // Precedes the checks of lengths: segmentation offload shows TCP with a total length of 0.
         return Ok(Packet {
             source,
             destination,
@@ -62,7 +62,7 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     })
 }
 
-/// Reads an IPv6 packet. `length` is the true length of what the cursor's outermost slice shows.
+/// Parses an IPv6 packet. `length` is the true length of the cursor's outermost slice.
 pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, WireError> {
     let start = cursor;
     let available = length.saturating_sub(cursor.offset());
@@ -106,8 +106,8 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
             44 => {
                 let [following, _, high, low, id @ ..] = body.peek::<8>("IPv6 fragment header")?;
                 body.skip("IPv6 fragment header", 8)?;
-                // The offset's unit is 8 octets, and it stands in the upper 13 bits: masked, the
-                // field is already in bytes.
+                // The offset's unit is 8 octets, in the upper 13 bits: the masked field is in
+                // bytes.
                 let field = u16::from_be_bytes([high, low]);
                 let (offset, more) = (u32::from(field & 0xfff8), field & 1 != 0);
                 if offset == 0 && !more {
@@ -126,14 +126,14 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     Err(start.error("IPv6 extension headers", Reason::OverLimit))
 }
 
-/// What follows a header: captured bytes that may be fewer than the true length.
+/// The bytes behind a header: the captured ones may be fewer than the true length.
 struct Body<'a> {
     cursor: Cursor<'a>,
     length: usize,
 }
 
 impl<'a> Body<'a> {
-    /// Cuts off what the link layer appended (Ethernet pads to 60 octets).
+    /// Cuts off link-layer padding (Ethernet pads to 60 octets).
     fn new(mut cursor: Cursor<'a>, length: usize) -> Result<Self, WireError> {
         let captured = length.min(cursor.remaining());
         Ok(Self {
@@ -172,8 +172,8 @@ impl<'a> Body<'a> {
         })
     }
 
-    /// `zero_is_all`: IPv6 allows a UDP length of zero for jumbograms (RFC 2675), and Linux takes
-    /// it for "the rest of the packet".
+    /// Parses a datagram. `zero_is_all`: IPv6 allows a UDP length of zero for jumbograms (RFC
+    /// 2675), and Linux reads it as "the rest of the packet".
     fn datagram(mut self, zero_is_all: bool) -> Result<Datagram<'a>, WireError> {
         let start = self.cursor;
         let source_port = self.cursor.u16("UDP source port")?;

@@ -141,7 +141,7 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
         parse_cooked(0x0800, PacketType::HOST, ip, length),
         Ok(expected)
     );
-    // Doubly tagged: the inner tag is still there on the way in, and not on the way out.
+    // Doubly tagged: received frames keep the inner tag, sent frames do not.
     let inner = [&[0x45, 0x05, 0x08, 0x00], ip].concat();
     assert_eq!(
         parse_cooked(0x8100, PacketType::MULTICAST, &inner, length + 4),
@@ -151,7 +151,7 @@ fn a_socket_that_strips_the_link_header_shows_the_same_packet() {
         parse_cooked(0x88a8, PacketType::OUTGOING, ip, length),
         Ok(expected)
     );
-    // Linux 6.11 and later: the tag is there, its ether type is not named.
+    // Linux 6.11 and later: the tag is present, its ether type is not named.
     assert_eq!(
         parse_cooked(0x0800, PacketType::MULTICAST, &inner, length + 4),
         Ok(expected)
@@ -295,7 +295,7 @@ fn a_capture_cut_short_keeps_the_true_length() {
         (datagram(&short).length, datagram(&short).payload.len()),
         (992, 18)
     );
-    // On the wire no longer than what we hold: the IP header lies.
+    // The wire length equals the captured length: the IP header is wrong.
     let error = whole(Link::ETHERNET, &frame).unwrap_err();
     assert_eq!(
         (error.what, error.reason),
@@ -421,7 +421,7 @@ proptest! {
         prop_assert_eq!(read.payload, &payload[..]);
     }
 
-    /// Where both readers accept a damaged frame as a whole UDP datagram, they agree on it.
+    /// If both readers accept a damaged frame as a whole UDP datagram, they agree on it.
     #[test]
     fn we_agree_with_etherparse_on_damaged_frames(
         damage in prop::collection::vec((12..PADDED.len(), any::<u8>()), 1..3),

@@ -1,14 +1,14 @@
-//! Typed views of a record's body: what the words of a [`Record`] mean for its kind.
+//! Typed views of a record's body: the meaning of a [`Record`]'s words for each kind.
 //!
-//! The kinds share their words, so that a record stays small in the kernel's maps and ring buffer.
-//! User space reads them through these views and through nothing else. A view borrows its record
-//! and costs no copy; it believes the kind, and checks no number for plausibility.
+//! All kinds share the words, so that a record stays small in the kernel's maps and ring buffer.
+//! User space reads them only through these views. A view borrows its record and copies nothing; it
+//! trusts the kind and does not validate numbers.
 
 use super::{Record, flag, kind};
 use crate::rtps::{StatusInfo, SubmessageFlags};
 use crate::time::RtpsTime;
 
-/// What a record reports, by its kind.
+/// The body of a record, by kind.
 #[derive(Clone, Copy, Debug)]
 pub enum Body<'a> {
     /// DATA or DATA_FRAG.
@@ -30,7 +30,7 @@ pub enum Body<'a> {
 }
 
 impl Record {
-    /// What it reports.
+    /// Returns the body as a typed view.
     #[inline]
     #[must_use]
     pub const fn body(&self) -> Body<'_> {
@@ -47,7 +47,7 @@ impl Record {
         }
     }
 
-    /// The DATA or DATA_FRAG that it reports, if it reports one.
+    /// Returns the DATA or DATA_FRAG, if the record reports one.
     #[inline]
     #[must_use]
     pub const fn sample(&self) -> Option<Sample<'_>> {
@@ -57,14 +57,14 @@ impl Record {
         }
     }
 
-    /// Whether it reports a DATA or DATA_FRAG.
+    /// Returns whether the record reports a DATA or DATA_FRAG.
     #[inline]
     #[must_use]
     pub const fn is_sample(&self) -> bool {
         matches!(self.kind, kind::DATA | kind::DATA_FRAG)
     }
 
-    /// Whether it reports an ACKNACK, which a reader sends to a writer.
+    /// Returns whether the record reports an ACKNACK, which a reader sends to a writer.
     #[inline]
     #[must_use]
     pub const fn is_acknack(&self) -> bool {
@@ -82,7 +82,7 @@ pub enum Sample<'a> {
 }
 
 impl<'a> Sample<'a> {
-    /// The record that reports it.
+    /// Returns the record behind the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
@@ -91,28 +91,29 @@ impl<'a> Sample<'a> {
         }
     }
 
-    /// writerSN.
+    /// Returns writerSN.
     #[inline]
     #[must_use]
     pub const fn sequence_number(self) -> u64 {
         self.record().sequence_number
     }
 
-    /// INFO_TS in force.
+    /// Returns the INFO_TS in force.
     #[inline]
     #[must_use]
     pub const fn source_timestamp(self) -> RtpsTime {
         self.record().source_timestamp()
     }
 
-    /// PID_STATUS_INFO of the inline QoS, [`StatusInfo::ALIVE`] without one (RTPS 2.5, 9.6.4.9).
+    /// Returns PID_STATUS_INFO of the inline QoS, [`StatusInfo::ALIVE`] if absent (RTPS 2.5,
+    /// 9.6.4.9).
     #[inline]
     #[must_use]
     pub const fn status_info(self) -> StatusInfo {
         StatusInfo(self.record().status_info)
     }
 
-    /// Bytes of the whole sample's serialized payload, encapsulation included.
+    /// Returns the bytes of the whole sample's serialized payload, encapsulation included.
     #[inline]
     #[must_use]
     pub const fn size(self) -> u32 {
@@ -122,7 +123,7 @@ impl<'a> Sample<'a> {
         }
     }
 
-    /// Whether the sample is a value of an instance that is alive, not a disposal.
+    /// Returns whether the sample is a value of a living instance, not a disposal.
     #[inline]
     #[must_use]
     pub const fn is_message(self) -> bool {
@@ -133,7 +134,7 @@ impl<'a> Sample<'a> {
         is_value && self.status_info().0 == StatusInfo::ALIVE.0
     }
 
-    /// Whether it holds the sample's first byte.
+    /// Returns whether it holds the sample's first byte.
     #[inline]
     #[must_use]
     pub const fn is_start(self) -> bool {
@@ -143,7 +144,7 @@ impl<'a> Sample<'a> {
         }
     }
 
-    /// Whether it holds the sample's last byte.
+    /// Returns whether it holds the sample's last byte.
     #[inline]
     #[must_use]
     pub const fn is_end(self) -> bool {
@@ -153,8 +154,8 @@ impl<'a> Sample<'a> {
         }
     }
 
-    /// `std_msgs/Header.stamp` if the payload begins with one: seconds and nanoseconds. `None` when
-    /// the payload's first bytes were not seen or cannot be a stamp.
+    /// Returns `std_msgs/Header.stamp` as seconds and nanoseconds, if the payload begins with one.
+    /// `None` if the payload's first bytes were not seen or cannot be a stamp.
     #[inline]
     #[must_use]
     pub const fn header_stamp(self) -> Option<(i32, u32)> {
@@ -171,14 +172,14 @@ impl<'a> Sample<'a> {
 pub struct Data<'a>(&'a Record);
 
 impl Data<'_> {
-    /// Flags of the submessage.
+    /// Returns the flags of the submessage.
     #[inline]
     #[must_use]
     pub const fn flags(self) -> SubmessageFlags {
         SubmessageFlags(self.0.submessage_flags)
     }
 
-    /// Bytes of serialized payload, encapsulation included.
+    /// Returns the bytes of serialized payload, encapsulation included.
     #[inline]
     #[must_use]
     pub const fn payload_len(self) -> u32 {
@@ -186,54 +187,54 @@ impl Data<'_> {
     }
 }
 
-/// DATA_FRAG (RTPS 2.5, 9.4.5.5), or several that follow each other.
+/// DATA_FRAG (RTPS 2.5, 9.4.5.5), or several consecutive ones.
 #[derive(Clone, Copy, Debug)]
 pub struct DataFrag<'a>(&'a Record);
 
 impl<'a> DataFrag<'a> {
-    /// The record that reports it.
+    /// Returns the record behind the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
         self.0
     }
 
-    /// writerSN.
+    /// Returns writerSN.
     #[inline]
     #[must_use]
     pub const fn sequence_number(self) -> u64 {
         self.0.sequence_number
     }
 
-    /// fragmentStartingNum: the first fragment in here, counted from 1.
+    /// Returns fragmentStartingNum: the number of its first fragment, counted from 1.
     #[inline]
     #[must_use]
     pub const fn starting(self) -> u32 {
         self.0.fragment_start
     }
 
-    /// fragmentsInSubmessage, of all submessages that the record reports.
+    /// Returns fragmentsInSubmessage, summed over all submessages of the record.
     #[inline]
     #[must_use]
     pub const fn count(self) -> u32 {
         self.0.fragments_in_submessage()
     }
 
-    /// fragmentSize: bytes of every fragment but the sample's last.
+    /// Returns fragmentSize: bytes of every fragment but the sample's last.
     #[inline]
     #[must_use]
     pub const fn fragment_size(self) -> u32 {
         self.0.fragment_size()
     }
 
-    /// sampleSize. Claimed, not shown: nothing may be allocated for it.
+    /// Returns sampleSize. It is unverified: nothing may be allocated for it.
     #[inline]
     #[must_use]
     pub const fn sample_size(self) -> u32 {
         self.0.sample_size
     }
 
-    /// Fragments of the whole sample; 0 for fragments of impossible size.
+    /// Returns the number of fragments of the whole sample; 0 for an invalid fragment size.
     #[inline]
     #[must_use]
     pub const fn total(self) -> u32 {
@@ -243,7 +244,7 @@ impl<'a> DataFrag<'a> {
         }
     }
 
-    /// Whether the assembled payload is a key only.
+    /// Returns whether the assembled payload is a key only.
     #[inline]
     #[must_use]
     pub const fn is_key(self) -> bool {
@@ -251,21 +252,21 @@ impl<'a> DataFrag<'a> {
         flags.contains(SubmessageFlags::FRAGMENT_KEY)
     }
 
-    /// INFO_TS in force.
+    /// Returns the INFO_TS in force.
     #[inline]
     #[must_use]
     pub const fn source_timestamp(self) -> RtpsTime {
         self.0.source_timestamp()
     }
 
-    /// As [`Sample::header_stamp`].
+    /// Returns the stamp as [`Sample::header_stamp`] does.
     #[inline]
     #[must_use]
     pub const fn header_stamp(self) -> Option<(i32, u32)> {
         Sample::DataFrag(self).header_stamp()
     }
 
-    /// The same submessage with the fragments from `starting` to before `end` only.
+    /// Returns the same submessage limited to the fragments in `starting..end`.
     #[must_use]
     pub const fn part(self, starting: u32, end: u32) -> Record {
         let mut record = *self.0;
@@ -280,28 +281,28 @@ impl<'a> DataFrag<'a> {
 pub struct Heartbeat<'a>(&'a Record);
 
 impl<'a> Heartbeat<'a> {
-    /// The record that reports it.
+    /// Returns the record behind the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
         self.0
     }
 
-    /// firstSN: the oldest sample that the writer has; one more than `last` when it has none.
+    /// Returns firstSN: the oldest sample that the writer has; one more than `last` if it has none.
     #[inline]
     #[must_use]
     pub const fn first(self) -> u64 {
         self.0.sequence_number
     }
 
-    /// lastSN: the newest sample.
+    /// Returns lastSN: the newest sample.
     #[inline]
     #[must_use]
     pub const fn last(self) -> u64 {
         self.0.long()
     }
 
-    /// Grows with every new HEARTBEAT of the writer.
+    /// Returns the count, which grows with every new HEARTBEAT of the writer.
     #[inline]
     #[must_use]
     pub const fn count(self) -> u32 {
@@ -309,27 +310,27 @@ impl<'a> Heartbeat<'a> {
     }
 }
 
-/// GAP (RTPS 2.5, 9.4.5.6): samples from `start` to before `list`'s base, and `list`'s members, will
-/// not come. The span may be of any length.
+/// GAP (RTPS 2.5, 9.4.5.6): the writer will not send the samples from `start` to before `list`'s
+/// base, nor `list`'s members. The span may have any length.
 #[derive(Clone, Copy, Debug)]
 pub struct Gap<'a>(&'a Record);
 
 impl<'a> Gap<'a> {
-    /// The record that reports it.
+    /// Returns the record behind the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
         self.0
     }
 
-    /// gapStart.
+    /// Returns gapStart.
     #[inline]
     #[must_use]
     pub const fn start(self) -> u64 {
         self.0.sequence_number
     }
 
-    /// gapList.
+    /// Returns gapList.
     #[inline]
     #[must_use]
     pub const fn list(self) -> SequenceNumberSet {
@@ -342,21 +343,21 @@ impl<'a> Gap<'a> {
 pub struct AckNack<'a>(&'a Record);
 
 impl<'a> AckNack<'a> {
-    /// The record that reports it.
+    /// Returns the record behind the view.
     #[inline]
     #[must_use]
     pub const fn record(self) -> &'a Record {
         self.0
     }
 
-    /// The reader acknowledges all samples below this number.
+    /// Returns the number below which the reader acknowledges all samples.
     #[inline]
     #[must_use]
     pub const fn base(self) -> u64 {
         self.0.sequence_number
     }
 
-    /// readerSNState: the members are missing.
+    /// Returns readerSNState, whose members are missing.
     #[inline]
     #[must_use]
     pub const fn missing(self) -> SequenceNumberSet {
@@ -364,12 +365,12 @@ impl<'a> AckNack<'a> {
     }
 }
 
-/// SequenceNumberSet (RTPS 2.5, 9.4.2.6): numbers from a base on.
+/// SequenceNumberSet (RTPS 2.5, 9.4.2.6): a base and a bitmap of the numbers from it.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct SequenceNumberSet {
     /// The number of bit 0.
     pub base: u64,
-    /// Length of the window; up to 256, of which the record has the first
+    /// Length of the bitmap; up to 256, of which the record holds the first
     /// [`Record::BITMAP_BITS`].
     pub num_bits: u32,
     bitmap: [u32; 5],
@@ -391,7 +392,7 @@ impl SequenceNumberSet {
         }
     }
 
-    /// The members that the record has, ascending. Numbers beyond the largest become the largest.
+    /// Iterates over the members in the record, ascending. Numbers saturate at the largest.
     pub fn iter(&self) -> impl Iterator<Item = u64> + use<> {
         let Self {
             base,
@@ -441,7 +442,7 @@ mod tests {
         };
         let base = 2 << 32 | 9;
         assert_eq!((gap.start(), gap.list().base), (7, base));
-        // Of the second word, one bit lies behind numBits.
+        // One bit of the second word lies behind numBits.
         assert_eq!(
             gap.list().iter().collect::<Vec<_>>(),
             [base, base + 31, base + 33]

@@ -1,8 +1,10 @@
-//! The flags octet of a submessage header (RTPS 2.5, 9.4.5.1.2): one meaning of a bit for each kind.
+//! The flags octet of a submessage header (RTPS 2.5, 9.4.5.1.2). The meaning of a bit depends on
+//! the kind.
 
 use crate::cursor::Endianness;
 
-/// The flags of one submessage. What a bit means depends on the submessage's kind, except for E.
+/// The flags of one submessage. The meaning of a bit depends on the submessage's kind, except for
+/// E.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Hash, Debug)]
 pub struct SubmessageFlags(pub u8);
 
@@ -21,26 +23,26 @@ impl SubmessageFlags {
     pub const FINAL: Self = Self(0x02);
     /// L of HEARTBEAT (RTPS 2.5, 9.4.5.7): it asserts the writer's liveliness.
     pub const LIVELINESS: Self = Self(0x04);
-    /// I of INFO_TS (RTPS 2.5, 9.4.5.12): no timestamp follows, and none is in force any more.
+    /// I of INFO_TS (RTPS 2.5, 9.4.5.12): no timestamp follows, and none remains in force.
     pub const INVALIDATE: Self = Self(0x02);
     /// M of INFO_REPLY and INFO_REPLY_IP4 (RTPS 2.5, 9.4.5.10 and 9.4.5.15): multicast locators
     /// follow.
     pub const MULTICAST: Self = Self(0x02);
 
-    /// Whether all bits of `flags` are set.
+    /// Returns whether all bits of `flags` are set.
     #[inline(always)]
     #[must_use]
     pub const fn contains(self, flags: Self) -> bool {
         self.0 & flags.0 == flags.0
     }
 
-    /// These flags and those of `other`.
+    /// Returns the union of these flags and `other`.
     #[must_use]
     pub const fn with(self, other: Self) -> Self {
         Self(self.0 | other.0)
     }
 
-    /// Byte order of the submessage's fields.
+    /// Returns the byte order of the submessage's fields.
     #[must_use]
     pub const fn endianness(self) -> Endianness {
         if self.contains(Self::ENDIANNESS) {

@@ -1,4 +1,4 @@
-//! What inline QoS says about one change: which instance, whether it is gone, whose answer it is.
+//! Inline QoS of one change: its instance, the instance's state, and the request that it answers.
 
 use super::{SequenceNumber, VendorId};
 use crate::cursor::{Cursor, WireError};
@@ -10,53 +10,53 @@ use crate::parameters::{ParameterId, ParameterList};
 pub struct StatusInfo(pub u32);
 
 impl StatusInfo {
-    /// Neither disposed nor unregistered: what a change without status is.
+    /// Neither disposed nor unregistered: the default of a change without a status.
     pub const ALIVE: Self = Self(0);
 
-    /// The instance was deleted.
+    /// Returns whether the instance was deleted.
     #[must_use]
     pub const fn is_disposed(self) -> bool {
         self.0 & 1 != 0
     }
 
-    /// The writer no longer speaks for the instance.
+    /// Returns whether the writer unregistered the instance.
     #[must_use]
     pub const fn is_unregistered(self) -> bool {
         self.0 & 2 != 0
     }
 
-    /// The change was filtered out for the reader it is sent to.
+    /// Returns whether the change was filtered out for its reader.
     #[must_use]
     pub const fn is_filtered(self) -> bool {
         self.0 & 4 != 0
     }
 }
 
-/// Which change this one answers (RTPS 2.5 with DDS-RPC 1.0, 7.8.2).
+/// Identity of the change that this one answers (RTPS 2.5 with DDS-RPC 1.0, 7.8.2).
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct SampleIdentity {
-    /// The other change's writer; rmw_fastrtps puts the client's response reader here.
+    /// Writer of the other change; rmw_fastrtps puts the client's response reader here.
     pub writer: Guid,
-    /// The other change's number.
+    /// Sequence number of the other change.
     pub sequence_number: SequenceNumber,
 }
 
 /// The inline QoS parameters an observer needs.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct InlineQos {
-    /// The instance's key hash; the GUID itself for discovery data.
+    /// Key hash of the instance; the GUID itself for discovery data.
     pub key_hash: Option<[u8; 16]>,
-    /// Zero when not given.
+    /// State of the instance; zero if absent.
     pub status_info: StatusInfo,
-    /// Request or reply correlation.
+    /// Correlation of a request and its reply.
     pub related_sample_identity: Option<SampleIdentity>,
 }
 
 impl InlineQos {
-    /// From a parameter list; `vendor` decides what the vendor-specific identifiers mean.
+    /// Parses a parameter list; `vendor` decides the meaning of the vendor-specific identifiers.
     ///
     /// # Errors
-    /// The list is malformed or one of these values is too short.
+    /// Fails if the list is malformed or one of these values is too short.
     pub fn parse(parameters: ParameterList<'_>, vendor: VendorId) -> Result<Self, WireError> {
         let mut inline_qos = Self::default();
         for parameter in parameters {
@@ -65,14 +65,14 @@ impl InlineQos {
             match parameter.id.known() {
                 ParameterId::KEY_HASH => inline_qos.key_hash = Some(value.array("PID_KEY_HASH")?),
                 ParameterId::STATUS_INFO => {
-                    // Octets, not a number: big-endian whatever the submessage's E flag says.
+                    // Octets, not a number: big-endian regardless of the submessage's E flag.
                     let octets = value.array("PID_STATUS_INFO")?;
                     inline_qos.status_info = StatusInfo(u32::from_be_bytes(octets));
                 }
                 ParameterId::RELATED_SAMPLE_IDENTITY => {
                     inline_qos.related_sample_identity = Some(sample_identity(&mut value)?);
                 }
-                // The number Fast DDS used before the standard one; RTI reads it too. For Cyclone
+                // Fast DDS used this number before the standard one; RTI reads it too. In Cyclone
                 // DDS the same number means subscription keys.
                 ParameterId::FAST_RELATED_SAMPLE_IDENTITY
                     if matches!(vendor, VendorId::EPROSIMA | VendorId::RTI_CONNEXT)

@@ -1,11 +1,11 @@
-//! Locators: where an endpoint can be reached (RTPS 2.5, 9.3.2.3 and 9.4.2.11).
+//! Locators: addresses of endpoints (RTPS 2.5, 9.3.2.3 and 9.4.2.11).
 
 use core::fmt;
 use core::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
 
 use crate::cursor::{Cursor, WireError};
 
-/// Kind of transport; the vendors add their own.
+/// Kind of transport; vendors add their own.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct LocatorKind(pub i32);
 
@@ -29,11 +29,11 @@ impl LocatorKind {
 /// One address of one transport.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Locator {
-    /// Which transport.
+    /// Kind of transport.
     pub kind: LocatorKind,
-    /// Its port.
+    /// Port, in the transport's own numbering.
     pub port: u32,
-    /// Its address; IPv4 stands in the last four bytes.
+    /// Address; IPv4 is in the last four bytes.
     pub address: [u8; 16],
 }
 
@@ -41,8 +41,11 @@ impl Locator {
     /// Length on the wire.
     pub const LEN: usize = 24;
 
+    /// Reads a locator in the cursor's byte order.
+    ///
     /// # Errors
-    /// [`Truncated`](crate::cursor::Reason::Truncated).
+    /// Returns [`Truncated`](crate::cursor::Reason::Truncated) if fewer than [`Self::LEN`] bytes
+    /// remain.
     pub fn read(cursor: &mut Cursor<'_>) -> Result<Self, WireError> {
         Ok(Self {
             kind: LocatorKind(cursor.i32("locator kind")?),
@@ -51,7 +54,7 @@ impl Locator {
         })
     }
 
-    /// The UDP address, when it is one.
+    /// Returns the UDP address; `None` for other transports.
     #[must_use]
     pub fn udp(&self) -> Option<SocketAddr> {
         let address = match self.kind {
@@ -65,7 +68,7 @@ impl Locator {
         Some(SocketAddr::new(address, u16::try_from(self.port).ok()?))
     }
 
-    /// Shared memory, whoever's numbering.
+    /// Returns whether it is shared memory, in any vendor's numbering.
     #[must_use]
     pub const fn is_shared_memory(&self) -> bool {
         matches!(

@@ -1,8 +1,8 @@
 //! The vocabulary of RTPS messages: vendors, versions, submessage kinds and flags, locators, inline
 //! QoS (RTPS 2.5, 8.3 and 9.4).
 //!
-//! [`crate::walk`] reads messages with it, `rp discover` writes some. Nothing here reads a whole
-//! message. The tests have a second, complete reader, which the walk has to agree with:
+//! [`crate::walk`] reads messages with it, and `rp discover` writes some. This module does not read
+//! a whole message. The tests have a second, complete reader that the walk must agree with:
 //! `tests/oracle`.
 
 mod flags;
@@ -19,12 +19,12 @@ pub use inline_qos::{InlineQos, SampleIdentity, StatusInfo};
 pub use locator::{Locator, LocatorKind};
 pub use payload::Payload;
 
-/// Who made the implementation (RTPS 2.5, 9.3.2; numbers assigned by the OMG).
+/// Vendor of an implementation (RTPS 2.5, 9.3.2; numbers assigned by the OMG).
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct VendorId(pub [u8; 2]);
 
 impl VendorId {
-    /// Not said.
+    /// Not announced.
     pub const UNKNOWN: Self = Self([0x00, 0x00]);
     /// RTI Connext.
     pub const RTI_CONNEXT: Self = Self([0x01, 0x01]);
@@ -35,7 +35,7 @@ impl VendorId {
     /// Atostek RustDDS.
     pub const RUSTDDS: Self = Self([0x01, 0x12]);
 
-    /// Name of the product, for people and for labels; `None` when the number is not known here.
+    /// Returns the product's name for people and for labels; `None` if the number is unknown.
     #[must_use]
     pub const fn name(self) -> Option<&'static str> {
         Some(match self.0 {
@@ -57,7 +57,7 @@ impl VendorId {
     }
 }
 
-/// The product's name, or the two bytes in hex.
+/// Formats the product's name, or the two bytes in hex.
 impl fmt::Display for VendorId {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.name() {
@@ -74,12 +74,12 @@ impl fmt::Debug for VendorId {
     }
 }
 
-/// Protocol version; the minor one never decides whether a message is read.
+/// Protocol version; the minor version never decides whether a message is read.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct ProtocolVersion {
-    /// 2 for everything DDS speaks today.
+    /// Major version; 2 in every current DDS implementation.
     pub major: u8,
-    /// Fast DDS writes 2 or 3, Cyclone DDS 1 or 5.
+    /// Minor version; Fast DDS writes 2 or 3, Cyclone DDS 1 or 5.
     pub minor: u8,
 }
 
@@ -89,7 +89,7 @@ impl fmt::Display for ProtocolVersion {
     }
 }
 
-/// Number of a change of one writer; the first is 1 (RTPS 2.5, 8.3.5.4).
+/// Sequence number of a writer's change; the first is 1 (RTPS 2.5, 8.3.5.4).
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct SequenceNumber(pub i64);
 
@@ -97,7 +97,7 @@ impl SequenceNumber {
     /// `SEQUENCENUMBER_UNKNOWN`: high −1, low 0.
     pub const UNKNOWN: Self = Self(-(1 << 32));
 
-    /// `i32` high, then `u32` low, each in the cursor's byte order.
+    /// Reads `i32` high, then `u32` low, each in the cursor's byte order.
     pub(crate) fn read(cursor: &mut Cursor<'_>, what: &'static str) -> Result<Self, WireError> {
         let high = cursor.i32(what)?;
         let low = cursor.u32(what)?;
@@ -111,34 +111,34 @@ impl fmt::Display for SequenceNumber {
     }
 }
 
-/// Kind of a submessage (RTPS 2.5, 9.4.5.1.1); 80..ff are the vendors'.
+/// Kind of a submessage (RTPS 2.5, 9.4.5.1.1); vendors define 80..ff.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct SubmessageId(pub u8);
 
 impl SubmessageId {
-    /// Header extension of RTPS 2.5; nobody is known to send it.
+    /// Header extension of RTPS 2.5; no known implementation sends it.
     pub const HEADER_EXTENSION: Self = Self(0x00);
-    /// Filler.
+    /// Padding.
     pub const PAD: Self = Self(0x01);
-    /// Reader acknowledges and asks again.
+    /// A reader acknowledges samples and requests missing ones.
     pub const ACKNACK: Self = Self(0x06);
-    /// Writer says what it has.
+    /// A writer announces the samples that it has.
     pub const HEARTBEAT: Self = Self(0x07);
-    /// Writer says what will never come.
+    /// A writer announces samples that it will not send.
     pub const GAP: Self = Self(0x08);
-    /// Time of the changes that follow.
+    /// Source timestamp of the changes that follow.
     pub const INFO_TS: Self = Self(0x09);
-    /// Whose the following submessages are.
+    /// Source of the following submessages.
     pub const INFO_SRC: Self = Self(0x0c);
-    /// Where to answer, IPv4 only.
+    /// Reply locators, IPv4 only.
     pub const INFO_REPLY_IP4: Self = Self(0x0d);
-    /// For whom the following submessages are.
+    /// Destination of the following submessages.
     pub const INFO_DST: Self = Self(0x0e);
-    /// Where to answer.
+    /// Reply locators.
     pub const INFO_REPLY: Self = Self(0x0f);
-    /// Reader asks for fragments.
+    /// A reader requests missing fragments.
     pub const NACK_FRAG: Self = Self(0x12);
-    /// Writer says which fragments it has.
+    /// A writer announces the fragments that it has.
     pub const HEARTBEAT_FRAG: Self = Self(0x13);
     /// One change.
     pub const DATA: Self = Self(0x15);
@@ -146,16 +146,16 @@ impl SubmessageId {
     pub const DATA_FRAG: Self = Self(0x16);
     /// Encrypted submessage.
     pub const SEC_BODY: Self = Self(0x30);
-    /// Before a protected submessage.
+    /// Precedes a protected submessage.
     pub const SEC_PREFIX: Self = Self(0x31);
-    /// After a protected submessage.
+    /// Follows a protected submessage.
     pub const SEC_POSTFIX: Self = Self(0x32);
-    /// Before a protected message.
+    /// Precedes a protected message.
     pub const SRTPS_PREFIX: Self = Self(0x33);
-    /// After a protected message.
+    /// Follows a protected message.
     pub const SRTPS_POSTFIX: Self = Self(0x34);
 
-    /// Name from the specification; `None` for an unknown one.
+    /// Returns the specification's name; `None` for an unknown kind.
     #[must_use]
     pub const fn name(self) -> Option<&'static str> {
         Some(match self {

@@ -1,4 +1,5 @@
-//! The oracle of the differential tests reads what real participants sent, and survives the rest.
+//! The oracle of the differential tests reads messages of real participants, and survives malformed
+//! ones.
 
 use std::vec::Vec;
 
@@ -220,7 +221,7 @@ fn receiver_state_decides_whose_and_for_whom() {
         );
         assert_eq!(first.receiver.timestamp, time.receiver.timestamp);
         assert_eq!(first.receiver.vendor, VendorId::EPROSIMA);
-        // INFO_SRC ends the time in force.
+        // INFO_SRC resets the timestamp in force.
         assert_eq!(second.receiver.timestamp, RtpsTime(0));
         assert_eq!(second.receiver.vendor, VendorId::CYCLONE);
         assert_eq!(
@@ -248,7 +249,7 @@ fn length_zero_is_empty_for_pad_and_info_ts_and_the_rest_for_others() {
         panic!("{data:?}")
     };
     assert_eq!(data.payload, Payload::Data(&[0, 1, 0, 0, 1, 2, 3, 4]));
-    // An INFO_TS that promises a time has to have one.
+    // An INFO_TS without the I flag must contain a timestamp.
     let mut message = self::message(Endianness::Little);
     message.raw(&[0x09, 0x01, 0, 0]).u32(1).u32(2);
     assert_eq!(

@@ -10,7 +10,7 @@ use crate::record::{Handover, Record, flag};
 use crate::rtps::{InlineQos, Payload, SubmessageFlags, VendorId};
 use crate::time::Timestamp;
 
-/// What is known of a datagram besides its bytes.
+/// Context of a datagram besides its bytes.
 #[derive(Clone, Copy, Default, PartialEq, Eq, Debug)]
 pub struct Envelope {
     /// Nanoseconds since the Unix epoch, of the frame that completed the datagram.
@@ -27,14 +27,15 @@ pub struct Envelope {
     pub fragmented: bool,
     /// Source UDP port, 0 = unknown.
     pub source_port: u16,
-    /// Cookie of the socket that it was seen at; 0 = unknown.
+    /// Cookie of the socket at which it was seen; 0 = unknown.
     pub socket: u64,
     /// Seen at a socket, not on an interface.
     pub host: bool,
 }
 
 impl Envelope {
-    /// Of a datagram that the kernel filter handed over with `record`, complete at `time`.
+    /// Returns the context of a datagram that the kernel filter handed over with `record`, complete
+    /// at `time`.
     #[must_use]
     pub fn of_handover(record: &Record, time: Timestamp) -> Self {
         Self {
@@ -49,7 +50,7 @@ impl Envelope {
         }
     }
 
-    /// The record fields that concern the whole datagram.
+    /// Returns a record with the fields of the whole datagram.
     fn record(&self) -> Record {
         const IPV4_MAPPED: [u8; 12] = [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff];
         let mut flags = 0;
@@ -81,7 +82,7 @@ impl Envelope {
 /// One endpoint submessage of a datagram in user space.
 #[derive(Clone, Copy, Debug)]
 pub struct Found<'a> {
-    /// As the kernel filter would report it.
+    /// The record that the kernel filter would report.
     pub record: Record,
     /// The whole submessage behind its header: fixed fields, inline QoS and payload.
     pub body: &'a [u8],
@@ -90,13 +91,13 @@ pub struct Found<'a> {
 }
 
 impl<'a> Found<'a> {
-    /// The flags octet of the submessage's header.
+    /// Returns the flags octet of the submessage's header.
     #[must_use]
     pub const fn flags(&self) -> SubmessageFlags {
         SubmessageFlags(self.record.submessage_flags)
     }
 
-    /// Payload of a DATA, as its flags D and K say what it is (RTPS 2.5, 9.4.5.4).
+    /// Returns the payload of a DATA, interpreted by its flags D and K (RTPS 2.5, 9.4.5.4).
     #[must_use]
     pub const fn payload(&self) -> Payload<'a> {
         let flags = self.flags();
@@ -109,11 +110,11 @@ impl<'a> Found<'a> {
         }
     }
 
-    /// Inline QoS of a DATA or DATA_FRAG, none if flag Q is not set; `vendor` decides what the
-    /// vendor-specific parameters mean.
+    /// Returns the inline QoS of a DATA or DATA_FRAG, empty if flag Q is not set; `vendor` decides
+    /// the meaning of the vendor-specific parameters.
     ///
     /// # Errors
-    /// The parameter list is malformed, also behind those parameters that the walk followed.
+    /// Fails if the parameter list is malformed, even behind the parameters that the walk read.
     pub fn inline_qos(&self, vendor: VendorId) -> Result<InlineQos, WireError> {
         let flags = self.flags();
         if !flags.contains(SubmessageFlags::INLINE_QOS) {
@@ -129,10 +130,10 @@ impl<'a> Found<'a> {
     }
 }
 
-/// How a walk in user space ended.
+/// Result of a walk in user space.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Outcome {
-    /// To the datagram's end.
+    /// Reached the datagram's end.
     Complete,
     /// No RTPS magic.
     NotRtps,
@@ -140,8 +141,8 @@ pub enum Outcome {
     Malformed,
 }
 
-/// Walks a whole datagram, any number of submessages, and shows every endpoint submessage to
-/// `show`. With `handover` the walk goes on where the kernel filter left off; bytes before that
+/// Walks a whole datagram, any number of submessages, and passes every endpoint submessage to
+/// `show`. With `handover` the walk continues where the kernel filter stopped; bytes before that
 /// offset are not read. A GAP too long for one record is shown as two.
 pub fn datagram<'a>(
     payload: &'a [u8],
@@ -205,13 +206,13 @@ pub fn datagram<'a>(
     }
 }
 
-/// The second record of a GAP whose set has more than [`Record::BITMAP_BITS`] bits: the same set
-/// from there on, with an empty range before it.
+/// Returns the second record of a GAP whose set has more than [`Record::BITMAP_BITS`] bits: the
+/// rest of the set, with an empty range before it.
 fn long_gap_tail(record: &Record, body: &[u8]) -> Record {
     let order = Order::of(record.submessage_flags.into());
     let gap_list_base = u64::from(record.payload_len) << 32 | u64::from(record.encapsulation);
     let base = gap_list_base.wrapping_add(Record::BITMAP_BITS.into());
-    // reader, writer, gapStart, base, numBits, then five words that the first record holds
+    // reader, writer, gapStart, base, numBits, then the five words that the first record holds
     let map = |index: u32| {
         body.words::<1>(28 + 20 + 4 * index)
             .map_or(0, |[word]| order.word(word))

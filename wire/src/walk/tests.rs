@@ -139,7 +139,7 @@ fn status_info_is_big_endian_and_inline_qos_is_not_payload() {
     assert_eq!(walk_all(&bytes).1[0].0.payload_len, 8);
 }
 
-/// The one DATA of a message, its body behind `octets` octets of fixed fields.
+/// The inline QoS of a message with one DATA, whose body has `octets` octets of fixed fields.
 fn inline_qos_of(little: bool, octets: u8, tail: &[u8]) -> Result<InlineQos, WireError> {
     let mut body = data_body(little, 9, tail);
     body[if little { 2 } else { 3 }] = octets;
@@ -173,7 +173,7 @@ fn inline_qos_are_read_in_the_submessages_byte_order_behind_octets_to_inline_qos
         let inline_qos = inline_qos_of(little, 16, &list(little)).unwrap();
         assert_eq!(inline_qos.key_hash, Some([7; 16]));
         assert_eq!(inline_qos.status_info.0, 3);
-        // A later version's field stands before them.
+        // A field of a later version precedes them.
         let behind = [&b"new!"[..], &list(little)].concat();
         assert_eq!(inline_qos_of(little, 20, &behind), Ok(inline_qos));
     }
@@ -196,7 +196,7 @@ fn flags_say_whether_a_payload_is_a_value_or_a_key() {
         (0x05, Payload::Data(&bytes)),
         (0x09, Payload::Key(&bytes)),
         (0x01, Payload::None),
-        // The specification knows no such submessage; the value is the more telling.
+        // The specification does not define this combination; the value carries more information.
         (0x0d, Payload::Data(&bytes)),
     ] {
         let message = message(&[submessage(0x15, flags, &data_body(true, 1, &bytes))]);
@@ -246,7 +246,7 @@ fn a_length_of_zero_reaches_the_end_but_not_for_pad_and_info_ts() {
 
 #[test]
 fn a_message_longer_than_a_datagram_ends_in_a_sample_of_any_size() {
-    // Fast DDS with a transport of shared memory alone: the last submessage has the length 0.
+    // Fast DDS with shared memory as its only transport: the last submessage has the length 0.
     let short = submessage(0x15, 0x05, &data_body(true, 1, &[0, 1, 0, 0]));
     let body = data_body(true, 2, &[7; 200_000]);
     let bytes = message(&[short, [&[0x15, 0x05, 0, 0][..], &body].concat()]);
@@ -327,7 +327,7 @@ fn the_first_malformed_submessage_ends_the_walk_but_not_what_came_before() {
     assert_eq!((outcome, found.len()), (Outcome::Malformed, 1));
 }
 
-/// A valid message with one of everything, to be cut and damaged.
+/// A valid message with every kind of submessage, to be cut and damaged.
 fn sampler() -> Vec<u8> {
     let set = [
         &READER[..],
@@ -373,8 +373,8 @@ fn every_truncation_and_every_single_byte_corruption_is_survived() {
 }
 
 proptest! {
-    /// The kernel sees a datagram fragment by fragment: stopping anywhere and going on with
-    /// more bytes must find the same as one go, unless the walk says that it is split.
+    /// The kernel sees a datagram fragment by fragment: stopping anywhere and continuing with more
+    /// bytes must find the same as one pass, unless the walk reports a split.
     #[test]
     fn pausing_between_fragments_changes_nothing(cuts in proptest::collection::vec(8u32..300, 1..6)) {
         let bytes = sampler();

@@ -1,13 +1,14 @@
-//! A complete reader of RTPS messages (RTPS 2.5, 8.3 and 9.4): the oracle of the differential tests.
+//! A complete reader of RTPS messages (RTPS 2.5, 8.3 and 9.4): the oracle of the differential
+//! tests.
 //!
-//! No production code reads with it. The walk reads what the product needs of a message, in the
-//! style of the kernel; this one reads every field of every submessage, in the style of the
-//! specification, and refuses numbers that the specification does not allow. The fuzz targets and
-//! the tests over captures compare the two, and compare this one with an independent decoder. So
-//! nothing of the walk may be used here.
+//! No production code uses it. The walk reads what the product needs of a message, in the style of
+//! the kernel. The oracle reads every field of every submessage, in the style of the specification,
+//! and rejects numbers that the specification does not allow. The fuzz targets and the tests over
+//! captures compare the two, and compare the oracle with an independent decoder. So the oracle must
+//! not use the walk.
 //!
-//! Parsing borrows the datagram. Unknown submessages are stepped over by their length; a malformed
-//! one ends the message (8.3.4.1), what came before it stands.
+//! Parsing borrows the datagram. Unknown submessages are skipped by their length. A malformed one
+//! ends the message (8.3.4.1); the submessages before it remain valid.
 
 #![allow(dead_code, reason = "each of those that include it uses a part")]
 
@@ -26,7 +27,7 @@ pub struct Header {
     pub version: ProtocolVersion,
     /// The sender's implementation.
     pub vendor: VendorId,
-    /// The sending participant; not necessarily the origin of what it sends.
+    /// The sending participant; not necessarily the origin of the message.
     pub prefix: GuidPrefix,
 }
 
@@ -34,11 +35,11 @@ impl Header {
     /// Length on the wire.
     pub const LEN: usize = 20;
 
-    /// From the first bytes of a datagram.
+    /// Parses the first bytes of a datagram.
     ///
     /// # Errors
-    /// [`Reason::Truncated`]; [`Reason::BadMarker`] when it does not begin with `RTPS` or has
-    /// another major version than 2.
+    /// Returns [`Reason::Truncated`] if bytes are missing, and [`Reason::BadMarker`] if it does not
+    /// begin with `RTPS` or its major version is not 2.
     pub fn parse(bytes: &[u8]) -> Result<Self, WireError> {
         Self::read(&mut Cursor::new(bytes, Endianness::Big))
     }
@@ -61,31 +62,32 @@ impl Header {
     }
 }
 
-/// What a receiver knows while it reads a message (RTPS 2.5, 8.3.4): whose, for whom, when.
+/// State of a receiver while it reads a message (RTPS 2.5, 8.3.4).
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Receiver {
-    /// Whose the submessages are: the header's prefix until an INFO_SRC.
+    /// Source of the submessages: the header's prefix until an INFO_SRC.
     pub source: GuidPrefix,
     /// The source's protocol version.
     pub version: ProtocolVersion,
     /// The source's implementation.
     pub vendor: VendorId,
-    /// For whom they are; [`GuidPrefix::UNKNOWN`] is any participant that receives them.
+    /// Destination of the submessages; [`GuidPrefix::UNKNOWN`] is any participant that receives
+    /// them.
     pub destination: GuidPrefix,
-    /// INFO_TS in force; zero when none is.
+    /// INFO_TS in force; zero if none is.
     pub timestamp: RtpsTime,
 }
 
-/// One submessage with the receiver state it is to be read under.
+/// One submessage with the receiver state that applies to it.
 #[derive(Clone, Copy, Debug)]
 pub struct Submessage<'a> {
-    /// State after this submessage when it is an INFO_*, otherwise the state it stands under.
+    /// State after this submessage if it is an INFO_*, otherwise the state that applies to it.
     pub receiver: Receiver,
-    /// Its kind.
+    /// Kind of the submessage.
     pub id: SubmessageId,
     /// The flags octet.
     pub flags: SubmessageFlags,
-    /// Where its header begins in the message.
+    /// Offset of its header in the message.
     pub offset: usize,
     /// Its content.
     pub body: Body<'a>,
@@ -100,10 +102,10 @@ pub struct Message<'a> {
 }
 
 impl<'a> Message<'a> {
-    /// Over a whole datagram.
+    /// Parses the header of a whole datagram.
     ///
     /// # Errors
-    /// Those of [`Header::parse`].
+    /// Fails as [`Header::parse`] does.
     pub fn parse(datagram: &'a [u8]) -> Result<Self, WireError> {
         let mut rest = Cursor::new(datagram, Endianness::Big);
         let header = Header::read(&mut rest)?;
@@ -121,7 +123,7 @@ impl<'a> Message<'a> {
         })
     }
 
-    /// The message's header.
+    /// Returns the message's header.
     #[must_use]
     pub const fn header(&self) -> Header {
         self.header
@@ -137,8 +139,8 @@ impl<'a> Message<'a> {
             Endianness::Big => u16::from_be_bytes(length),
             Endianness::Little => u16::from_le_bytes(length),
         };
-        // RTPS 2.5, 9.4.5.1.3: zero reaches to the end of the message, except where an empty body
-        // is a body. Fast DDS writes zero for submessages that do not fit the field.
+        // RTPS 2.5, 9.4.5.1.3: zero reaches to the end of the message, except for kinds whose body
+        // may be empty. Fast DDS writes zero if the length does not fit the field.
         let to_the_end = length == 0 && !matches!(id, SubmessageId::PAD | SubmessageId::INFO_TS);
         let length = if to_the_end {
             self.rest.remaining()
@@ -170,7 +172,7 @@ impl<'a> Iterator for Message<'a> {
         }
         let result = self.submessage();
         if result.is_err() {
-            // Nothing after a malformed submessage can be trusted to be where it seems to be.
+            // Offsets behind a malformed submessage cannot be trusted.
             self.rest = Cursor::new(&[], Endianness::Big);
         }
         Some(result)

@@ -4,7 +4,7 @@
 use ros2probe_wire::rtps::SequenceNumber;
 use ros2probe_wire::{Cursor, Reason, WireError};
 
-/// A sequence number, `i32` high and `u32` low, of those from `least` on (RTPS 2.5, 9.4.2.5).
+/// Reads a sequence number, `i32` high and `u32` low, not below `least` (RTPS 2.5, 9.4.2.5).
 pub fn sequence_number(
     cursor: &mut Cursor<'_>,
     what: &'static str,
@@ -21,7 +21,8 @@ pub fn sequence_number(
     }
 }
 
-/// Bits, most significant first within each 32-bit word, words in the submessage's byte order.
+/// A bitmap, most significant bit first within each 32-bit word, words in the submessage's byte
+/// order.
 #[derive(Clone, Copy, Debug)]
 struct Bitmap<'a> {
     words: Cursor<'a>,
@@ -44,7 +45,7 @@ impl<'a> Bitmap<'a> {
         })
     }
 
-    /// Positions of the set bits, ascending.
+    /// Iterates over the positions of the set bits, ascending.
     fn ones(self) -> impl Iterator<Item = u32> {
         let mut words = self.words;
         let words = core::iter::from_fn(move || words.u32("set bitmap").ok());
@@ -59,17 +60,17 @@ impl<'a> Bitmap<'a> {
     }
 }
 
-/// Sequence numbers from a base on: in ACKNACK the missing ones, in GAP the irrelevant ones.
+/// Sequence numbers from a base: the missing ones in ACKNACK, the irrelevant ones in GAP.
 #[derive(Clone, Copy, Debug)]
 pub struct SequenceNumberSet<'a> {
-    /// What bit 0 stands for.
+    /// The number of bit 0.
     pub base: SequenceNumber,
     bitmap: Bitmap<'a>,
 }
 
 impl<'a> SequenceNumberSet<'a> {
     pub fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
-        // Fast DDS asks for everything with base 0, so that one is let through.
+        // Fast DDS requests everything with base 0, so 0 is accepted.
         let base = sequence_number(cursor, "set base", 0)?;
         Ok(Self {
             base,
@@ -77,13 +78,13 @@ impl<'a> SequenceNumberSet<'a> {
         })
     }
 
-    /// Length of the window.
+    /// Returns the length of the bitmap in bits.
     #[must_use]
     pub const fn num_bits(&self) -> u32 {
         self.bitmap.bits
     }
 
-    /// The members, ascending; those that do not fit a sequence number are left out.
+    /// Iterates over the members, ascending; those that exceed a sequence number are omitted.
     pub fn iter(&self) -> impl Iterator<Item = SequenceNumber> + use<'a> {
         let base = self.base.0;
         self.bitmap
@@ -92,10 +93,10 @@ impl<'a> SequenceNumberSet<'a> {
     }
 }
 
-/// Fragment numbers from a base on: in NACK_FRAG the missing ones.
+/// Fragment numbers from a base: the missing ones in NACK_FRAG.
 #[derive(Clone, Copy, Debug)]
 pub struct FragmentNumberSet<'a> {
-    /// What bit 0 stands for.
+    /// The number of bit 0.
     pub base: u32,
     bitmap: Bitmap<'a>,
 }
@@ -108,7 +109,7 @@ impl<'a> FragmentNumberSet<'a> {
         })
     }
 
-    /// The members, ascending; those that do not fit a fragment number are left out.
+    /// Iterates over the members, ascending; those that exceed a fragment number are omitted.
     pub fn iter(&self) -> impl Iterator<Item = u32> + use<'a> {
         let base = self.base;
         self.bitmap

@@ -1,4 +1,4 @@
-//! The submessages' bodies (RTPS 2.5, 9.4.5), with GUIDs made whole from the receiver state.
+//! The submessages' bodies (RTPS 2.5, 9.4.5), with GUIDs completed from the receiver state.
 
 use ros2probe_wire::parameters::{ParameterId, ParameterList};
 use ros2probe_wire::rtps::{
@@ -10,10 +10,10 @@ use ros2probe_wire::{Cursor, EntityId, Guid, GuidPrefix, Reason, RtpsTime, WireE
 use super::Receiver;
 use super::sets::{FragmentNumberSet, SequenceNumberSet, sequence_number};
 
-/// What a submessage holds.
+/// Content of a submessage.
 #[derive(Clone, Copy, Debug)]
 pub enum Body<'a> {
-    /// Filler.
+    /// Padding.
     Pad,
     /// ACKNACK.
     AckNack(AckNack<'a>),
@@ -39,74 +39,74 @@ pub enum Body<'a> {
     DataFrag(DataFrag<'a>),
     /// SEC_* and SRTPS_*: a transformation's header, footer or cipher text.
     Secure(&'a [u8]),
-    /// A kind not known here, stepped over by its length.
+    /// An unknown kind, skipped by its length.
     Unknown(&'a [u8]),
 }
 
-/// Reader to writer: what has arrived and what is missing.
+/// Reader to writer: the acknowledged and the missing samples.
 #[derive(Clone, Copy, Debug)]
 pub struct AckNack<'a> {
     /// The sender's reader.
     pub reader: Guid,
     /// The destination's writer.
     pub writer: Guid,
-    /// All before the base is acknowledged, members are missing.
+    /// All samples before the base are acknowledged, the members are missing.
     pub missing: SequenceNumberSet<'a>,
     /// Grows with every new ACKNACK of this reader.
     pub count: u32,
-    /// No answer is needed when nothing is missing.
+    /// No answer is required if nothing is missing.
     pub is_final: bool,
 }
 
-/// Writer to readers: what it has.
+/// Writer to readers: the samples that it has.
 #[derive(Clone, Copy, Debug)]
 pub struct Heartbeat {
-    /// For whom; an unknown entity is every matched reader.
+    /// Receiving reader; an unknown entity is every matched reader.
     pub reader: Guid,
-    /// Whose.
+    /// Sending writer.
     pub writer: Guid,
-    /// The oldest change still held; one more than `last` when there is none.
+    /// The oldest change still held; one more than `last` if the writer holds none.
     pub first: SequenceNumber,
     /// The newest change.
     pub last: SequenceNumber,
     /// Grows with every new HEARTBEAT of this writer.
     pub count: u32,
-    /// No answer is needed from a reader that has all.
+    /// No answer is required from a reader that has all samples.
     pub is_final: bool,
     /// Asserts the writer's liveliness only.
     pub is_liveliness: bool,
 }
 
-/// Writer to readers: which fragments of one change it has.
+/// Writer to readers: the fragments of one change that it has.
 #[derive(Clone, Copy, Debug)]
 pub struct HeartbeatFrag {
-    /// For whom.
+    /// Receiving reader.
     pub reader: Guid,
-    /// Whose.
+    /// Sending writer.
     pub writer: Guid,
     /// The change.
     pub sequence_number: SequenceNumber,
-    /// Fragments 1 to this one are there.
+    /// The writer has fragments 1 to this one.
     pub last_fragment: u32,
     /// Grows with every new HEARTBEAT_FRAG of this writer.
     pub count: u32,
 }
 
-/// Writer to readers: changes that will never come.
+/// Writer to readers: changes that it will not send.
 #[derive(Clone, Copy, Debug)]
 pub struct Gap<'a> {
-    /// For whom.
+    /// Receiving reader.
     pub reader: Guid,
-    /// Whose.
+    /// Sending writer.
     pub writer: Guid,
-    /// Irrelevant are the changes from here up to before the list's base. The span may be any
-    /// length: whoever walks it has to bound the walk.
+    /// First irrelevant change; the range ends before the list's base. It may have any length, so
+    /// an iteration over it must be bounded.
     pub start: SequenceNumber,
-    /// And the members of this list.
+    /// Further irrelevant changes.
     pub list: SequenceNumberSet<'a>,
 }
 
-/// Reader to writer: fragments that are missing.
+/// Reader to writer: missing fragments.
 #[derive(Clone, Copy, Debug)]
 pub struct NackFrag<'a> {
     /// The sender's reader.
@@ -121,25 +121,25 @@ pub struct NackFrag<'a> {
     pub count: u32,
 }
 
-/// Where to send answers to the submessages that follow.
+/// Reply locators for the submessages that follow.
 #[derive(Clone, Copy, Debug)]
 pub enum InfoReply<'a> {
-    /// INFO_REPLY: unicast locators, and multicast ones when given.
+    /// INFO_REPLY: unicast locators, and multicast ones if present.
     Lists(LocatorList<'a>, Option<LocatorList<'a>>),
-    /// INFO_REPLY_IP4: one UDPv4 locator of each.
+    /// INFO_REPLY_IP4: one unicast UDPv4 locator, and a multicast one if present.
     Ip4(Locator, Option<Locator>),
 }
 
 /// One change of one writer.
 #[derive(Clone, Copy, Debug)]
 pub struct Data<'a> {
-    /// For whom; an unknown entity is every matched reader.
+    /// Receiving reader; an unknown entity is every matched reader.
     pub reader: Guid,
-    /// Whose.
+    /// Sending writer.
     pub writer: Guid,
-    /// Its number.
+    /// Sequence number of the change.
     pub sequence_number: SequenceNumber,
-    /// Parameters about the change.
+    /// Parameters of the change.
     pub inline_qos: Option<ParameterList<'a>>,
     /// The change itself.
     pub payload: Payload<'a>,
@@ -148,42 +148,42 @@ pub struct Data<'a> {
 /// Consecutive fragments of one change.
 #[derive(Clone, Copy, Debug)]
 pub struct DataFrag<'a> {
-    /// For whom; an unknown entity is every matched reader.
+    /// Receiving reader; an unknown entity is every matched reader.
     pub reader: Guid,
-    /// Whose.
+    /// Sending writer.
     pub writer: Guid,
-    /// The change's number.
+    /// Sequence number of the change.
     pub sequence_number: SequenceNumber,
-    /// First fragment in here, counted from 1.
+    /// Number of its first fragment, counted from 1.
     pub starting: u32,
-    /// How many are in here, at least 1.
+    /// Number of fragments, at least 1.
     pub count: u16,
     /// Size of every fragment but the last, at least 1.
     pub fragment_size: u16,
-    /// Size of the whole payload. Claimed, not shown: nothing may be allocated for it.
+    /// Size of the whole payload. It is unverified: nothing may be allocated for it.
     pub sample_size: u32,
-    /// Parameters about the change.
+    /// Parameters of the change.
     pub inline_qos: Option<ParameterList<'a>>,
     /// The assembled payload is a key only.
     pub is_key: bool,
-    /// The fragments' bytes without padding, exactly as many as the numbers above say.
+    /// The fragments' bytes without padding, exactly as many as the numbers above require.
     pub bytes: &'a [u8],
 }
 
 impl<'a> DataFrag<'a> {
-    /// How many fragments the whole change has.
+    /// Returns the number of fragments of the whole change.
     #[must_use]
     pub const fn total(&self) -> u32 {
         self.sample_size.div_ceil(self.fragment_size as u32)
     }
 
-    /// Where the first fragment in here begins in the change's payload.
+    /// Returns the offset of the first fragment in the change's payload.
     #[must_use]
     pub const fn offset(&self) -> u64 {
         (self.starting as u64).saturating_sub(1) * self.fragment_size as u64
     }
 
-    /// The fragments one by one, with their numbers.
+    /// Iterates over the fragments with their numbers.
     pub fn fragments(&self) -> impl Iterator<Item = (u32, &'a [u8])> + use<'a> {
         (self.starting..).zip(self.bytes.chunks(usize::from(self.fragment_size).max(1)))
     }
@@ -322,7 +322,7 @@ fn info<'a>(
     })
 }
 
-/// `readerId`, `writerId` where the message's source is the writer.
+/// Reads `readerId` and `writerId` of a message whose source is the writer.
 fn from_writer(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid), WireError> {
     let reader = EntityId(body.array("readerId")?);
     let writer = EntityId(body.array("writerId")?);
@@ -332,7 +332,7 @@ fn from_writer(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid
     ))
 }
 
-/// `readerId`, `writerId` where the message's source is the reader.
+/// Reads `readerId` and `writerId` of a message whose source is the reader.
 fn from_reader(body: &mut Cursor<'_>, receiver: &Receiver) -> Result<(Guid, Guid), WireError> {
     let reader = EntityId(body.array("readerId")?);
     let writer = EntityId(body.array("writerId")?);
@@ -393,7 +393,7 @@ fn data_frag<'a>(
         .then(|| parameter_list(&mut rest))
         .transpose()?;
 
-    // The fragments in here span [begin, end) of the payload; the last one may be shorter.
+    // The fragments span [begin, end) of the payload; the last one may be shorter.
     let first = u64::from(starting).checked_sub(1).ok_or(numbers)?;
     let begin = first * u64::from(fragment_size);
     let end = ((first + u64::from(count)) * u64::from(fragment_size)).min(sample_size.into());
@@ -416,9 +416,9 @@ fn data_frag<'a>(
     })
 }
 
-/// Reads `extraFlags` and `octetsToInlineQos`; returns where the inline QoS (or the payload)
-/// begins. Later versions may put fields behind the `least` octets of this one, so the offset is
-/// followed, not assumed.
+/// Reads `extraFlags` and `octetsToInlineQos`; returns the position of the inline QoS (or the
+/// payload). Later versions may insert fields behind the `least` octets of this one, so the offset
+/// is followed.
 fn after_octets_to_inline_qos<'a>(
     body: &mut Cursor<'a>,
     least: u16,
@@ -434,8 +434,8 @@ fn after_octets_to_inline_qos<'a>(
     Ok(rest)
 }
 
-/// The list at the cursor, which moves behind the sentinel: only the sentinel shows where a payload
-/// begins.
+/// Reads the list at the cursor, which moves behind the sentinel: only the sentinel marks the start
+/// of the payload.
 fn parameter_list<'a>(cursor: &mut Cursor<'a>) -> Result<ParameterList<'a>, WireError> {
     let list = ParameterList::inline(*cursor);
     loop {
@@ -460,14 +460,14 @@ fn locator_ip4(body: &mut Cursor<'_>) -> Result<Locator, WireError> {
     })
 }
 
-/// A counted list of locators, shown to be there but not copied.
+/// A counted list of locators, whose bytes are checked but not copied.
 #[derive(Clone, Copy, Debug)]
 pub struct LocatorList<'a> {
     rest: Cursor<'a>,
 }
 
 impl<'a> LocatorList<'a> {
-    /// `u32` count, then that many locators.
+    /// Reads a `u32` count, then that many locators.
     fn read(cursor: &mut Cursor<'a>) -> Result<Self, WireError> {
         let error = cursor.error("locator list", Reason::BadLength);
         let count = usize::try_from(cursor.u32("locator count")?).map_err(|_| error)?;

@@ -1,9 +1,9 @@
-//! Fields of records: numbers, texts and maps, little-endian and with their lengths in front.
+//! Fields of records: numbers, texts and maps, little-endian, with length prefixes.
 
 use std::collections::BTreeMap;
 
 pub(super) fn length(out: &mut Vec<u8>, length: usize) {
-    // Nothing here comes near 4 GiB: names, definitions and lists are bounded where they enter.
+    // Never reached: names, definitions and lists are bounded far below 4 GiB.
     let length = u32::try_from(length).unwrap_or(u32::MAX);
     out.extend_from_slice(&length.to_le_bytes());
 }
@@ -30,7 +30,7 @@ pub(super) fn numbers(out: &mut Vec<u8>, map: &BTreeMap<u16, u64>) {
     }
 }
 
-/// What is left to read.
+/// The remaining bytes.
 pub(super) struct Cursor<'a>(pub(super) &'a [u8]);
 
 impl<'a> Cursor<'a> {

@@ -1,4 +1,4 @@
-//! What a bag holds so far: its topics and complete files, as records and metadata.yaml name them.
+//! Content of a bag so far: its topics and complete files, for records and metadata.yaml.
 
 use std::collections::BTreeMap;
 
@@ -16,17 +16,17 @@ pub(super) struct Topic {
     pub(super) description: TopicDescription,
     pub(super) channel_id: u16,
     pub(super) schema_id: u16,
-    /// In complete files.
+    /// Number of messages in complete files.
     pub(super) messages: u64,
-    /// Has messages: the description stays as it is.
+    /// Whether it has messages: then the description is fixed.
     pub(super) is_written: bool,
-    /// All publishers, where they changed after that.
+    /// All publishers, if they changed after that.
     pub(super) later: Option<Vec<Qos>>,
 }
 
 #[derive(Clone, Debug)]
 pub(super) struct DoneFile {
-    /// Without the suffix of a compression.
+    /// Name without the suffix of a compression.
     pub(super) name: String,
     pub(super) compression: Compression,
     pub(super) times: Option<(u64, u64)>,
@@ -39,7 +39,7 @@ impl Topic {
         let description = &self.description;
         let (encoding, data) = match &description.schema {
             Some(schema) => (schema.encoding.as_str(), schema.text.as_bytes()),
-            // As in Humble. rosbag2 accepts `unknown` as well, PyPI `rosbags` does not.
+            // As Humble writes. rosbag2 accepts `unknown` as well, PyPI `rosbags` does not.
             None => ("", &[][..]),
         };
         let schema = SchemaRecord {

@@ -1,4 +1,4 @@
-//! Bags whose writer was stopped at any byte, and what `reindex` makes of them.
+//! Bags whose writer was stopped at any byte, completed by `reindex`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -13,7 +13,7 @@ use ros2probe_wire::Timestamp;
 
 use super::{BEGIN, messages, metadata, text, topic};
 
-/// Many small chunks, or none.
+/// A bag with many small chunks, or none.
 fn written(directory: &Path, storage: Storage, form: Form) -> PathBuf {
     let path = directory.join("whole");
     let options = Options {
@@ -45,7 +45,7 @@ fn written(directory: &Path, storage: Storage, form: Form) -> PathBuf {
     summary.files[0].clone()
 }
 
-/// Where each message ends in a file without compression.
+/// Returns the end of each message in a file without compression.
 fn ends(file: &Path) -> Vec<u64> {
     let bytes = fs::read(file).unwrap();
     let mut ends = Vec::new();
@@ -92,7 +92,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
                 .collect();
             let found: Vec<u32> = messages(&file).iter().map(|message| message.1).collect();
             assert_eq!(found, expected, "{length}: {report:?}");
-            // With the index, too.
+            // Including the index.
             let again = fs::read(&file).unwrap();
             let summary = mcap::Summary::read(&again).unwrap().unwrap();
             assert_eq!(
@@ -118,7 +118,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
             let yaml = metadata(&bag);
             assert_eq!(yaml.message_count, expected.len() as u64);
             assert_eq!(yaml.relative_file_paths, ["cut_0.mcap"]);
-            // Nothing is lost: what is no record lies beside.
+            // Nothing is lost: incomplete records are kept beside the file.
             if let Found::Unfinished {
                 kept: Some(kept), ..
             } = &report.files[0].found
@@ -126,7 +126,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
                 let kept = fs::read(bag.join(kept)).unwrap();
                 assert!(bytes[..length].ends_with(&kept), "{length}");
             }
-            // Done is done.
+            // A second run changes nothing.
             let second = reindex(&bag).unwrap();
             assert_eq!(second.files[0].found, Found::Complete, "{length}");
             assert_eq!(fs::read(&file).unwrap(), again);
@@ -151,7 +151,7 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
         let bag = directory.path().join("cut");
         fs::create_dir(&bag).unwrap();
         let file = bag.join("cut_0.mcap");
-        // Within the third chunk: the first two are whole.
+        // Within the third chunk: the first two are complete.
         let third = &scan.chunks[2];
         fs::write(&file, &bytes[..(third.offset + third.length - 20) as usize]).unwrap();
         reindex(&bag).unwrap();
@@ -220,7 +220,7 @@ fn metadata_is_made_anew_from_all_files_in_their_order() {
                 .all(|file| file.found == Found::Complete)
         );
         let mut after = metadata(&path);
-        // Humble's files do not name the distribution as metadata.yaml of others does.
+        // Unlike metadata.yaml, Humble's files do not name the distribution.
         after.ros_distro.clone_from(&before.ros_distro);
         assert_eq!(after, before, "{form:?}");
     }
@@ -279,7 +279,7 @@ fn compression_of_files_that_was_interrupted_is_completed() {
     assert_eq!(metadata(&path).compression_mode, "FILE");
 }
 
-/// A file of chunks that each expand to zeros, `bytes` in all.
+/// Returns a file of chunks that each expand to zeros, `bytes` in all.
 fn expanding(chunk_bytes: usize, chunks: usize, compression: Compression) -> Vec<u8> {
     let inside = compression.compressed(&vec![0; chunk_bytes]).unwrap();
     let mut file = records::MAGIC.to_vec();
@@ -331,14 +331,14 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
     let path = refused("many_0.mcap", &many);
     assert!(reindex(directory.path()).is_err());
     assert_eq!(fs::read(path).unwrap(), many, "left as it was");
-    // A whole file that is compressed, of one record.
+    // A compressed file with one record.
     let mut whole = records::MAGIC.to_vec();
     records::record(&mut whole, Opcode::METADATA, |out| {
         out.resize(out.len() + (200 << 20), 0);
     });
     let whole = Compression::Zstd.compressed(&whole).unwrap();
     refused("whole_0.mcap.zstd", &whole);
-    // What expands as recordings of the same picture do is read.
+    // Content that expands like recordings of a still image is readable.
     let path = directory.path().join("still_0.mcap");
     fs::write(&path, expanding(4 << 20, 8, Compression::Lz4)).unwrap();
     let scan = read::scan(&path, &mut |_, _| {}).unwrap();

@@ -1,4 +1,4 @@
-//! A file system that is full, and places that cannot be written to.
+//! Full file systems, and paths that cannot be written.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -52,7 +52,7 @@ fn small_disk() {
     };
     assert!(matches!(error, Error::DiskFull { .. }), "{error:?}");
     assert!(taken > 30, "{taken}");
-    // What the report says finds room as well.
+    // The final report fits as well.
     let report = BTreeMap::from([("ros2probe.report".to_owned(), "x".repeat(20_000))]);
     let summary = writer.close(report).unwrap();
     let found = messages(&summary.files[0]);
@@ -65,10 +65,10 @@ fn small_disk() {
     let yaml = metadata(&path);
     assert_eq!(yaml.message_count, summary.messages);
     assert_eq!(yaml.custom_data["ros2probe.report"].len(), 20_000);
-    // Nothing stays reserved.
+    // No space stays reserved.
     let again = path.with_file_name("again");
     fs::write(&again, vec![0; 100_000]).unwrap();
-    // A bag that cannot be begun leaves nothing, however often somebody tries.
+    // A bag that cannot be started leaves nothing behind, however often it is tried.
     let rest = fs::write(path.with_file_name("rest"), vec![0; 6 << 20]);
     assert!(rest.is_err());
     let third = path.with_file_name("third");

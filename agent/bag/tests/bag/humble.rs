@@ -1,4 +1,4 @@
-//! Real bags of Humble: their metadata and records are those that are written here.
+//! Compares metadata and records with real bags of Humble.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -48,7 +48,7 @@ fn qos(depth: i32, reliability: Reliability, durability: Durability) -> Qos {
     }
 }
 
-/// Records in order, as text; what must differ is left out.
+/// Returns records in order, as text, without fields that must differ.
 fn listing(bytes: &[u8]) -> Vec<String> {
     let mut listing = Vec::new();
     let mut rest = &bytes[records::MAGIC.len()..bytes.len() - records::MAGIC.len()];
@@ -75,7 +75,7 @@ fn listing(bytes: &[u8]) -> Vec<String> {
                     listing.push(format!("  {} {content:?}", opcode.0));
                 }
             }
-            // One for each channel, in any order.
+            // One per channel, in any order.
             Opcode::MESSAGE_INDEX => {
                 let at = listing
                     .iter()
@@ -97,7 +97,7 @@ fn listing(bytes: &[u8]) -> Vec<String> {
                     index.compression
                 ));
             }
-            // Offsets follow from how small the chunk became.
+            // Offsets depend on the compressed size of the chunk.
             Opcode::SUMMARY_OFFSET => {
                 listing.push(format!("offset of {} {:?}", content[0], &content[9..]));
             }
@@ -148,7 +148,7 @@ fn records_are_those_that_humble_writes() {
         };
         topics.insert(channel.id, writer.topic(description).unwrap());
     }
-    // Humble writes no sequence numbers and no times of sending.
+    // Humble writes neither sequence numbers nor times of sending.
     let write = &mut |message: &records::Message<'_>, _: &Contents| {
         let time = Timestamp(message.log_time);
         let topic = topics[&message.channel_id];
@@ -162,7 +162,7 @@ fn records_are_those_that_humble_writes() {
     for (ours, theirs) in ours.iter().zip(&theirs) {
         assert_eq!(ours, theirs);
     }
-    // And metadata.yaml, but for the order of topics.
+    // And metadata.yaml, except for the order of topics.
     let theirs = fs::read_to_string(real().join("bag_zstd_fast/metadata.yaml")).unwrap();
     let mut theirs = Metadata::read(&theirs).unwrap();
     let ours = fs::read_to_string(path.join("metadata.yaml")).unwrap();

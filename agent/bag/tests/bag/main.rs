@@ -1,4 +1,4 @@
-//! Bags as things on disk: what is written, and what other readers make of it.
+//! Bags on disk: their content, and how other readers read them.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -53,7 +53,7 @@ fn topic(name: &str, type_name: &str) -> TopicDescription {
     }
 }
 
-/// `count` messages of two topics, ten a second; every third is of the larger topic.
+/// Writes `count` messages of two topics, ten per second; every third is of the larger topic.
 fn bag(directory: &Path, options: Options, count: u64) -> Summary {
     let mut writer = Writer::create(directory, options).unwrap();
     let chatter = writer
@@ -95,7 +95,7 @@ fn metadata(directory: &Path) -> Metadata {
     Metadata::read(&text).unwrap()
 }
 
-/// Topic, sequence, log time, publish time and bytes, as the `mcap` crate reads them.
+/// Returns topic, sequence, log time, publish time and bytes, as the `mcap` crate reads them.
 fn messages(path: &Path) -> Vec<(String, u32, u64, u64, Vec<u8>)> {
     let bytes = fs::read(path).unwrap();
     let messages = mcap::MessageStream::new(&bytes).unwrap();

@@ -1,10 +1,10 @@
-//! Bags in every form, as the PyPI readers find them.
+//! Bags in every form, as the PyPI readers read them.
 
 use ros2probe_testing::bag_readers::read_by_others;
 
 use super::*;
 
-/// Every form and compression, by name.
+/// Returns every form and compression, by name.
 fn forms() -> [(&'static str, Options); 8] {
     let usual = Options {
         ros_distro: "jazzy".into(),

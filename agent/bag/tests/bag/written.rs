@@ -1,4 +1,4 @@
-//! What a writer puts into a bag, as other readers find it.
+//! Content of written bags, as other readers find it.
 
 use super::*;
 
@@ -40,7 +40,7 @@ fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones()
         .unwrap();
         let sent: Vec<_> = (0..sizes.len()).map(|index| (index, data(index))).collect();
         assert!(found == sent, "{name}");
-        // The other reader knows no zstd here; it checks the checksums.
+        // The other reader is built without zstd here; it checks the checksums.
         if name != "packed" {
             let theirs = messages(&summary.files[0]).into_iter();
             assert!(
@@ -180,7 +180,7 @@ fn a_bag_says_in_metadata_what_is_in_it() {
             .offered_qos_profiles
             .starts_with("- history: 1\n  depth: 10\n")
     );
-    // The same in the file, where a reader of single files looks.
+    // The same in the file, for readers of single files.
     let bytes = fs::read(path.join("run_0.mcap")).unwrap();
     let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
     assert_eq!(summary.metadata_indexes.len(), 2);
@@ -201,7 +201,7 @@ fn files_are_split_by_size_and_by_time_and_nothing_is_lost_between() {
         ..Options::default()
     };
     let summary = bag(&by_time, options, 50);
-    // A file holds what is at most 2 s after its first message.
+    // A file holds messages up to 2 s after its first one.
     let counts: Vec<_> = summary
         .files
         .iter()
@@ -257,7 +257,7 @@ fn what_was_flushed_is_there_when_the_writer_is_gone() {
             writer.flush().unwrap();
         }
     }
-    // As `kill -9` leaves it: neither closed nor dropped.
+    // As after `kill -9`: neither closed nor dropped.
     std::mem::forget(writer);
     assert_eq!(metadata(&path).message_count, 3);
     let bytes = fs::read(path.join("killed_0.mcap")).unwrap();
@@ -405,7 +405,7 @@ fn whole_files_are_compressed_by_whoever_takes_the_work() {
             found.relative_file_paths[0],
             format!("{suffix}_0.mcap.{suffix}")
         );
-        // The last file, and nothing of the second, which somebody else was to do.
+        // The last file, and not the second, which was taken for another thread.
         let summary = writer.close(BTreeMap::new()).unwrap();
         let names: Vec<_> = summary.files.iter().map(|file| file.exists()).collect();
         assert_eq!(names, [true; 3]);

@@ -1,7 +1,7 @@
-//! The host hook from user space: attach it to a cgroup, read what it captured, ask about sockets.
+//! The host hook from user space: attaches it to a cgroup, reads its captures, looks up sockets.
 //!
-//! Attached by links: the kernel detaches them when the last descriptor is closed, so nothing stays
-//! behind however the process ends. Links stand beside other people's programs on the same cgroup.
+//! It is attached by links: the kernel removes them with the last descriptor, so nothing stays
+//! behind however the process ends. Links coexist with other programs on the same cgroup.
 
 use std::fs::File;
 use std::io;
@@ -25,9 +25,10 @@ use super::{
 const INGRESS: u32 = 0;
 const EGRESS: u32 = 1;
 
-/// What the host hook has besides what both hooks have.
+/// State of the host hook in addition to the shared state.
 pub(super) struct HostHook {
-    /// Until they are attached: it holds the object's instructions and types, half a megabyte.
+    /// Present until the programs are attached: it holds the object's instructions and types, half
+    /// a megabyte.
     programs: Option<Ebpf>,
     layout: KernelLayout,
     tracepoints: Option<Tracepoints>,
@@ -43,12 +44,12 @@ pub struct Links {
     egress: OwnedFd,
 }
 
-/// One piece of a captured datagram, in place in the ring: the ring has its room again when this is
-/// dropped.
+/// One piece of a captured datagram, read in place; dropping it frees its room in the ring.
 pub struct CapturedPiece<'a>(RingBufItem<'a>);
 
 impl CapturedPiece<'_> {
-    /// The piece and its bytes; `None` when it is not one, which the kernel program does not write.
+    /// Returns the piece and its bytes; `None` if it is malformed, which the kernel program never
+    /// writes.
     #[must_use]
     pub fn read(&self) -> Option<(Piece, &[u8])> {
         let (piece, bytes) = Piece::read_from_prefix(self.0.deref()).ok()?;
@@ -57,12 +58,13 @@ impl CapturedPiece<'_> {
     }
 }
 
-/// The host hook.
+/// Methods of the host hook.
 impl Filter {
-    /// Loads the host hook's programs and their maps; attaches them to nothing.
+    /// Loads the host hook's programs and their maps, without attaching them.
     ///
     /// # Errors
-    /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
+    /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
+    /// refuses them.
     pub fn load_host(settings: &FilterSettings) -> Result<Self, FilterError> {
         let pieces = ring_size(settings.piece_ring_bytes);
         let layout = if settings.kernel_types {
@@ -88,13 +90,13 @@ impl Filter {
         Ok(filter)
     }
 
-    /// Attaches the host hook to a cgroup (version 2), given by its directory: from now on it sees
-    /// the datagrams of all sockets that were created in that cgroup or below.
+    /// Attaches the host hook to a cgroup (version 2), given by its directory. From then on it sees
+    /// the datagrams of all sockets created in that cgroup or below.
     ///
     /// # Errors
-    /// [`FilterError::AttachNotPermitted`] without CAP_NET_ADMIN, [`FilterError::Attach`] when the
-    /// directory is no such cgroup, or another program on it excludes further ones. Then nothing is
-    /// attached.
+    /// Returns [`FilterError::AttachNotPermitted`] without CAP_NET_ADMIN, and
+    /// [`FilterError::Attach`] if the directory is not such a cgroup or another program on it
+    /// excludes further ones. Then nothing is attached.
     pub fn attach(&mut self, cgroup: &File) -> Result<(), FilterError> {
         let mut links = self.links()?.create(cgroup)?;
         if let Some(host) = &mut self.host {
@@ -103,10 +105,11 @@ impl Filter {
         Ok(())
     }
 
-    /// What attaches the host hook to another cgroup, also after this filter is gone.
+    /// Returns what is needed to attach the host hook to another cgroup, even after this filter is
+    /// dropped.
     ///
     /// # Errors
-    /// On the wire hook, and when there can be no more descriptors.
+    /// Fails on the wire hook, and if no more descriptors are available.
     pub fn links(&self) -> Result<Links, FilterError> {
         let host = self.host.as_ref();
         let host = host.ok_or(FilterError::Missing("host hook"))?;
@@ -117,8 +120,8 @@ impl Filter {
         })
     }
 
-    /// Attaches the programs that look further inside the kernel, as many as it allows. `whole_host`:
-    /// the hook is attached to the topmost cgroup, so it sees every socket. Nothing on the wire hook.
+    /// Attaches the tracepoint programs that the kernel supports. `whole_host`: the hook is
+    /// attached to the topmost cgroup, so it sees every socket. Does nothing on the wire hook.
     pub fn attach_tracepoints(&mut self, whole_host: bool) {
         if let Some(host) = &mut self.host
             && let Some(programs) = &mut host.programs
@@ -128,40 +131,41 @@ impl Filter {
         }
     }
 
-    /// Nothing more will be attached: what that takes is given up. What is in place stays.
+    /// Frees what further attaching would need. Attached programs stay.
     pub fn settle(&mut self) {
         if let Some(host) = &mut self.host {
             host.programs = None;
         }
     }
 
-    /// What [`Filter::attach_tracepoints`] has put in place.
+    /// Returns what [`Filter::attach_tracepoints`] has attached.
     #[must_use]
     pub fn tracepoints(&self) -> Option<&Tracepoints> {
         self.host.as_ref()?.tracepoints.as_ref()
     }
 
-    /// The program for datagrams on their way out, `None` on the wire hook.
+    /// Returns the program for sent datagrams; `None` on the wire hook.
     #[must_use]
     pub fn egress_program(&self) -> Option<BorrowedFd<'_>> {
         self.host.as_ref().map(|host| host.egress.as_fd())
     }
 
-    /// Readable when the ring of captured datagrams is half full; `None` on the wire hook.
+    /// Returns a descriptor that is readable when the ring of captured datagrams is half full;
+    /// `None` on the wire hook.
     #[must_use]
     pub fn piece_ring(&self) -> Option<BorrowedFd<'_>> {
         self.pieces.as_ref().map(RingBuf::as_fd)
     }
 
-    /// The oldest piece of a captured datagram not read yet.
+    /// Returns the oldest unread piece of a captured datagram.
     pub fn next_piece(&mut self) -> Option<CapturedPiece<'_>> {
         self.pieces.as_mut()?.next().map(CapturedPiece)
     }
 
-    /// What the hook knows of a socket, by its cookie.
+    /// Returns the hook's entry for a socket, by its cookie.
     ///
     /// # Errors
-    /// When the kernel refuses.
+    /// Fails if the kernel refuses the lookup.
     pub fn socket(&self, cookie: u64) -> Result<Option<Socket>, FilterError> {
         let Some(host) = &self.host else {
             return Ok(None);
@@ -173,7 +177,7 @@ impl Filter {
         }
     }
 
-    /// Every socket that the hook remembers, by cookie.
+    /// Iterates over the sockets that the hook remembers, by cookie.
     pub fn sockets(&self) -> impl Iterator<Item = (u64, Socket)> + '_ {
         self.host
             .iter()
@@ -184,11 +188,11 @@ impl Filter {
 }
 
 impl Links {
-    /// Links the programs to a cgroup (version 2), given by its directory. They are detached when
-    /// the descriptors are closed, and stand beside other programs on the cgroup.
+    /// Links the programs to a cgroup (version 2), given by its directory. Closing the descriptors
+    /// detaches them; they coexist with other programs on the cgroup.
     ///
     /// # Errors
-    /// As [`Filter::attach`].
+    /// Fails as [`Filter::attach`] does.
     pub fn create(&self, cgroup: &File) -> Result<Vec<OwnedFd>, FilterError> {
         let programs = [(&self.ingress, INGRESS), (&self.egress, EGRESS)];
         let links = programs.map(|(program, direction)| link(program, cgroup, direction));
@@ -202,8 +206,8 @@ impl Links {
     }
 }
 
-/// What is not a link would outlive the process; the kernels that have the maps we need (5.8) have
-/// links (5.7).
+/// Creates a link. Any other attachment would outlive the process; kernels with the required maps
+/// (5.8) have links (5.7).
 fn link(program: &OwnedFd, cgroup: &File, direction: u32) -> io::Result<OwnedFd> {
     let [program, cgroup] = [program.as_raw_fd(), cgroup.as_raw_fd()].map(i32::cast_unsigned);
     bpf::create_link(program, cgroup, direction)

@@ -1,8 +1,9 @@
-//! The probe on Fast DDS's way into shared memory, from user space: load it, attach it to libraries.
+//! The probe on Fast DDS's path into shared memory, from user space: loads it, attaches it to
+//! libraries.
 //!
-//! Attached to a library's file, it puts a breakpoint into the code of every process that maps it,
-//! and takes it out again: the kernel does both, also when this process is killed, because a probe
-//! lives as long as its descriptor. Nothing is written to `uprobe_events`.
+//! Attached to a library's file, it puts a breakpoint into the code of every process that maps the
+//! file. The kernel inserts and removes the breakpoint, also if this process is killed, because a
+//! probe lives as long as its descriptor. Nothing is written to `uprobe_events`.
 
 use std::fs::File;
 use std::os::fd::AsRawFd as _;
@@ -14,11 +15,11 @@ use aya::programs::{ProgramError, UProbe};
 
 use super::{Filter, FilterError, FilterSettings, UNUSED, open, ring_size, take};
 
-/// Where the kernel says that it has probes of this kind. Without it older ways would be tried,
-/// which outlive a process that is killed.
+/// File in which the kernel announces this type of probe. Without it aya falls back to older
+/// interfaces, whose probes outlive a killed process.
 const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
 
-/// How a library's function gets its message.
+/// How a library's function receives its message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Form {
     /// In one piece (Fast DDS 2.x).
@@ -27,20 +28,22 @@ pub enum Form {
     List,
 }
 
-/// The programs, to be attached; the maps are with the [`Filter`] of the same call.
+/// The loaded programs; their maps are in the [`Filter`] returned with them.
 pub struct Probes(Ebpf);
 
-/// One library's; the breakpoint goes with it.
+/// The probe of one library; dropping it removes the breakpoint.
 pub struct Probe {
     _link: UProbeLink,
 }
 
 impl Filter {
-    /// Loads the programs for messages into shared memory, and their maps; attaches them to nothing.
-    /// `within`: only what processes of this control group send, by the inode of its directory.
+    /// Loads the programs for shared-memory messages and their maps, without attaching them.
+    /// `within`: restricts them to processes of this control group, given by the inode of its
+    /// directory.
     ///
     /// # Errors
-    /// [`FilterError::NotPermitted`] without the capabilities, others when the kernel refuses them.
+    /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
+    /// refuses them.
     pub fn load_uprobe(
         settings: &FilterSettings,
         within: Option<u64>,
@@ -71,12 +74,13 @@ impl Filter {
 }
 
 impl Probes {
-    /// Attaches to a library at an offset in its file: from now on every call there is seen.
+    /// Attaches to a library at an offset in its file: every call there is then seen.
     ///
     /// # Errors
-    /// [`FilterError::Probe`] without CAP_SYS_ADMIN, or when no instruction is there.
+    /// Returns [`FilterError::Probe`] without CAP_SYS_ADMIN, or if the offset is not an
+    /// instruction.
     pub fn attach(&mut self, file: &File, offset: u64, form: Form) -> Result<Probe, FilterError> {
-        // The very file that was looked at, whatever its name means by now.
+        // Refers to the inspected file, even if its path now names another one.
         let path = format!("/proc/self/fd/{}", file.as_raw_fd());
         let program = program(&mut self.0, form)?;
         let link = program

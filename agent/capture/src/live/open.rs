@@ -1,4 +1,4 @@
-//! Opening the taps that the settings ask for, or the best that there are.
+//! Opens the configured taps, or the best ones available.
 
 use std::path::PathBuf;
 
@@ -13,10 +13,10 @@ use crate::error_chain::in_words;
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ExactChoice, SourceChoice};
 
-/// A fragmented datagram fits in, however many network namespaces share the cap.
+/// Least share of a namespace: one fragmented datagram fits, however many namespaces share the cap.
 const LEAST_REASSEMBLY: usize = 1 << 17;
 
-/// Whose shared memory belongs to what is looked at otherwise.
+/// Returns the shared memory that belongs to the observed sockets or namespaces.
 pub(super) fn scope(settings: &CaptureSettings, host: bool) -> Scope {
     match &settings.cgroup {
         Some(cgroup) if host => Scope::Cgroup(cgroup.clone()),
@@ -29,7 +29,7 @@ pub(super) fn scope(settings: &CaptureSettings, host: bool) -> Scope {
     }
 }
 
-/// The tap at the sockets, or why there is none.
+/// Returns the tap at the sockets, or why it is unavailable.
 pub(super) fn open_host(
     settings: &CaptureSettings,
 ) -> Result<(Option<HostTap>, Option<String>), CaptureError> {
@@ -54,8 +54,8 @@ pub(super) fn open_host(
     }
 }
 
-/// The programs for messages into shared memory, or why there are none. Without them shared memory
-/// is looked at as usual.
+/// Returns the programs for shared-memory messages, or why they are unavailable. Without them
+/// shared memory is sampled.
 pub(super) fn open_exact(
     settings: &CaptureSettings,
     host: bool,
@@ -64,8 +64,8 @@ pub(super) fn open_exact(
         return (None, None);
     }
     if !host {
-        // Of processes, only control groups can be told apart where the programs run.
-        let reason = "it goes with looking at the host's sockets (capture.source)";
+        // Where these programs run, processes can be selected by control group only.
+        let reason = "uprobes require observing the host's sockets (capture.source: host)";
         return (None, Some(reason.to_owned()));
     }
     let opened = Uprobe::open(
@@ -80,13 +80,13 @@ pub(super) fn open_exact(
     }
 }
 
-/// A tap for this namespace and one for each configured one.
+/// Opens a tap for this namespace and for each configured one.
 pub(super) fn open_wires(
     settings: &CaptureSettings,
     limits: Limits,
     selection: Selection,
 ) -> Result<Vec<WireTap>, CaptureError> {
-    // All of them together keep the cap.
+    // Together they stay within the cap.
     let share = limits.bytes / (1 + settings.network_namespaces.len());
     let limits = Limits {
         bytes: share.max(LEAST_REASSEMBLY),

@@ -1,7 +1,7 @@
 //! pcapng (draft-ietf-opsawg-pcapng): sections of blocks, each with its own byte order.
 //!
-//! Section headers, interface descriptions and the three packet blocks are read; everything else
-//! is skipped without being held in memory.
+//! Reads section headers, interface descriptions and the three packet blocks, and skips everything
+//! else without holding it in memory.
 
 use std::io::{self, Read};
 
@@ -19,16 +19,16 @@ const OBSOLETE_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
 const ENHANCED_PACKET: u32 = 6;
 
-/// A packet with its options and comments.
+/// Longest block: a packet with its options and comments.
 const LONGEST_BLOCK: u32 = LONGEST_PACKET + 65_536;
 const MOST_INTERFACES: usize = 4096;
 const LONGEST_NAME: usize = 256;
 
-/// A section: what its header and its interface descriptions said so far.
+/// State of a section, from its header and its interface descriptions.
 pub(super) struct Section {
     endianness: Endianness,
     interfaces: Vec<Interface>,
-    /// Simple packets carry no time; they get that of the packet before them.
+    /// Time of the previous packet, which simple packets without a time inherit.
     last_time: Timestamp,
 }
 
@@ -41,7 +41,7 @@ struct Interface {
 }
 
 impl Section {
-    /// After the magic.
+    /// Reads the first section header, after the magic.
     pub(super) fn open(source: &mut dyn Read) -> Result<Self, PcapError> {
         let length = array(source, "section header", 0)?;
         let mut section = Self {
@@ -121,7 +121,7 @@ impl Section {
         }
     }
 
-    /// The rest of a section header block. `length` stands before the byte order is known.
+    /// Reads the rest of a section header block. `length` precedes the byte order in the file.
     fn begin(
         &mut self,
         length: [u8; 4],
@@ -145,7 +145,7 @@ impl Section {
                 what: "unknown version of pcapng",
             });
         }
-        // Byte order, version and section length are behind us; options and the second length not.
+        // Byte order, version and section length are read; options and the second length remain.
         let body = body_length(self.number(length), packets)?;
         let options = body.checked_sub(16).ok_or(PcapError::Malformed {
             packets,
@@ -223,7 +223,7 @@ impl Section {
 }
 
 impl Interface {
-    /// `None` when its clock is finer than we can count.
+    /// Returns `None` if the resolution of its clock is too fine.
     fn read(mut cursor: Cursor<'_>) -> Result<Option<Self>, WireError> {
         let link = Link(cursor.u16("interface's link type")?);
         cursor.u16("interface's reserved field")?;
@@ -272,7 +272,7 @@ impl Interface {
     }
 }
 
-/// Length of what stands between a block's two lengths.
+/// Returns the number of bytes between a block's two lengths.
 fn body_length(total: u32, packets: u64) -> Result<u32, PcapError> {
     total
         .checked_sub(12)

@@ -1,13 +1,13 @@
-//! Replaying at the pace of the capture, a multiple of it, or as fast as it goes.
+//! Replay at the pace of the capture, a multiple of it, or without pauses.
 //!
-//! Only tells how long to wait; who waits, and what may interrupt it, is the caller's choice.
+//! It only computes how long to wait; the caller waits, and decides what interrupts it.
 
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 use ros2probe_wire::Timestamp;
 
-/// How fast to replay.
+/// Speed of a replay.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub enum Speed {
     /// Without waiting.
@@ -16,14 +16,14 @@ pub enum Speed {
     Times(f64),
 }
 
-/// Says how long to wait before each packet.
+/// Computes the pause before each packet.
 #[derive(Clone, Debug)]
 pub struct Pacer {
     speed: Speed,
     anchor: Option<(Timestamp, Instant)>,
 }
 
-/// Not a speed.
+/// The text is not a speed.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, thiserror::Error)]
 #[error("a speed is a number above zero (1 is the capture's own pace) or \"max\"")]
 pub struct SpeedError;
@@ -43,7 +43,7 @@ impl FromStr for Speed {
 }
 
 impl Pacer {
-    /// Nothing replayed yet.
+    /// Creates a pacer before the first packet.
     #[must_use]
     pub const fn new(speed: Speed) -> Self {
         Self {
@@ -52,15 +52,15 @@ impl Pacer {
         }
     }
 
-    /// How long from `now` until the packet captured at `time` is due. The first packet is due at
-    /// once and sets the pace; a packet older than the first, or one that is late, is due at once.
+    /// Returns the time from `now` until the packet captured at `time` is due. The first packet is
+    /// due at once and sets the pace; a late packet, or one older than the first, is due at once.
     pub fn delay(&mut self, time: Timestamp, now: Instant) -> Duration {
         let Speed::Times(factor) = self.speed else {
             return Duration::ZERO;
         };
         let (first, started) = *self.anchor.get_or_insert((time, now));
         let since_first = Duration::from_nanos(time.0.saturating_sub(first.0));
-        // A capture that spans centuries at a crawl: as good as for ever.
+        // Overflows for a capture of centuries at a very low speed: wait forever.
         let due = Duration::try_from_secs_f64(since_first.as_secs_f64() / factor)
             .unwrap_or(Duration::MAX);
         due.saturating_sub(now.saturating_duration_since(started))

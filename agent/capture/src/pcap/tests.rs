@@ -134,7 +134,7 @@ fn next_generation(endianness: Endianness) -> Vec<u8> {
             .raw(b"hi")
             .u32(0);
     });
-    // 1024 units a second.
+    // 1024 units per second.
     file.block(6, |body| {
         body.u32(1).u32(0).u32(1536).u32(3).u32(3).raw(b"two");
     });
@@ -262,7 +262,7 @@ fn a_file_cut_anywhere_delivers_what_precedes_the_cut() {
                 Some(PcapError::Truncated { packets: count, .. }) => {
                     assert_eq!(count, packets.len() as u64);
                 }
-                // Between two blocks or packets the end cannot be told from the end.
+                // Between two blocks or packets, a truncation cannot be detected.
                 None => {}
                 Some(error) => panic!("cut at {end}: {error}"),
             }
@@ -352,7 +352,7 @@ fn fragments_of_a_real_capture_become_a_datagram() {
     );
 }
 
-/// Frames, datagrams whole or put together, what became of the fragments.
+/// Returns frames, datagrams (whole or reassembled), and the reassembly's counters.
 fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
     let mut reader = PcapReader::open(path).unwrap();
     let mut reassembly = Reassembly::new(Limits::default());
@@ -374,7 +374,8 @@ fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
     (reader.packets(), whole, reassembly.counters())
 }
 
-/// Frames, whole UDP datagrams, fragments, frames that a cooked header calls outgoing.
+/// Returns the numbers of frames, whole UDP datagrams, fragments, and frames that a cooked header
+/// marks as outgoing.
 fn census(path: &Path) -> (u64, u64, u64, u64) {
     let mut reader = PcapReader::open(path).unwrap();
     let (mut datagrams, mut fragments, mut outgoing) = (0, 0, 0);

@@ -1,4 +1,4 @@
-//! The fragments of one datagram: which byte ranges have come, and their bytes.
+//! The fragments of one datagram: the byte ranges that have arrived, and their bytes.
 
 use std::mem::size_of;
 
@@ -11,36 +11,36 @@ use super::{FlowKey, UDP_HEADER};
 /// An unfinished datagram.
 #[derive(Debug)]
 pub(super) struct Flow {
-    /// Position among all flows ever opened.
+    /// Sequence number among all flows.
     pub(super) order: u64,
     pub(super) first_seen: Timestamp,
     pub(super) last_seen: Timestamp,
     pub(super) handover: Option<Record>,
     /// Sorted, neither overlapping nor touching.
     pieces: Vec<Piece>,
-    /// Length of the datagram with its UDP header, once the last fragment has come.
+    /// Length of the datagram with its UDP header, known after the last fragment.
     total: Option<u32>,
-    /// First byte that a capture cut short did not keep.
+    /// First byte that is missing in a truncated capture.
     first_unknown: Option<u32>,
     /// Capacity of all pieces.
     held: usize,
 }
 
-/// Consecutive bytes. In-order fragments all end up in one.
+/// Consecutive bytes. Fragments that arrive in order form one piece.
 #[derive(Debug)]
 struct Piece {
     start: u32,
     bytes: Vec<u8>,
 }
 
-/// What a fragment brought.
+/// Result of adding a fragment.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub(super) enum Placed {
     /// Bytes that were missing.
     New,
-    /// Nothing that was not there.
+    /// No new bytes.
     Nothing,
-    /// It cannot belong to the same datagram. Nothing has changed.
+    /// It cannot belong to the same datagram. The flow is unchanged.
     Contradiction,
 }
 
@@ -65,15 +65,15 @@ impl Flow {
         }
     }
 
-    /// Bytes this flow costs, bookkeeping included.
+    /// Returns the bytes of this flow, bookkeeping included.
     pub(super) const fn memory(&self) -> usize {
         const ENTRIES: usize = size_of::<Flow>() + 2 * size_of::<FlowKey>();
         ENTRIES + self.held + self.pieces.capacity() * size_of::<Piece>()
     }
 
-    /// The same, counted from its pieces.
+    /// Returns the same, computed from its pieces.
     pub(super) fn held(&self) -> usize {
-        // A new list does not compile before it has a place here.
+        // A new list does not compile until it is listed here.
         let Self {
             order: _,
             first_seen: _,
@@ -91,7 +91,7 @@ impl Flow {
         self.memory() - held + pieces.iter().map(bytes).sum::<usize>()
     }
 
-    /// Takes a fragment. Of overlapping bytes the first to come are kept.
+    /// Adds a fragment. Of overlapping bytes, the first ones are kept.
     pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placed {
         let (start, end) = (fragment.offset, fragment.end());
         let seen = self.pieces.last().map_or(0, Piece::end);
@@ -124,7 +124,7 @@ impl Flow {
         placed
     }
 
-    /// The byte range, counted from the UDP header, that has to be delivered, if it is all there.
+    /// Returns the byte range to deliver, counted from the UDP header, if it is complete.
     pub(super) fn complete(&self) -> Option<(u32, u32)> {
         let to = self.total()?;
         let from = self
@@ -134,7 +134,8 @@ impl Flow {
         (piece.start <= from && to <= piece.end()).then_some((from, to))
     }
 
-    /// The bytes up to `to`, with zeros before `from`, without those a capture did not keep.
+    /// Returns the bytes up to `to`, with zeros before `from`, without those missing in the
+    /// capture.
     pub(super) fn take(&mut self, from: u32, to: u32) -> Vec<u8> {
         let index = self.first_ending_after(from);
         let Some(piece) = self.pieces.get_mut(index) else {
@@ -165,7 +166,7 @@ impl Flow {
         self.pieces.partition_point(|piece| piece.end() <= offset)
     }
 
-    /// The first missing range within `from..to`, and which piece it stands before.
+    /// Returns the first missing range within `from..to`, and the index of the piece after it.
     fn gap(&self, mut from: u32, to: u32) -> Option<(usize, u32, u32)> {
         let mut index = self.first_ending_after(from);
         if let Some(piece) = self.pieces.get(index)
@@ -178,7 +179,8 @@ impl Flow {
         (from < to).then_some((index, from, to))
     }
 
-    /// Puts the fragment's bytes `from..to` before the piece at `index`, joining what touches.
+    /// Inserts the fragment's bytes `from..to` before the piece at `index`, joining adjacent
+    /// pieces.
     fn fill(&mut self, index: usize, from: u32, to: u32, fragment: &Fragment<'_>) {
         let size = |offset: u32| usize::try_from(offset).unwrap_or(usize::MAX);
         let within = |offset: u32| size(offset.saturating_sub(fragment.offset));
@@ -215,13 +217,13 @@ impl Flow {
         };
         self.held = self.held.saturating_sub(piece.bytes.capacity());
         piece.bytes.extend_from_slice(bytes);
-        // What the capture did not keep of the fragment.
+        // Bytes of the fragment that are missing in the capture.
         piece.bytes.resize(size(to.saturating_sub(piece.start)), 0);
         piece.bytes.extend_from_slice(&joined);
         self.held += piece.bytes.capacity();
     }
 
-    /// Whether a fragment that is wholly covered has other bytes than those that cover it.
+    /// Returns whether a fully covered fragment differs from the bytes that cover it.
     fn differs(&self, fragment: &Fragment<'_>) -> bool {
         if self.first_unknown.is_some() {
             return false;

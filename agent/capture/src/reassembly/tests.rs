@@ -101,7 +101,7 @@ fn a_late_repeated_fragment_does_not_reopen_a_datagram() {
     assert_eq!(feed(&mut reassembly, 1, &parts[..2]), []);
     assert_eq!(reassembly.counters().duplicate, 2);
     assert_empty(&reassembly);
-    // After a while the identification may come again for another datagram.
+    // After a while another datagram may reuse the identification.
     let later = Timestamp(3 * SECOND);
     assert!(
         parts

@@ -1,8 +1,7 @@
-//! What the kernel writes into one block of a TPACKET_V3 ring (`linux/if_packet.h`), read as plain
-//! bytes.
+//! Parses one block of a TPACKET_V3 ring (`linux/if_packet.h`) as plain bytes.
 //!
-//! Offsets in a block come from the kernel, and still none is followed out of the block: a wrong
-//! one ends the block and says so.
+//! Offsets in a block come from the kernel; still none is followed out of the block. A wrong offset
+//! ends the block and is reported.
 
 use std::mem::{offset_of, size_of};
 
@@ -10,7 +9,7 @@ use libc::{sockaddr_ll, tpacket_block_desc, tpacket_hdr_v1, tpacket_hdr_variant1
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::PacketType;
 
-/// Where a block's owner is written down.
+/// Offset of the word that holds a block's owner.
 pub(super) const STATUS: usize =
     offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, block_status);
 const COUNT: usize = offset_of!(tpacket_block_desc, hdr) + offset_of!(tpacket_hdr_v1, num_pkts);
@@ -23,7 +22,7 @@ const VLAN_TAG: usize =
 /// The address follows its header at the next multiple of `TPACKET_ALIGNMENT`.
 const ADDRESS: usize = size_of::<tpacket3_hdr>().next_multiple_of(libc::TPACKET_ALIGNMENT);
 
-// The kernel's ABI does not change; these say which one the offsets above were taken from.
+// The kernel's ABI does not change; this pins the version of the offsets above.
 const _: () = assert!(STATUS == 8 && COUNT == 12 && FIRST == 16 && LENGTH == 20);
 const _: () = assert!(size_of::<tpacket_block_desc>() == 48 && size_of::<tpacket3_hdr>() == 48);
 const _: () = assert!(VLAN_TAG == 32 && ADDRESS == 48 && size_of::<sockaddr_ll>() == 20);
@@ -32,19 +31,19 @@ const _: () = assert!(offset_of!(tpacket3_hdr, tp_mac) == 24);
 /// One frame in the ring.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct RingFrame<'a> {
-    /// When the kernel saw it.
+    /// Time at which the kernel saw it.
     pub time: Timestamp,
-    /// The bytes kept, beginning at the network header.
+    /// The captured bytes, beginning at the network header.
     pub bytes: &'a [u8],
-    /// How many bytes there were.
+    /// Length of the frame from the network header.
     pub length: u32,
     /// Index of the interface it was seen on.
     pub interface: u32,
-    /// Whom it is for; outgoing when this host sends it.
+    /// Recipient of the frame; outgoing if this host sends it.
     pub packet_type: PacketType,
-    /// Ether type of what the bytes begin with.
+    /// Ether type of the bytes.
     pub protocol: u16,
-    /// VLAN tag that the kernel took off.
+    /// VLAN tag removed by the kernel.
     pub vlan: Option<u16>,
 }
 
@@ -58,7 +57,7 @@ pub struct Frames<'a> {
 }
 
 impl<'a> Frames<'a> {
-    /// Of a block that belongs to user space.
+    /// Reads a block that belongs to user space.
     #[must_use]
     pub fn new(block: &'a [u8]) -> Self {
         let header = (|| {
@@ -82,7 +81,7 @@ impl<'a> Frames<'a> {
         }
     }
 
-    /// Whether the iteration ended early because the block contradicts itself.
+    /// Returns whether the iteration ended early because the block contradicts itself.
     #[must_use]
     pub const fn damaged(&self) -> bool {
         self.damaged
@@ -109,7 +108,7 @@ impl<'a> Iterator for Frames<'a> {
     }
 }
 
-/// The frame at `at`, and how far away the next one is.
+/// Returns the frame at `at`, and the distance to the next one.
 fn frame(block: &[u8], at: usize) -> Option<(RingFrame<'_>, usize)> {
     let block = block.get(at..)?;
     let step = size(word(block, offset_of!(tpacket3_hdr, tp_next_offset))?);
@@ -172,7 +171,7 @@ pub(super) mod tests {
         block_of(&[b"first", b"another"])
     }
 
-    /// Frames as the kernel lays them out; the last one with a VLAN tag.
+    /// A block as the kernel lays it out; the last frame has a VLAN tag.
     pub(in crate::ring) fn block_of(frames: &[&[u8]]) -> Vec<u8> {
         let mut block = vec![0; 48];
         put(&mut block, STATUS, libc::TP_STATUS_USER);
@@ -249,7 +248,7 @@ pub(super) mod tests {
                 let mut bytes = bytes[..end].to_vec();
                 put(&mut bytes, LENGTH, u32::try_from(end).unwrap());
                 let mut frames = Frames::new(&bytes);
-                // Only the padding after the last frame is not missed.
+                // Without the padding after the last frame the block is still complete.
                 let complete = frames.by_ref().count() == 2;
                 assert_eq!(frames.damaged(), !complete);
                 assert_eq!(complete, end >= bytes.len().max(48 + 96 + 87));

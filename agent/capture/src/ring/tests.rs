@@ -1,4 +1,4 @@
-//! Live, in network namespaces of their own, which takes root.
+//! Live tests in network namespaces of their own. Needs root.
 
 use std::net::UdpSocket;
 use std::time::Instant;
@@ -18,13 +18,13 @@ const SMALL: Settings = Settings {
     retire: Duration::from_millis(10),
 };
 
-/// However busy the machine is.
+/// Generous for a busy machine.
 const PATIENCE: Duration = Duration::from_secs(20);
 
 /// UDP payloads, by interface.
 type Payloads = Vec<(u32, Vec<u8>)>;
 
-/// UDP payloads seen, of frames that this host sends, until they are as they should be.
+/// Collects UDP payloads of frames that this host sends until `done` accepts them.
 fn sent_until(ring: &mut Ring, done: impl Fn(&Payloads) -> bool) -> Payloads {
     let mut payloads = Payloads::new();
     let start = Instant::now();
@@ -35,7 +35,7 @@ fn sent_until(ring: &mut Ring, done: impl Fn(&Payloads) -> bool) -> Payloads {
     payloads
 }
 
-/// UDP payloads seen within a time, of frames that this host sends.
+/// Collects UDP payloads of frames that this host sends during `patience`.
 fn sent(ring: &mut Ring, patience: Duration) -> Payloads {
     let mut payloads = Payloads::new();
     let start = Instant::now();
@@ -46,7 +46,7 @@ fn sent(ring: &mut Ring, patience: Duration) -> Payloads {
     payloads
 }
 
-/// UDP payloads in blocks that the kernel is done with, of frames that this host sends.
+/// Returns UDP payloads of frames that this host sends, in released blocks.
 fn ready(ring: &mut Ring) -> Payloads {
     let mut payloads = Payloads::new();
     while let Some(block) = ring.block() {
@@ -96,8 +96,8 @@ fn filter(keep: i32) -> OwnedFd {
 #[test]
 fn a_socket_that_may_hold_as_little_as_up_to_linux_6_7_takes_the_kernel_filter() {
     in_new_namespace(|| {
-        // From Linux 6.8 on each network namespace has its own, of 128 KB; before, the host's is what
-        // it is.
+        // Since Linux 6.8 each network namespace has its own value, 128 KB; before, the host's
+        // value applies.
         let _ = std::fs::write("/proc/sys/net/core/optmem_max", "20480");
         let filter = Filter::load(&FilterSettings::default()).unwrap();
         let ring = Ring::open(SMALL, Some(filter.program())).unwrap();
@@ -153,8 +153,9 @@ fn the_ring_goes_round_many_times_without_losing_a_frame() {
         let mut ring = Ring::open(SMALL, None).unwrap();
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         let mut seen = Payloads::new();
-        // 4 blocks hold about 60 of these; 3000 times two copies are 100 rounds. On a busy machine
-        // each block may be closed with two of them, so what is there is always read first.
+        // 4 blocks hold about 60 frames; 3000 packets with two copies each fill them 100 times. On
+        // a busy machine each block may be closed with two frames, so available frames are read
+        // first.
         for number in 0..3000_u32 {
             let mut payload = [0; 800];
             payload[..4].copy_from_slice(&number.to_be_bytes());
@@ -167,7 +168,7 @@ fn the_ring_goes_round_many_times_without_losing_a_frame() {
         let numbers: Vec<u32> = numbers
             .map(|bytes| u32::from_be_bytes(*bytes.unwrap()))
             .collect();
-        // Not `assert_eq`: nobody reads two lists of 3000 numbers.
+        // Not `assert_eq`: two lists of 3000 numbers are unreadable.
         assert!(
             numbers.iter().copied().eq(0..3000),
             "{:?}",
@@ -206,11 +207,11 @@ fn what_a_slow_reader_misses_is_counted_once() {
         }
         let first = ring.statistics().unwrap();
         assert!(first.drops > 800 && first.freezes >= 1, "{first:?}");
-        // The kernel forgets with each reading, we do not.
+        // The kernel resets its counters on each read, the ring does not.
         assert_eq!(ring.statistics().unwrap(), first);
         let kept = sent(&mut ring, Duration::from_millis(100)).len();
         assert!(kept > 10, "{kept}");
-        // Blocks went back to the kernel: there is room again.
+        // Blocks went back to the kernel, which has room again.
         socket.send_to(b"again", "127.0.0.1:7400").unwrap();
         sent_until(&mut ring, |payloads| {
             payloads
@@ -267,7 +268,8 @@ fn a_link_that_goes_down_does_not_make_the_reader_spin() {
         // SAFETY: a terminated string.
         let index = unsafe { libc::if_nametoindex(c"gone".as_ptr()) };
         let index = i32::try_from(index).unwrap();
-        // Only a socket bound to the interface is told; ours are not, and still must not spin.
+        // The kernel reports to sockets bound to the interface only; the agent's are not bound, and
+        // still must not spin.
         let mut bound = Ring::open_on(SMALL, None, index).unwrap();
         let mut unbound = Ring::open(SMALL, None).unwrap();
         sent(&mut bound, Duration::from_millis(50));
@@ -321,7 +323,7 @@ fn blocks_are_whole_pages_whatever_a_page_is() {
             };
             let (request, block_size) = request(settings, page).unwrap();
             assert_eq!(block_size, given, "{wanted} bytes in pages of {page}");
-            // What packet_set_ring() wants of it.
+            // Requirements of packet_set_ring().
             let (size, frame) = (request.tp_block_size, request.tp_frame_size);
             assert_eq!(size as usize, block_size);
             assert!(frame > 0 && frame % libc::TPACKET_ALIGNMENT as u32 == 0);

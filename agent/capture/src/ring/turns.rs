@@ -1,44 +1,43 @@
-//! Whose turn it is: the blocks of a ring, one after the other, each passed to and fro between the
-//! kernel and its reader by one word.
+//! Ownership of a ring's blocks, each passed between the kernel and its reader by one word.
 //!
-//! Knows no socket and no system call: over plain memory, with a thread in the kernel's place, it
-//! does the same, which is how the tests run it under Miri.
+//! Uses no socket and no system call. Over plain memory, with a thread in place of the kernel, it
+//! behaves the same; the tests run it that way under Miri.
 
 use std::ptr::NonNull;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use super::block::{Frames, STATUS};
 
-/// The blocks, and which of them comes next.
+/// The blocks, and the index of the next one.
 #[derive(Debug)]
 pub(super) struct Turns {
     start: NonNull<u8>,
     block_size: usize,
     blocks: usize,
-    /// Block that the kernel will hand over next.
+    /// Block that the kernel hands over next.
     next: usize,
 }
 
-/// A block of frames on loan from the kernel. Frames are dropped while the reader keeps all blocks,
+/// A block of frames on loan from the kernel. Frames are dropped while the reader holds all blocks,
 /// so it should not be kept for long.
 #[derive(Debug)]
 pub struct Block<'a> {
     turns: &'a mut Turns,
 }
 
-// SAFETY: whoever made it has said that the memory is there for as long as it is; it is reached
-// through this value only, and no thread has a claim to it.
+// SAFETY: the caller of `new` guarantees that the memory outlives this value; it is accessed only
+// through this value and bound to no thread.
 unsafe impl Send for Turns {}
 
 impl Turns {
-    /// Blocks that lie one behind the other from `start` on.
+    /// Creates a ring over adjacent blocks at `start`.
     ///
     /// # Safety
-    /// `start` is aligned to 8, `block_size` a multiple of that and at least a block's header, and
-    /// `blocks`, not 0, times `block_size` bytes are mapped for as long as the value lives. Nobody
-    /// but the other side touches them, and that writes into a block only while its status does not
-    /// have `TP_STATUS_USER`, after having read that with acquire, and before setting it with
-    /// release.
+    /// `start` is aligned to 8. `block_size` is a multiple of 8 and at least the size of a block's
+    /// header. `blocks`, not 0, times `block_size` bytes are mapped while the value lives. Only the
+    /// other side accesses them besides this value. It writes into a block only while its status
+    /// does not have `TP_STATUS_USER`, after having read that with acquire, and before setting it
+    /// with release.
     pub(super) const unsafe fn new(start: NonNull<u8>, block_size: usize, blocks: usize) -> Self {
         Self {
             start,
@@ -48,18 +47,18 @@ impl Turns {
         }
     }
 
-    /// How many blocks there are.
+    /// Returns the number of blocks.
     pub(super) const fn blocks(&self) -> usize {
         self.blocks
     }
 
-    /// Which block comes next.
+    /// Returns the index of the next block.
     #[cfg(test)]
     pub(super) const fn next(&self) -> usize {
         self.next
     }
 
-    /// The next block if the kernel is done with it.
+    /// Returns the next block if the kernel has released it.
     pub(super) fn block(&mut self) -> Option<Block<'_>> {
         // Acquire: pairs with the write barrier between the kernel's last write to the block and
         // its status (net/packet/af_packet.c, prb_flush_block).
@@ -70,25 +69,25 @@ impl Turns {
         Some(Block { turns: self })
     }
 
-    /// Where the next block begins.
+    /// Returns the start of the next block.
     fn start(&self) -> NonNull<u8> {
-        // SAFETY: `next < blocks`, so the block lies within the memory that `new` was told of.
+        // SAFETY: `next < blocks`, so the block lies within the memory passed to `new`.
         unsafe { self.start.byte_add(self.next * self.block_size) }
     }
 
-    /// The word by which the next block changes hands.
+    /// Returns the word that passes the next block.
     fn status(&self) -> &AtomicU32 {
         // SAFETY: a block is longer than its header, which has the word (STATUS, a multiple of 4).
         let word = unsafe { self.start().byte_add(STATUS) };
-        // SAFETY: aligned and mapped as `new` was told, for as long as `self` lives. Kernel and user
-        // space both access it as one 32-bit word; the kernel does not write it while we own the
-        // block.
+        // SAFETY: aligned and mapped, as guaranteed to `new`, while `self` lives. Kernel and user
+        // space both access it as one 32-bit word; the kernel does not write it while user space
+        // owns the block.
         unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) }
     }
 }
 
 impl Block<'_> {
-    /// The frames in it.
+    /// Returns the frames of the block.
     #[must_use]
     pub fn frames(&self) -> Frames<'_> {
         Frames::new(self.bytes())
@@ -96,9 +95,9 @@ impl Block<'_> {
 
     fn bytes(&self) -> &[u8] {
         let start = self.turns.start();
-        // SAFETY: the block is mapped for as long as the ring lives, which this borrows. It belongs
-        // to user space since `Turns::block` saw TP_STATUS_USER, and until our Drop the kernel
-        // writes nothing into it; nor do we. Any bytes are valid `u8`.
+        // SAFETY: the block is mapped while the ring lives, which this borrows. It belongs to user
+        // space since `Turns::block` saw TP_STATUS_USER. Until the drop, neither the kernel nor
+        // this process writes to it. Any bytes are valid `u8`.
         unsafe { std::slice::from_raw_parts(start.as_ptr(), self.turns.block_size) }
     }
 }
@@ -124,10 +123,10 @@ mod tests {
     const BLOCK: usize = 512;
     const BLOCKS: usize = 3;
 
-    /// Memory of a ring, as words so that it is aligned.
+    /// Memory of a ring, in words for alignment.
     struct Memory(NonNull<u8>);
 
-    // SAFETY: plain memory; what is done to it is what the test is about.
+    // SAFETY: plain memory; the tests exercise its synchronization.
     unsafe impl Send for Memory {}
 
     impl Memory {
@@ -139,11 +138,11 @@ mod tests {
         }
 
         fn turns(&self) -> Turns {
-            // SAFETY: as long and as aligned as said, and every test frees it last.
+            // SAFETY: length and alignment are as required, and every test frees it last.
             unsafe { Turns::new(self.0, BLOCK, BLOCKS) }
         }
 
-        /// What the kernel does: waits for its turn, fills the block, gives it away.
+        /// Acts as the kernel: waits for its turn, fills the block, passes it on.
         fn fill(&self, index: usize, bytes: &[u8]) {
             // SAFETY: within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
@@ -155,7 +154,7 @@ mod tests {
                 thread::yield_now();
             }
             let (head, tail) = (&bytes[..STATUS], &bytes[STATUS + 4..]);
-            // SAFETY: the block is the kernel's, and the reader has let go of it.
+            // SAFETY: the kernel's side owns the block, since the reader has released it.
             unsafe { block.copy_from_nonoverlapping(NonNull::from(head).cast(), head.len()) };
             // SAFETY: within the block, behind the status.
             let behind = unsafe { word.byte_add(4) };
@@ -164,10 +163,10 @@ mod tests {
             status.store(libc::TP_STATUS_USER, Ordering::Release);
         }
 
-        /// After everything that was made of it.
+        /// Frees the memory after every use of it.
         fn free(self) {
             let words = std::ptr::slice_from_raw_parts_mut(self.0.cast().as_ptr(), Self::WORDS);
-            // SAFETY: from `new`, and nobody has it any more.
+            // SAFETY: from `new`, and no longer used.
             drop(unsafe { Box::<[u64]>::from_raw(words) });
         }
     }
@@ -176,7 +175,7 @@ mod tests {
         vec![number; usize::from(number % 7) * 9 + 1]
     }
 
-    /// The frames of the next block, waited for.
+    /// Waits for the next block and returns its frames.
     fn next(turns: &mut Turns) -> Vec<Vec<u8>> {
         loop {
             if let Some(block) = turns.block() {
@@ -196,7 +195,7 @@ mod tests {
         assert_eq!(next(&mut turns), [b"first"]);
         assert_eq!(next(&mut turns), [&b"second"[..], b"third"]);
         assert!(turns.block().is_none());
-        // Not the first again: the third is next, and only then the first.
+        // Not the first again: the third is next, then the first.
         memory.fill(0, &block_of(&[b"again"]));
         assert!(turns.block().is_none());
         memory.fill(2, &block_of(&[]));
@@ -213,7 +212,7 @@ mod tests {
         thread::scope(|scope| {
             let kernel = Memory(memory.0);
             scope.spawn(move || {
-                // All of it, not only the pointer in it.
+                // Moves the whole value, not only the pointer in it.
                 let kernel = kernel;
                 for number in 0..NUMBERS {
                     let bytes = block_of(&[&payload(number), b"", &payload(number ^ 1)]);

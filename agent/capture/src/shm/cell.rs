@@ -1,4 +1,4 @@
-//! One place in a port's ring: which buffer of which segment holds a message.
+//! One entry of a port's ring: the buffer and segment that hold a message.
 //!
 //! Layout: MultiProducerConsumerRingBuffer's cell with a BufferDescriptor, Fast DDS 2.3 to 3.6
 //! (constant 5 of its shared-memory ABI), 20 bytes: reference counter, segment id, offset of the
@@ -6,25 +6,25 @@
 
 use std::fmt;
 
-/// Names a segment; in hexadecimal it ends the file's name.
+/// Id of a segment; the file's name ends in its hexadecimal form.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct SegmentId(pub [u8; 8]);
 
-/// Which message a cell means.
+/// Identifies the message of a cell.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Default, Debug)]
 pub struct Descriptor {
-    /// Where it lies.
+    /// Segment with the buffer.
     pub segment: SegmentId,
-    /// Offset of its buffer's node in there.
+    /// Offset of the buffer's node in the segment.
     pub node: u32,
-    /// Which use of the buffer is meant.
+    /// Validity id: distinguishes successive uses of the buffer.
     pub validity: u32,
 }
 
 /// A cell as it was read.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
 pub struct Cell {
-    /// Listeners that have not taken it yet; 0 also while it is being filled.
+    /// Number of listeners that have not read it yet; also 0 while it is being filled.
     pub references: u32,
     /// The message.
     pub descriptor: Descriptor,
@@ -34,7 +34,7 @@ impl Cell {
     /// Bytes of a cell.
     pub const LEN: usize = 20;
 
-    /// From its bytes.
+    /// Parses the bytes of a cell.
     #[must_use]
     pub const fn parse(bytes: [u8; Self::LEN]) -> Self {
         let [

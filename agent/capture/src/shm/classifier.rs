@@ -1,8 +1,8 @@
 //! The verdict on a message in shared memory: the kernel filter's rules, on the same walk.
 //!
-//! Ignored, metered as records, or captured whole; writers that nobody has classified yet are
-//! captured, then metered, each within a budget. Messages are read where the walk needs them:
-//! that of a point cloud's fragment costs its first 256 bytes.
+//! Messages are ignored, metered as records, or captured whole. Messages of unclassified writers
+//! are captured, then metered, each within a budget. Only the parts that the walk needs are read:
+//! the first 256 bytes for a point cloud's fragment.
 
 use std::collections::HashMap;
 
@@ -12,26 +12,26 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
 use ros2probe_wire::{EntityId, Guid};
 
-/// Submessages of one message that are followed; one with more is captured.
+/// Submessages read per message; a message with more is captured.
 const SUBMESSAGES: usize = 64;
-/// What unclassified writers may cost each second, all together: bytes captured, and records.
+/// Budget of all unclassified writers per second: bytes captured, and records.
 const CAPTURE_PER_SECOND: i64 = 4 << 20;
 const RECORDS_PER_SECOND: i64 = 4096;
 
-/// What is to be done with a message.
+/// What happens to a message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum MessageVerdict {
-    /// Nothing: none of its submessages is of interest.
+    /// Discarded: none of its submessages is of interest.
     Ignored,
-    /// The records that were appended count.
+    /// The appended records are valid.
     Metered,
-    /// User space has to see it whole.
+    /// User space must read it whole.
     Captured,
-    /// It is no RTPS message.
+    /// It is not an RTPS message.
     Foreign,
 }
 
-/// The rules, and what is wanted.
+/// The rules and the interest map.
 #[derive(Debug)]
 pub struct MessageClassifier {
     interest: HashMap<[u32; 4], Verdict>,
@@ -40,13 +40,14 @@ pub struct MessageClassifier {
     capture_left: i64,
     records_left: i64,
     refilled: u64,
-    /// The message that was captured last is about endpoints or nodes, and more of that may follow.
+    /// The last captured message announces endpoints or nodes, and more announcements may follow.
     pub announces: bool,
-    /// It is of a writer whose messages are wanted whole: its nodes, or samples that are read.
+    /// It belongs to a writer whose messages are captured whole: a participant's nodes, or samples
+    /// that are read.
     pub is_wanted: bool,
 }
 
-/// Nothing classified.
+/// Starts without classified endpoints.
 impl Default for MessageClassifier {
     fn default() -> Self {
         Self {
@@ -62,7 +63,7 @@ impl Default for MessageClassifier {
 }
 
 impl MessageClassifier {
-    /// What is wanted of this writer or reader from now on; `None` = it is not classified.
+    /// Sets the verdict of a writer or reader; `None` = unclassified.
     pub fn set(&mut self, guid: Guid, verdict: Option<Verdict>) {
         let key = guid_words(guid);
         match verdict {
@@ -72,7 +73,7 @@ impl MessageClassifier {
         self.unknown.remove(&key);
     }
 
-    /// Gives unclassified writers what they may cost in the next second.
+    /// Refills the budget of unclassified writers for the next second.
     pub fn refill(&mut self, now: u64) {
         if now.saturating_sub(self.refilled) >= SECOND {
             self.refilled = now;
@@ -80,8 +81,8 @@ impl MessageClassifier {
         }
     }
 
-    /// Judges a message of `length` bytes. Records are appended with what `template` says of the
-    /// whole message; they count when the message is metered.
+    /// Judges a message of `length` bytes. Appends records based on `template`, which holds the
+    /// fields of the whole message; they are valid if the message is metered.
     pub fn classify<B: Bytes>(
         &mut self,
         message: &B,
@@ -150,7 +151,7 @@ impl MessageClassifier {
         }
     }
 
-    /// Captured within its budget, then metered within that of all.
+    /// Captures within the writer's budget, then meters within the common one.
     fn unknown(&mut self, writer: [u32; 4], length: u32) -> Verdict {
         let has_room = self.unknown.len() < UNKNOWN_CAPACITY as usize;
         let is_datagram = length <= u16::MAX.into();
@@ -185,7 +186,7 @@ mod tests {
         Guid::from_bytes(bytes)
     }
 
-    /// A message of some samples of some writers.
+    /// A message with samples of writers.
     pub(super) fn message(samples: &[([u8; 4], u32)]) -> Vec<u8> {
         let mut bytes = b"RTPS\x02\x03\x01\x0f".to_vec();
         bytes.extend([9; 12]);

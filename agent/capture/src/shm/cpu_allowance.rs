@@ -1,20 +1,20 @@
-//! What listing directories and opening ports may cost.
+//! CPU allowance for listing directories and opening ports.
 //!
-//! Who creates and deletes files all the time makes the tap list without end, and who leaves files
-//! that are no ports makes it open them without end. Both wait when their share of a CPU is used up.
-//! Knows no clock but what it is told.
+//! A process that constantly creates and deletes files makes the tap list directories without end,
+//! and files that are not ports make it open them without end. Both wait when the allowance is used
+//! up. It reads no clock.
 
-/// CPU nanoseconds that may be saved, so that a robot that starts is met at once.
+/// Most CPU nanoseconds saved, so that a starting robot is found at once.
 pub const SAVINGS: u64 = 1_000_000_000;
-/// One of so many nanoseconds may be spent.
+/// Reciprocal of the share: 1 % of a CPU.
 pub const SHARE: u64 = 100;
 
-/// CPU time for listings that is left.
+/// CPU time left for listings.
 #[derive(Debug)]
 pub struct CpuAllowance {
-    /// Nanoseconds; below zero what was spent too much.
+    /// Nanoseconds left; negative after overspending.
     left: i64,
-    /// When that was so, on the monotonic clock.
+    /// Time of that value, on the monotonic clock.
     at: u64,
 }
 
@@ -28,7 +28,7 @@ impl Default for CpuAllowance {
 }
 
 impl CpuAllowance {
-    /// Whether anything is left at `now`, in nanoseconds of the monotonic clock.
+    /// Returns whether anything is left at `now`, in nanoseconds of the monotonic clock.
     pub fn is_left(&mut self, now: u64) -> bool {
         let gained = now.saturating_sub(self.at) / SHARE;
         if gained > 0 {
@@ -39,7 +39,7 @@ impl CpuAllowance {
         self.left > 0
     }
 
-    /// So many nanoseconds of CPU time were used.
+    /// Charges this many nanoseconds of CPU time.
     pub const fn spend(&mut self, nanoseconds: u64) {
         self.left = self.left.saturating_sub_unsigned(nanoseconds);
     }
@@ -62,7 +62,7 @@ mod tests {
                 }
                 now += cost.min(1_000_000);
             }
-            // What was saved, the share of a hundred seconds, and one that was begun.
+            // The savings, the share of a hundred seconds, and one listing in progress.
             let most = SAVINGS + 101 * SECOND / SHARE + cost;
             assert!(spent <= most, "{cost}: {spent}");
             assert!(spent > SECOND / 2, "{cost}: {spent}");

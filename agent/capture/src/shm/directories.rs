@@ -1,8 +1,7 @@
-//! Which files of shared memory there are, in every mount namespace of the host.
+//! Finds the files of shared memory in every mount namespace of the host.
 //!
-//! Each `/dev/shm` is listed only when it changed; processes are gone through only for those that
-//! are new. What is behind `/proc/<pid>/root` belongs to somebody else: links are not followed
-//! there.
+//! Each `/dev/shm` is listed only if it changed; only new processes are inspected for mounts.
+//! Everything behind `/proc/<pid>/root` is untrusted, so links are not followed there.
 
 use std::collections::{HashMap, HashSet};
 use std::fs::{self, Metadata};
@@ -13,50 +12,51 @@ use std::time::{Duration, SystemTime};
 use super::cell::SegmentId;
 use super::owner::{LOCKED, Locks};
 
-/// Where shared memory is.
+/// Directory of shared memory.
 const SHARED_MEMORY: &str = "/dev/shm";
-/// File names begin with one of these: Fast DDS 2.x, 3.x.
+/// Prefixes of file names: Fast DDS 2.x, 3.x.
 const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
-/// Mount namespaces with a `/dev/shm` of their own that are looked at.
+/// Most mount namespaces with their own `/dev/shm`.
 const MAX_DIRECTORIES: usize = 64;
-/// Files of one of them.
+/// Most files kept per directory.
 const MAX_FILES: usize = 2048;
-/// Entries of one of them that are looked through for those.
+/// Most entries read per directory.
 const MAX_LISTED: usize = 65_536;
-/// A directory that changed so lately may change again without its time telling.
+/// Granularity of directory timestamps: a directory that changed more recently may change again
+/// without a new timestamp.
 const COARSE: Duration = Duration::from_secs(1);
-/// A process that was met no more often than this may still be mounting what it needs; an older
-/// one is asked again at every so many rounds.
+/// Number of rounds in which a new process may still be mounting directories; afterwards it is
+/// inspected only once per so many rounds.
 const YOUNG: u32 = 10;
 const ROUNDS: u32 = 32;
-/// Levels of cgroups and processes of a scope that are gone through.
+/// Levels of cgroups and processes of a scope that are visited.
 const DEPTH: usize = 8;
 const MAX_PROCESSES: usize = 8192;
 
-/// A directory of shared memory, by the device and inode it has.
+/// Device and inode of a directory of shared memory.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct ShmDirectoryId {
     device: u64,
     inode: u64,
 }
 
-/// The ports' and segments' files of one Fast DDS generation: index of its prefix.
+/// A generation of Fast DDS with its own file names: index of its prefix.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub struct Generation(u8);
 
-/// What a file is by its name.
+/// Kind of a file, by its name.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
 pub enum Name {
-    /// A port.
+    /// A port and its number.
     Port(Generation, u32),
-    /// A segment.
+    /// A segment and its id.
     Segment(Generation, SegmentId),
 }
 
 /// One directory of shared memory.
 #[derive(Debug)]
 pub struct ShmDirectory {
-    /// Where it can be reached now.
+    /// A path that currently reaches it.
     pub path: PathBuf,
     /// Files by name, with their inodes.
     pub files: HashMap<Name, u64>,
@@ -64,35 +64,35 @@ pub struct ShmDirectory {
     seen: bool,
 }
 
-/// Whose shared memory is read.
+/// Scope of the observed shared memory.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub enum Scope {
-    /// The agent's own, and that of every process.
+    /// Directories of the agent and of every process.
     AllProcesses,
-    /// That of the processes of this cgroup and those below it.
+    /// Directories of the processes of this cgroup and those below it.
     Cgroup(PathBuf),
-    /// The agent's own, and that of processes in these network namespaces.
+    /// Directories of the agent and of processes in these network namespaces.
     Networks(Vec<PathBuf>),
-    /// These directories.
+    /// Exactly these directories.
     Directories(Vec<PathBuf>),
 }
 
-/// All of them.
+/// The directories in scope.
 #[derive(Debug)]
 pub struct ShmDirectories {
     scope: Scope,
-    /// Inodes of the network namespaces, where those are the scope.
+    /// Inodes of the network namespaces, if they are the scope.
     networks: Vec<u64>,
-    /// By identity.
+    /// Directories by identity.
     pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
-    /// Processes gone through, with the directory they have and how often they were met.
+    /// Visited processes with their directory and the number of visits.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
-    /// Directories and files left out because of a cap.
+    /// Directories and files skipped because of a cap.
     pub left_out: u64,
 }
 
 impl Scope {
-    /// Its processes. Those of directories are not known.
+    /// Returns its processes. Unknown for a list of directories.
     #[must_use]
     pub fn processes(&self) -> Vec<u32> {
         match self {
@@ -108,7 +108,7 @@ impl Scope {
 }
 
 impl Name {
-    /// From a file's name; `None` for everything that is not read.
+    /// Parses a file's name; `None` for files that are not read.
     #[must_use]
     pub fn parse(name: &str) -> Option<Self> {
         let (generation, rest) = (0_u8..)
@@ -131,13 +131,13 @@ impl Name {
         is_id.then_some(Self::Segment(generation, SegmentId(id)))
     }
 
-    /// Of the file whose lock this file bears.
+    /// Returns the file whose lock this lock file represents.
     fn of_lock(name: &str) -> Option<Self> {
         let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
         LOCKED.iter().find_map(suffix)
     }
 
-    /// The file's name.
+    /// Returns the file's name.
     #[must_use]
     pub fn file_name(&self) -> String {
         let prefix = |generation: &Generation| {
@@ -152,7 +152,7 @@ impl Name {
 }
 
 impl ShmDirectories {
-    /// None found yet.
+    /// Creates an empty set.
     #[must_use]
     pub fn new(scope: Scope) -> Self {
         let networks = match &scope {
@@ -182,7 +182,7 @@ impl ShmDirectories {
             Scope::Cgroup(cgroup) => {
                 let mut processes = Vec::new();
                 processes_of(&cgroup, DEPTH, &mut processes);
-                // The agent may be there, and shares nothing.
+                // The agent itself may be in scope, but shares nothing.
                 processes.retain(|pid| *pid != std::process::id());
                 self.go_through(processes);
             }
@@ -194,7 +194,7 @@ impl ShmDirectories {
         self.directories.retain(|_, directory| directory.seen);
     }
 
-    /// Lists what changed since the last time; whether anything did.
+    /// Lists the directories that changed since the last call; returns whether any file changed.
     pub fn list(&mut self) -> bool {
         let mut any = false;
         for directory in self.directories.values_mut() {
@@ -209,7 +209,7 @@ impl ShmDirectories {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
-                // Its path may lead through another process, which need not live any more.
+                // Its path may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {
                     directory.seen = true;
                     known
@@ -306,8 +306,8 @@ impl ShmDirectory {
         true
     }
 
-    /// Of a directory that was not looked through to its end the files that were `listed`, and those
-    /// `known` before that are still there.
+    /// For a partially listed directory, returns the `listed` files and the `known` files that
+    /// still exist.
     fn keep(&self, listed: Vec<(Name, u64)>, known: HashMap<Name, u64>) -> Vec<(Name, u64)> {
         let mut files: HashMap<Name, u64> = listed.into_iter().collect();
         for (name, inode) in known {
@@ -320,8 +320,8 @@ impl ShmDirectory {
         files.into_iter().collect()
     }
 
-    /// Of too many files those whose processes live, and of those that are left as many of each
-    /// user, the oldest first: a user who makes many hides none of another's.
+    /// Selects from too many files: first those of living processes, then an equal number per user,
+    /// oldest first, so that no user can hide another's files.
     fn choose(&self, files: Vec<(Name, u64)>, locks: &[(Name, u64)]) -> Vec<(Name, u64)> {
         let device = fs::metadata(&self.path).map_or(0, |metadata| metadata.dev());
         let held = Locks::read();
@@ -338,7 +338,7 @@ impl ShmDirectory {
         chosen
     }
 
-    /// So many of them, an equal number of each user's.
+    /// Selects this many files, an equal number per user.
     fn share(&self, files: Vec<(Name, u64)>, room: usize) -> Vec<(Name, u64)> {
         let files = files.into_iter().filter_map(|(name, inode)| {
             let metadata = fs::symlink_metadata(self.path.join(name.file_name())).ok()?;
@@ -501,7 +501,7 @@ mod tests {
         let mut directories =
             ShmDirectories::new(Scope::Directories(vec![directory.path().to_path_buf()]));
         directories.find();
-        // Whichever end of the directory the file system lists first.
+        // In either order in which the file system lists the directory.
         make(real[0]);
         flood(0..MAX_LISTED - real.len());
         make(real[1]);
@@ -516,7 +516,7 @@ mod tests {
         flood(MAX_LISTED..MAX_LISTED + 2 * MAX_FILES);
         directories.left_out = 0;
         directories.list();
-        // One for all entries that were not looked at, and the files beyond those that are kept.
+        // One for all unread entries, plus the files beyond the cap.
         let left_out = usize::try_from(directories.left_out).unwrap();
         let bound = 1 + MAX_LISTED - MAX_FILES..=1 + MAX_LISTED;
         assert!(bound.contains(&left_out), "{left_out}");
@@ -560,7 +560,7 @@ mod tests {
             );
         };
         assert_only("fastrtps_port7411");
-        // Another directory with the same path, as after a mount.
+        // Another directory at the same path, as after a mount.
         fs::rename(&path, above.path().join("below")).unwrap();
         fs::create_dir(&path).unwrap();
         fs::write(path.join("fastrtps_port7413"), "").unwrap();
@@ -576,7 +576,7 @@ mod tests {
             .values()
             .filter(|directory| directory.path == Path::new(SHARED_MEMORY));
         assert_eq!(own.count(), 1);
-        // Of this process's network there is that one too, of a cgroup without processes nothing.
+        // This process's network includes that directory too; a cgroup without processes has none.
         let network = PathBuf::from("/proc/self/ns/net");
         let mut directories = ShmDirectories::new(Scope::Networks(vec![network]));
         directories.find();

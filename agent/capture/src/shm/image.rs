@@ -1,5 +1,4 @@
-//! Ports and segments as Fast DDS lays them out, for tests: the layout once more, from the writing
-//! side.
+//! Builds ports and segments in Fast DDS's layout for tests, from the writer's side.
 
 use std::fs;
 use std::os::unix::fs::FileExt as _;
@@ -26,7 +25,7 @@ pub struct SegmentImage {
 }
 
 impl PortImage {
-    /// An empty ring of `capacity` cells, PortNode at `node`.
+    /// Creates an empty ring of `capacity` cells, with PortNode at `node`.
     pub fn new(number: u32, capacity: u32, node: usize) -> Self {
         let (ring, cells) = (node + 64, node + 80);
         let mut image = Self {
@@ -47,7 +46,7 @@ impl PortImage {
         image
     }
 
-    /// Keeps a file in step from now on.
+    /// Mirrors every change to a file.
     pub fn in_directory(mut self, directory: &Path) -> Self {
         let path = self.path(directory);
         fs::write(&path, &self.bytes).unwrap();
@@ -63,13 +62,13 @@ impl PortImage {
         &self.bytes
     }
 
-    /// As Fast DDS does: write_p first, the cell then.
+    /// Pushes as Fast DDS does: first write_p, then the cell.
     pub fn push(&mut self, descriptor: Descriptor) {
         let index = self.begin_push();
         self.fill(index, descriptor);
     }
 
-    /// The first half of it.
+    /// Does the first half of a push: moves write_p.
     pub fn begin_push(&mut self) -> u32 {
         let write = self.word(self.ring);
         let (index, round) = (write & 0x7fff_ffff, write & 0x8000_0000);
@@ -81,7 +80,7 @@ impl PortImage {
         index
     }
 
-    /// The other half.
+    /// Does the second half of a push: fills the cell.
     pub fn fill(&mut self, index: u32, descriptor: Descriptor) {
         let at = self.cells + index as usize * Cell::LEN;
         let [low, high] = [&descriptor.segment.0[..4], &descriptor.segment.0[4..]]
@@ -97,7 +96,7 @@ impl PortImage {
         }
     }
 
-    /// All listeners are done with everything.
+    /// Marks every message as read by all listeners.
     pub fn pop_all(&mut self) {
         for index in 0..self.capacity {
             self.put(self.cells + index as usize * Cell::LEN, 0);
@@ -118,7 +117,7 @@ impl PortImage {
 }
 
 impl SegmentImage {
-    /// An empty segment.
+    /// Creates an empty segment.
     pub fn new(id: [u8; 8], length: usize) -> Self {
         Self {
             id: SegmentId(id),
@@ -128,7 +127,7 @@ impl SegmentImage {
         }
     }
 
-    /// Keeps a file in step from now on.
+    /// Mirrors every change to a file.
     pub fn in_directory(mut self, directory: &Path) -> Self {
         let path = self.path(directory);
         fs::write(&path, &self.bytes).unwrap();
@@ -144,7 +143,7 @@ impl SegmentImage {
         &self.bytes
     }
 
-    /// A message in a buffer of its own.
+    /// Writes a message into a new buffer.
     pub fn put(&mut self, message: &[u8]) -> Descriptor {
         let (node, data, validity) = (self.used, self.used + 16, 1);
         self.used = (data + message.len()).next_multiple_of(16);
@@ -159,7 +158,7 @@ impl SegmentImage {
         }
     }
 
-    /// Nobody needs this one any more.
+    /// Frees the buffer of a message.
     pub fn free(&mut self, descriptor: Descriptor) {
         let next = u64::from(descriptor.validity) + 1;
         self.write(descriptor.node as usize, &next.to_le_bytes());

@@ -1,4 +1,4 @@
-//! What the tap found, on its way to the working thread: bounded, and counted where it overflows.
+//! Queue from the tap to the worker thread: bounded, with a counter of overflows.
 
 use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -7,35 +7,35 @@ use ros2probe_wire::record::{Record, Sample};
 
 use crate::bell::Bell;
 
-/// Records, and bytes of captured messages, that wait at most.
+/// Most waiting records, and most bytes of captured messages.
 const MAX_RECORDS: usize = 16_384;
 const MAX_BYTES: usize = 16 << 20;
-/// From so many bytes on it asks to be emptied: a camera fills it in a fifth of a second.
+/// Bytes from which the worker is woken: a camera fills them in a fifth of a second.
 const MUCH: usize = 1 << 20;
 
-/// One thing that was found.
+/// One item of the queue.
 #[derive(Debug)]
 pub enum Item {
     /// A submessage of a measured writer.
     Record(Record),
     /// A whole message.
     Message {
-        /// When it was read, nanoseconds since the Unix epoch.
+        /// Time of reading, in nanoseconds since the Unix epoch.
         time: u64,
-        /// The port that it was announced at.
+        /// Port that announced it.
         port: u16,
         /// The message.
         bytes: Vec<u8>,
     },
-    /// A ring may have gone round unnoticed before this time.
+    /// A ring may have wrapped around unnoticed before this time.
     Uncertain(u64),
 }
 
-/// What waits.
+/// The waiting items.
 #[derive(Debug, Default)]
 pub struct Inbox {
     waiting: Mutex<Waiting>,
-    /// Wakes the working thread.
+    /// Wakes the worker thread.
     bell: Option<Bell>,
 }
 
@@ -47,23 +47,23 @@ struct Waiting {
 }
 
 impl Inbox {
-    /// Empty, with a descriptor that is readable when much waits.
+    /// Creates an empty queue with a descriptor that is readable when it fills up.
     #[must_use]
     pub fn with_bell() -> Self {
         Self {
             waiting: Mutex::default(),
-            // Without one, what waits is taken when the working thread looks by itself.
+            // Without a bell, the worker's own polling empties the queue.
             bell: Bell::new().ok(),
         }
     }
 
-    /// Readable when much waits.
+    /// Returns a descriptor that is readable when the queue fills up.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         Some(self.bell.as_ref()?.descriptor())
     }
 
-    /// Takes over what `found` holds, and leaves it empty.
+    /// Moves the items of `found` into the queue.
     pub fn put(&self, found: &mut Vec<Item>) {
         if found.is_empty() {
             return;
@@ -81,7 +81,7 @@ impl Inbox {
         }
     }
 
-    /// Hands over everything.
+    /// Removes and returns all items.
     #[must_use]
     pub fn take(&self) -> Vec<Item> {
         let waiting = &mut *self.waiting();
@@ -92,13 +92,13 @@ impl Inbox {
         std::mem::take(&mut waiting.items)
     }
 
-    /// What there was no room for.
+    /// Returns the number of items that did not fit.
     #[must_use]
     pub fn refused(&self) -> u64 {
         self.waiting().refused
     }
 
-    /// Nothing that is done under this lock can fail.
+    /// Locks the queue; no operation under this lock can panic.
     fn waiting(&self) -> MutexGuard<'_, Waiting> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -1,9 +1,9 @@
 //! Traffic between processes of one host through Fast DDS's shared memory, read and never written.
 //!
-//! A thread of its own looks at the ports (see [`tap`]), so that neither its sleeps nor a scan of
-//! processes hold up the capture, nor the capture its looks. It is a sampled view: what was
-//! overwritten before it looked it has not seen, and sequence numbers tell that there was something.
-//! It opens files for reading, takes no lock, registers nowhere and wakes nobody.
+//! A separate thread polls the ports (see [`tap`]), so that its sleeps and process scans do not
+//! delay the capture, and the capture does not delay it. The view is sampled: messages overwritten
+//! before a poll are not seen, but sequence numbers show that they existed. The thread opens files
+//! for reading, takes no lock, registers nowhere and wakes no process.
 
 pub mod cell;
 pub mod classifier;
@@ -42,32 +42,32 @@ use crate::threads::{Spawn, Task};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
-/// How often the counters are put where others can read them.
+/// Interval at which the counters are published.
 const REPORT: u64 = 200_000_000;
-/// How long it sleeps at a time while it is paused.
+/// Length of one sleep while it is paused.
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Close looks between two readings of the CPU time that they cost.
+/// Polls in close succession between two readings of their CPU time.
 const ACCOUNT_EVERY: u64 = 16;
 
-/// The thread that looks at shared memory, from the outside.
+/// Handle of the thread that polls shared memory.
 pub struct SharedMemory {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// What the tap says of itself.
+/// Report of the tap.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Facts {
-    /// What it met.
+    /// Counters of the tap.
     pub counters: Counters,
     /// CPU time of its thread, seconds.
     pub cpu_seconds: f64,
-    /// Its looks so far.
+    /// Number of polls.
     pub looks: u64,
-    /// By how much it sleeps longer than it would like to, to stay within its share.
+    /// Factor by which sleeps are extended to stay within the CPU share.
     pub stretch: f64,
-    /// Found, and lost because nobody took it in time.
+    /// Items lost because the queue was full.
     pub refused: u64,
 }
 
@@ -78,17 +78,17 @@ struct Shared {
     has_news: AtomicBool,
     wanted: AtomicU8,
     facts: Mutex<Facts>,
-    /// Everything there is seen otherwise.
+    /// Every message is seen by the probes instead.
     is_paused: AtomicBool,
     stop: AtomicBool,
 }
 
 impl SharedMemory {
-    /// Starts looking, within shares of a CPU. The thread keeps those of the caller's capabilities
-    /// that it needs.
+    /// Starts polling, within shares of a CPU. The thread keeps the capabilities of the caller that
+    /// it needs.
     ///
     /// # Errors
-    /// There can be no more threads.
+    /// Fails if the thread cannot be started.
     pub fn start(directories: ShmDirectories, budget: Budget, spawn: Spawn) -> io::Result<Self> {
         let shared = Arc::new(Shared {
             inbox: Inbox::with_bell(),
@@ -107,7 +107,7 @@ impl SharedMemory {
         })
     }
 
-    /// Says what has become of interest.
+    /// Updates the interest map.
     pub fn apply(&self, changes: &[(Guid, Option<Verdict>)]) {
         if changes.is_empty() {
             return;
@@ -118,18 +118,18 @@ impl SharedMemory {
         self.shared.has_news.store(true, Ordering::Release);
     }
 
-    /// Looks no longer, or again: everything is seen in the processes that send it.
+    /// Pauses or resumes polling, while the probes see everything in the sending processes.
     pub fn pause(&self, is_paused: bool) {
         self.shared.is_paused.store(is_paused, Ordering::Release);
     }
 
-    /// Readable when much was found that has not been taken in.
+    /// Returns a descriptor that is readable when the queue fills up.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         self.shared.inbox.descriptor()
     }
 
-    /// Gives the model what was found since the last time.
+    /// Passes everything found since the last call to the model.
     pub fn poll(&self, clocks: &Clocks, observer: &mut Observer) {
         for item in self.shared.inbox.take() {
             match item {
@@ -155,7 +155,7 @@ impl SharedMemory {
         }
     }
 
-    /// Says what is wanted: how often it looks follows that.
+    /// Sets the current need, which determines how often the thread polls.
     pub fn want(&self, wanted: Wanted) {
         let need = match wanted {
             Wanted::Nothing => Need::Nothing,
@@ -166,7 +166,7 @@ impl SharedMemory {
         self.shared.wanted.store(need as u8, Ordering::Relaxed);
     }
 
-    /// What it says of itself.
+    /// Returns the report of the tap.
     #[must_use]
     pub fn facts(&self) -> Facts {
         let facts = self.shared.facts.lock();
@@ -188,7 +188,7 @@ impl Drop for SharedMemory {
 }
 
 impl Shared {
-    /// Puts what the thread says of itself where others can read it.
+    /// Publishes the tap's report.
     fn report(&self, tap: &Tap, looks: u64, stretch: f64) {
         let facts = self.facts.lock();
         *facts.unwrap_or_else(PoisonError::into_inner) = Facts {
@@ -201,12 +201,12 @@ impl Shared {
     }
 }
 
-/// The thread.
+/// The thread's main function.
 fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget) {
     let mut tap = Tap::new(directories, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
     let mut interval = PollInterval::new(budget).on(cpus);
-    // Without it, somebody who comes is noticed at the next listing.
+    // Without inotify, a newcomer is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();
     let (mut is_first, mut may_be_first) = (false, true);
@@ -261,7 +261,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget) {
                     host");
             }
         }
-        // Where files come without end, the news of them wait as well.
+        // If files appear without end, events about them wait as well.
         let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
             std::thread::sleep(sleep);
             continue;

@@ -1,32 +1,32 @@
-//! Whether the process that made a file of shared memory still lives.
+//! Detects whether the process that created a file of shared memory is alive.
 //!
-//! Fast DDS keeps an flock on `<file>_el` (exclusive) or `<file>_sl` (shared) while it uses the file.
-//! The kernel lists locks in `/proc/locks` by device and inode, so nothing is opened or locked here:
-//! peers take these locks themselves to find files of dead processes.
+//! Fast DDS holds an flock on `<file>_el` (exclusive) or `<file>_sl` (shared) while it uses the
+//! file. The kernel lists locks in `/proc/locks` by device and inode, so this module opens and
+//! locks nothing: participants take these locks themselves to find files of dead processes.
 
 use std::collections::HashSet;
 use std::fs;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
-/// Suffixes of the files that bear the locks.
+/// Suffixes of the lock files.
 pub(super) const LOCKED: [&str; 2] = ["_el", "_sl"];
-/// The inode of the host's own process namespace (`PROC_PID_INIT_INO`). In others, `/proc/locks`
-/// leaves out the locks of processes that are not in them.
+/// The inode of the initial PID namespace (`PROC_PID_INIT_INO`). In other namespaces, `/proc/locks`
+/// omits the locks of processes outside of them.
 const HOST_PROCESSES: u64 = 0xefff_fffc;
 
 /// Device and inode of a file.
 type FileId = (u32, u32, u64);
 
-/// The locks of this host at one moment.
+/// A snapshot of this host's locks.
 #[derive(Debug, Default)]
 pub struct Locks {
-    /// `None` where they cannot be told.
+    /// `None` if they cannot be read completely.
     held: Option<HashSet<FileId>>,
 }
 
 impl Locks {
-    /// Reads them.
+    /// Reads the current locks.
     #[must_use]
     pub fn read() -> Self {
         let namespace = fs::metadata("/proc/self/ns/pid");
@@ -37,16 +37,16 @@ impl Locks {
         }
     }
 
-    /// Whether somebody holds the lock that the file with this device and inode bears; `None` where
-    /// that cannot be told.
+    /// Returns whether a process holds the lock of the file with this device and inode; `None` if
+    /// that is unknown.
     #[must_use]
     pub fn is_held(&self, device: u64, inode: u64) -> Option<bool> {
         let held = self.held.as_ref()?;
         Some(held.contains(&(libc::major(device), libc::minor(device), inode)))
     }
 
-    /// Whether the process that made this file of shared memory is dead for sure: the file that
-    /// bears its lock is there, and nobody holds the lock.
+    /// Returns whether the process that created this file is certainly dead: the lock file exists,
+    /// and its lock is free.
     #[must_use]
     pub fn is_abandoned(&self, path: &Path) -> bool {
         if self.held.is_none() {
@@ -68,8 +68,8 @@ impl Locks {
     }
 }
 
-/// The file of a line as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`; that of a process that
-/// waits for a lock (`1: -> FLOCK ...`) holds none.
+/// Returns the file of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`; a process
+/// that waits for a lock (`1: -> FLOCK ...`) holds none.
 fn file_of(line: &str) -> Option<FileId> {
     let mut words = line.split_whitespace().skip(1);
     if words.next() != Some("FLOCK") {
@@ -105,7 +105,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("fastrtps_port7411");
         fs::write(&path, "x").unwrap();
-        // Without a file that bears a lock nothing is known.
+        // Without a lock file the state is unknown.
         assert!(!Locks::read().is_abandoned(&path));
         for suffix in LOCKED {
             let name = directory.path().join(format!("fastrtps_port7411{suffix}"));

@@ -1,74 +1,74 @@
 //! How long the tap sleeps between two polls.
 //!
-//! Waking up is what a look costs. So it looks again soon where there was much, slower and slower
-//! where there was nothing, and whatever it would like to do is stretched until it stays within its
-//! share of a CPU. Knows no clock but what it is told.
+//! Waking up dominates the cost of a poll. So it polls again soon after finding many messages, ever
+//! more slowly after finding none, and extends every sleep until it stays within its share of a
+//! CPU. It reads no clock.
 
 use std::time::Duration;
 
-/// Between looks while messages come in bursts, and at most while something is measured.
+/// Sleep during bursts of messages, and the longest sleep while a topic is measured.
 const BURST: f64 = 100e-6;
 const WATCHING: f64 = 1e-3;
-/// At most when only discovery is wanted, and when nothing came for a while.
+/// Longest sleep if only discovery is needed, and after a quiet period.
 const NAMES: f64 = 5e-3;
 const QUIET: f64 = 10e-3;
-/// Where nothing is wanted: a glance, for what was said last can still be read.
+/// Sleep if nothing is needed: an occasional poll, since the latest messages stay readable.
 const NOTHING: f64 = 100e-3;
-/// Nothing came for so long.
+/// Length of a quiet period.
 const QUIET_AFTER: f64 = 3.0;
-/// How much longer each sleep after nothing is.
+/// Factor by which the sleep grows after an empty poll.
 const SLOWER: f64 = 1.5;
-/// The share of the CPU is looked at this often.
+/// Interval at which the CPU share is computed.
 const ACCOUNT: f64 = 0.1;
-/// When participants meet, each says its names once, and uses the buffer again some 50 us later.
-/// Short sleeps see more than none: who sleeps is woken before those who compute.
+/// Sleep during discovery: each participant announces its names once, and reuses the buffer some 50
+/// us later. Short sleeps see more than busy polling: the scheduler prefers threads that wake up.
 const MEETING: f64 = 10e-6;
-/// Messages come in bursts, and it does not sleep at all for so long after each.
+/// Time of busy polling after each message: messages arrive in bursts.
 const BURSTS: f64 = 200e-6;
-/// How long that goes on after a participant created its files, and after anything was announced.
+/// Duration of close polling after a participant creates its files, and after each announcement.
 const NEWCOMER: f64 = 0.3;
 const NEWS: f64 = 0.1;
-/// CPU time for it: at most so many seconds, and so much more each second.
+/// CPU credit for close polling: its maximum, and its growth per second.
 const CREDIT: f64 = 10.0;
 const CREDIT_PER_SECOND: f64 = 0.01;
-/// At most while every message is wanted. In a burst a sender uses its buffers again after some
-/// 100 us, and its reader is quicker than that.
+/// Longest sleep while every message is needed. In a burst a sender reuses its buffers after some
+/// 100 us, and its reader is faster than that.
 const EVERY: f64 = 50e-6;
 const SOON: f64 = 20e-6;
-/// CPU time that may be saved for it, so that a short recording lacks nothing, and overdrawn.
+/// CPU time that may be saved for that, so that a short recording is complete, and overdrawn.
 const SAVINGS: f64 = 5.0;
 const OVERDRAFT: f64 = 0.25;
-/// Sleeps get no longer than this, whatever it costs.
+/// Longest sleep, at any cost.
 const LONGEST: f64 = 50e-3;
 
-/// What the tap is there for at the moment.
+/// What the tap is needed for.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Need {
-    /// Nothing is measured that can pass here, and no name is lacking. Who comes is noticed.
+    /// Nothing that can pass here is measured, and no name is missing. Newcomers are noticed.
     Nothing,
-    /// Nothing is measured; node names and endpoints may come.
+    /// Nothing is measured; node names and endpoints may be announced.
     Names,
-    /// Something is measured.
+    /// A topic is measured.
     Watching,
-    /// Every message is wanted, not their number alone.
+    /// Every message is needed, not only their number.
     Every,
 }
 
 impl Need {
-    /// All of them.
+    /// Every need, in ascending order.
     pub const ALL: [Self; 4] = [Self::Nothing, Self::Names, Self::Watching, Self::Every];
 }
 
 /// Shares of a CPU, 0.015 for 1.5 %.
 #[derive(Clone, Copy, PartialEq, Debug)]
 pub struct Budget {
-    /// While messages are counted and names are read.
+    /// Share while messages are counted and names are read.
     pub watching: f64,
-    /// While every message is wanted.
+    /// Share while every message is needed.
     pub every: f64,
 }
 
-/// The sleeps.
+/// Computes the sleeps.
 #[derive(Debug)]
 pub struct PollInterval {
     budget: Budget,
@@ -79,19 +79,19 @@ pub struct PollInterval {
     accounted: (f64, f64),
     meeting_until: f64,
     awake_until: f64,
-    /// Others have a CPU while it does not sleep.
+    /// Whether the machine has another CPU for other processes during busy polling.
     has_company: bool,
     was_close: bool,
-    /// CPU time for close looks that is left.
+    /// CPU time left for close polling.
     credit: f64,
-    /// What is left of the budget while every message is wanted, as of a time and the CPU time that
-    /// was used up to then.
+    /// Rest of the budget while every message is needed, with the time and the CPU time at which it
+    /// was computed.
     savings: f64,
     spent: (f64, f64),
 }
 
 impl PollInterval {
-    /// Within these shares of a CPU.
+    /// Creates the schedule within these shares of a CPU.
     #[must_use]
     pub const fn new(budget: Budget) -> Self {
         Self {
@@ -111,7 +111,7 @@ impl PollInterval {
         }
     }
 
-    /// With more than one CPU it may stay awake for a moment.
+    /// Sets whether busy polling is allowed, which needs more than one CPU.
     #[must_use]
     pub const fn on(self, cpus: usize) -> Self {
         Self {
@@ -120,24 +120,24 @@ impl PollInterval {
         }
     }
 
-    /// Somebody comes: for a moment it looks as closely as it can, while there is credit for that.
+    /// Starts close polling for a moment, within the credit: a participant is starting.
     pub fn newcomer(&mut self, now: f64) {
         self.watch_closely(now + NEWCOMER);
     }
 
-    /// Something was announced, and more of it may follow.
+    /// Extends close polling: an announcement was read, and more may follow.
     pub fn news(&mut self, now: f64) {
         self.watch_closely(now + NEWS);
     }
 
-    /// Whether it looks closely because somebody comes.
+    /// Returns whether it polls closely because a participant is starting.
     #[must_use]
     pub fn is_watching_closely(&self, now: f64) -> bool {
         now < self.meeting_until
     }
 
-    /// How long to sleep after a look at `now` that found so many messages; `cpu` is what the
-    /// thread has used so far. Both in seconds.
+    /// Returns how long to sleep after a poll at `now` that found this many messages; `cpu` is the
+    /// thread's CPU time so far. Both are in seconds.
     pub fn sleep(&mut self, now: f64, cpu: f64, found: usize, need: Need) -> Duration {
         if found > 0 {
             self.quiet_since = now;
@@ -159,7 +159,7 @@ impl PollInterval {
         }
         self.meeting_until = now;
         if (need == Need::Every) != (self.need == Need::Every) {
-            // By another measure from now on.
+            // The budget changes: forget the measured cost.
             (self.stretch, self.accounted) = (1.0, (now, cpu));
             let saved = (now - self.spent.0) * self.budget.every;
             self.savings = (self.savings + saved).min(SAVINGS);
@@ -185,14 +185,15 @@ impl PollInterval {
         Duration::from_secs_f64(stretched)
     }
 
-    /// By how much sleeps are longer than they would be without a budget.
+    /// Returns the factor by which the budget extends sleeps.
     #[must_use]
     pub const fn stretch(&self) -> f64 {
         self.stretch
     }
 
-    /// The sleep while every message is wanted: shorter for a moment after each, which may be the
-    /// first of a burst. It always sleeps, for it runs before those whose messages it reads.
+    /// Returns the sleep while every message is needed: shorter for a moment after each message,
+    /// which may start a burst. It always sleeps, because it preempts the processes whose messages
+    /// it reads.
     fn sleep_little(&mut self, now: f64, cpu: f64, found: usize) -> Duration {
         let (then, used) = std::mem::replace(&mut self.spent, (now, cpu));
         let saved = (now - then) * self.budget.every - (cpu - used);
@@ -227,7 +228,7 @@ impl PollInterval {
             Need::Every => self.budget.every,
             Need::Nothing | Need::Names | Need::Watching => self.budget.watching,
         };
-        // Waking up less often by the factor that it costs too much, but not all at once.
+        // Wakes up less often by the factor of the excess, but gradually.
         let wanted = share / budget;
         let correction = wanted.clamp(0.8, 1.5);
         self.stretch = (self.stretch * correction).clamp(1.0, LONGEST / BURST);
@@ -243,8 +244,8 @@ mod tests {
         every: 0.25,
     };
 
-    /// Runs for `seconds` with a look costing `cost`; the share of CPU over the second half, and
-    /// the looks in it.
+    /// Simulates `seconds` with polls that take `cost`; returns the CPU share and the number of
+    /// polls in the second half.
     fn run(
         interval: &mut PollInterval,
         seconds: f64,
@@ -278,7 +279,7 @@ mod tests {
                         every: 1.0,
                     });
                     let (share, _) = run(&mut interval, 20.0, cost, Need::Watching, |_| burst);
-                    // A look that costs 200 us at every 50 ms is 0.4 %: less is not to be had.
+                    // A poll of 200 us every 50 ms is 0.4 %, the least possible share.
                     assert!(share <= budget * 1.1, "{budget} {cost} {burst}: {share}");
                 }
             }
@@ -314,7 +315,7 @@ mod tests {
         assert_eq!(microseconds(&mut interval, 100.01, 0.0), 10);
         assert_eq!(microseconds(&mut interval, 100.2, 0.0), 10);
         assert!(microseconds(&mut interval, 100.6, 0.0) > 10);
-        // Somebody comes all the time, and close looks take a third of a CPU.
+        // Participants start constantly, and close polls take a third of a CPU.
         let (mut now, mut cpu) = (101.0, 0.0);
         while now < 201.0 {
             interval.newcomer(now);
@@ -322,7 +323,7 @@ mod tests {
             now += 0.01;
             cpu += if close { 0.003 } else { 0.0 };
         }
-        // The credit, and what a hundred seconds give.
+        // The credit plus the growth of a hundred seconds.
         assert!((10.0..=11.1).contains(&cpu), "{cpu}");
     }
 
@@ -347,13 +348,13 @@ mod tests {
         let mut interval = PollInterval::new(BUDGET).on(2);
         let (share, looks) = run(&mut interval, 10.0, 8e-6, Need::Every, idle);
         assert!(looks > 15_000.0 && share < 0.16, "{looks} {share}");
-        // A hundred thousand messages a second, and looks that cost much.
+        // A hundred thousand messages per second, and expensive polls.
         for cost in [8e-6, 60e-6] {
             let mut interval = PollInterval::new(BUDGET).on(2);
             (interval.need, interval.savings) = (Need::Every, 0.0);
             let (share, looks) = run(&mut interval, 20.0, cost, Need::Every, |_| 10);
             assert!(share <= 0.27 && looks > 2000.0, "{cost} {share} {looks}");
-            // Nobody wants them any more: what was learnt of the cost does not carry over.
+            // Every message is no longer needed: the measured cost is forgotten.
             let first = interval.sleep(30.0, 9.0, 1, Need::Watching);
             assert!(first <= Duration::from_micros(500), "{first:?}");
         }
@@ -368,7 +369,7 @@ mod tests {
         assert_eq!(microseconds(1.001, 0.0, 1), 20);
         assert_eq!(microseconds(1.001_1, 0.0, 0), 20);
         assert_eq!(microseconds(1.001_3, 0.0, 0), 50);
-        // What was saved is spent, and saved again.
+        // The savings are spent, then saved again.
         assert_eq!(microseconds(1.5, 7.0, 1), 75);
         assert_eq!(microseconds(4.5, 7.0, 1), 20);
     }

@@ -1,15 +1,15 @@
-//! A port: the ring through which messages are announced to the participants that listen there.
+//! A port: the ring that announces messages to the participants that listen there.
 //!
-//! Reads PortNode, ring and cells of Fast DDS 2.3 to 3.6 and follows the writing end as a listener
-//! would, without being one: no reference is counted, nothing is popped. Whoever pushes moves
-//! `write_p` first, fills the cell then and sets its reference counter last; so a cell counts as
-//! filled when it is referred to or when it is not what it was a round before.
+//! Reads PortNode, ring and cells of Fast DDS 2.3 to 3.6 and follows the write position like a
+//! listener, without being one: it counts no reference and pops nothing. A writer first moves
+//! `write_p`, then fills the cell, and sets its reference counter last. So a cell counts as filled
+//! if it is referenced or if it differs from its content one round before.
 
 use super::cell::{Cell, Descriptor};
 use super::source::Source;
 
-/// PortNode lies behind the allocator's administration, 0x100 on x86-64 and 0x110 on aarch64: it
-/// is looked for in the first page by what it says about itself.
+/// PortNode follows the allocator's administration, at 0x100 on x86-64 and 0x110 on aarch64: it is
+/// found in the first page by its content.
 const FIRST: u64 = 0x40;
 const LAST: u64 = 0x1000;
 /// Fields of PortNode and of the ring's node.
@@ -18,16 +18,16 @@ const RING: u64 = 16;
 const PORT_ID: u64 = 20;
 const CAPACITY: u64 = 36;
 const TOTAL_CELLS: u64 = 8;
-/// Fast DDS has 512 cells unless it is configured otherwise; more would be our memory.
+/// Most cells accepted. Fast DDS has 512 by default; a larger ring would cost too much memory here.
 const MAX_CAPACITY: u32 = 1 << 11;
-/// A cell that is not filled after so long will not be: its writer died.
+/// A cell that is not filled after this time stays unfilled: its writer died.
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
-/// Attempts to read a ring that nobody moves meanwhile.
+/// Attempts to read a ring while no writer moves it.
 const ATTEMPTS: usize = 3;
-/// The rate of a port is measured over this long, and forgotten by an eighth each time.
+/// Interval over which a port's rate is measured; each interval decays the peak by an eighth.
 const PACE_NANOSECONDS: u64 = 100_000_000;
 
-/// Where things lie in a port's file.
+/// Offsets in a port's file.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 struct Layout {
     ring: u64,
@@ -35,11 +35,11 @@ struct Layout {
     capacity: u32,
 }
 
-/// How far one port was read.
+/// Read position in one port.
 #[derive(Debug)]
 pub struct Port {
     layout: Layout,
-    /// Of the next cell: index, plus the capacity in every other round.
+    /// Position of the next cell: its index, plus the capacity in every other round.
     position: u32,
     shadow: Vec<Descriptor>,
     unfilled_since: Option<u64>,
@@ -48,20 +48,20 @@ pub struct Port {
     bytes: Vec<u8>,
 }
 
-/// What one poll of a port found besides messages.
+/// Result of one poll of a port besides messages.
 #[derive(Clone, Copy, PartialEq, Eq, Default, Debug)]
 pub struct PortPoll {
-    /// Messages announced since the last one.
+    /// Messages announced since the previous poll.
     pub pushed: u64,
-    /// Of those, overwritten before they were read.
+    /// Messages among them that were overwritten before they were read.
     pub overwritten: u64,
-    /// Announced and never filled in.
+    /// Messages announced but never filled in.
     pub unfilled: u64,
-    /// So much time had passed that the ring may have gone round unnoticed.
+    /// Whether the pause was long enough for the ring to wrap around unnoticed.
     pub is_uncertain: bool,
 }
 
-/// Messages a second at the port's busiest of late.
+/// Recent peak rate of the port, in messages per second.
 #[derive(Debug, Default)]
 struct PeakRate {
     since: u64,
@@ -70,8 +70,8 @@ struct PeakRate {
 }
 
 impl Port {
-    /// Finds port number `number` in its file and what still stands in its ring, the oldest first.
-    /// `None` when this is no port, or none of this layout.
+    /// Finds port number `number` in its file and the messages in its ring, the oldest first.
+    /// `None` if the file is not a port, or not of this layout.
     pub fn attach<S: Source + ?Sized>(
         source: &S,
         number: u32,
@@ -109,7 +109,8 @@ impl Port {
         Some((port, filled.collect()))
     }
 
-    /// Appends the messages announced since the last poll. Returns `None` if the file is no longer a port.
+    /// Appends the messages announced since the last poll. Returns `None` if the file is no longer
+    /// a port.
     pub fn poll<S: Source + ?Sized>(
         &mut self,
         source: &S,
@@ -135,7 +136,7 @@ impl Port {
             ahead = capacity;
             self.unfilled_since = None;
         }
-        // Cells may change while they are read: only what reads the same twice counts.
+        // Cells may change during the read: only a cell that reads the same twice counts.
         let first = self.layout.index(self.position);
         let (mut cells, mut again) = (Vec::new(), Vec::new());
         self.cells(source, first, ahead, &mut cells)?;
@@ -175,7 +176,7 @@ impl Port {
         })
     }
 
-    /// Reads `count` cells from `first` on, round the ring's end.
+    /// Reads `count` cells starting at `first`, wrapping around the ring's end.
     fn cells<S: Source + ?Sized>(
         &mut self,
         source: &S,
@@ -231,14 +232,14 @@ impl Layout {
         (position + by) % (2 * self.capacity)
     }
 
-    /// Cells from one position to another, which is not before it.
+    /// Returns the number of cells from one position to a later or equal one.
     const fn distance(&self, from: u32, to: u32) -> u32 {
         (to + 2 * self.capacity - from) % (2 * self.capacity)
     }
 }
 
 impl PeakRate {
-    /// Whether two rounds, which look like none, may have passed at the rate of late.
+    /// Returns whether two rounds, which look like none, may have passed at the recent rate.
     fn may_lap(&self, elapsed: u64, capacity: u32) -> bool {
         let pushed = u128::from(self.peak) * u128::from(elapsed) / 1_000_000_000;
         pushed >= 2 * u128::from(capacity)
@@ -368,7 +369,7 @@ mod tests {
             let (_, seen) = poll(&mut port, &image, u64::from(step) * SECOND / 100);
             assert!(!seen.is_uncertain);
         }
-        // 100 a second: 16 take 160 ms.
+        // 100 per second: 16 take 160 ms.
         let now = 2 * SECOND;
         assert!(!poll(&mut port, &image, now + 150_000_000).1.is_uncertain);
         assert!(poll(&mut port, &image, now + 500_000_000).1.is_uncertain);

@@ -1,8 +1,9 @@
-//! A segment: the memory of one participant in which its messages lie.
+//! A segment: the memory of one participant that holds its messages.
 //!
-//! Reads BufferNode of Fast DDS 2.3 to 3.6. A buffer is used again as soon as its last listener is
-//! done, and we are none; so its validity, which is raised before it is freed, is read before and
-//! after everything else, and what lies between counts only when both are what the port announced.
+//! Reads BufferNode of Fast DDS 2.3 to 3.6. A participant reuses a buffer as soon as its last
+//! listener has released it, and this reader is not a listener. The buffer's validity id is raised
+//! before the buffer is freed. So the id is read before and after the content, which counts only if
+//! both match the port's announcement.
 
 use std::cell::RefCell;
 
@@ -14,12 +15,12 @@ use super::source::Source;
 /// Fields of BufferNode behind the status word.
 const SIZE: u64 = 8;
 const DATA: u64 = 12;
-/// Validity's bits of the status word.
+/// Bits of the status word that hold the validity id.
 const VALIDITY: u64 = 0xff_ffff;
-/// RTPS header, INFO_DST, INFO_TS and the head of a DATA or DATA_FRAG fit in here.
+/// Holds an RTPS header, INFO_DST, INFO_TS and the head of a DATA or DATA_FRAG.
 const WINDOW: usize = 256;
 
-/// A message in a segment, valid when it was found.
+/// A message in a segment, valid at the time it was found.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Buffer {
     node: u64,
@@ -29,21 +30,21 @@ pub struct Buffer {
     pub length: u32,
 }
 
-/// Why a message is not there.
+/// Why a message cannot be read.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Refusal {
-    /// Its buffer has been used again since.
+    /// Its buffer has been reused.
     Expired,
-    /// What stands there cannot be one of ours: it lies outside the file, or is longer than any
-    /// message that is read.
+    /// The descriptor is invalid: the message lies outside of the file, or is longer than the
+    /// limit.
     Malformed,
 }
 
 impl Buffer {
-    /// Where the message that `descriptor` announces lies.
+    /// Finds the message that `descriptor` announces.
     ///
     /// # Errors
-    /// It does not.
+    /// Fails if the buffer was reused or is invalid.
     pub fn find<S: Source + ?Sized>(source: &S, descriptor: &Descriptor) -> Result<Self, Refusal> {
         let node = u64::from(descriptor.node);
         let mut bytes = [0; 16];
@@ -61,7 +62,7 @@ impl Buffer {
         if u64::from(validity) & VALIDITY != u64::from(descriptor.validity) {
             return Err(Refusal::Expired);
         }
-        // The rest may be of the next use, if that began just now.
+        // The other fields may belong to the next use, if that just began.
         let refused = if buffer.is_valid(source) {
             Refusal::Malformed
         } else {
@@ -75,16 +76,16 @@ impl Buffer {
         Ok(buffer)
     }
 
-    /// Whether the buffer still is what it was announced as: then all that was read of it so far
-    /// is, too.
+    /// Returns whether the buffer is still in the announced use: then everything read so far is
+    /// valid.
     #[must_use]
     pub fn is_valid<S: Source + ?Sized>(&self, source: &S) -> bool {
         let status = source.long(self.node);
         status.is_some_and(|status| status & VALIDITY == u64::from(self.validity))
     }
 
-    /// Reads the whole message. Look at [`Self::is_valid`] afterwards. Allocates no more than the
-    /// file has bytes.
+    /// Reads the whole message; check [`Self::is_valid`] afterwards. Allocates at most the size of
+    /// the file.
     pub fn read<S: Source + ?Sized>(&self, source: &S, into: &mut Vec<u8>) -> bool {
         let last = u64::from(self.length).saturating_sub(1);
         if !source.read(self.data.saturating_add(last), &mut [0]) {
@@ -95,14 +96,14 @@ impl Buffer {
     }
 }
 
-/// A message that is read where the walk needs it. Look at [`Buffer::is_valid`] afterwards.
+/// A message that is read only where the walk needs it; check [`Buffer::is_valid`] afterwards.
 pub struct Message<'a, S: ?Sized> {
     source: &'a S,
     buffer: Buffer,
     window: RefCell<Window>,
 }
 
-/// The piece that was read last.
+/// The part that was read last.
 struct Window {
     start: u32,
     length: usize,
@@ -110,7 +111,7 @@ struct Window {
 }
 
 impl<'a, S: Source + ?Sized> Message<'a, S> {
-    /// Of this buffer.
+    /// Reads the message in this buffer.
     #[must_use]
     pub const fn new(source: &'a S, buffer: Buffer) -> Self {
         Self {
@@ -136,7 +137,7 @@ impl<S: Source + ?Sized> Bytes for Message<'_, S> {
                 .as_chunks::<4>();
             let mut read = [0; N];
             for (read, word) in read.iter_mut().zip(words) {
-                // In memory order, as the walk takes them.
+                // In memory order, as the walk expects.
                 *read = u32::from_ne_bytes(*word);
             }
             Some(read)
@@ -198,7 +199,7 @@ mod tests {
 
     #[test]
     fn one_that_is_used_again_while_it_is_looked_at_is_expired_and_not_malformed() {
-        /// Other bytes at each read after the first.
+        /// Returns other bytes at each read after the first.
         struct Changing(Vec<u8>, Vec<u8>, Counter<u32>);
         impl Source for Changing {
             fn read(&self, offset: u64, into: &mut [u8]) -> bool {

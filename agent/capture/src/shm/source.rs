@@ -1,12 +1,11 @@
-//! Where the readers of Fast DDS's layout read from: a file of shared memory, or bytes in a test.
+//! Byte source of the readers of Fast DDS's layout: a file of shared memory, or bytes in a test.
 //!
-//! The other side writes while we read, and is not to be trusted. So everything is read in bounded
-//! pieces with `pread`, and nothing is mapped: a file that is truncated under us gives a short read
-//! where a mapping would give SIGBUS, and no reference into memory that changes ever exists.
-//! Measured on one machine, a piece costs 0.4 us, waking up costs 20: mapping would save nothing
-//! that counts. Each `pread` takes and gives back the page it reads with fully ordered atomics, so
-//! what one returns was read after what the one before it returned; the checks that read a word
-//! before and after a copy rest on that.
+//! Untrusted processes write during reads. So everything is read in bounded pieces with `pread`,
+//! and nothing is mapped. A truncated file gives a short read where a mapping would give SIGBUS,
+//! and no reference into changing memory ever exists. A read costs 0.4 us, waking up costs 20 us
+//! (measured on one machine), so a mapping would save little. Each `pread` takes and releases the
+//! page with fully ordered atomics, so successive reads are ordered; the checks that read a word
+//! before and after a copy rely on that.
 
 use std::fs::File;
 use std::io;
@@ -15,17 +14,17 @@ use std::path::Path;
 
 /// Bytes at offsets.
 pub trait Source {
-    /// Fills `into` from `offset` on; `false` when not all of it is there.
+    /// Fills `into` from `offset`; returns `false` if some of the bytes do not exist.
     fn read(&self, offset: u64, into: &mut [u8]) -> bool;
 
-    /// A little-endian word.
+    /// Reads a little-endian 32-bit word.
     fn word(&self, offset: u64) -> Option<u32> {
         let mut bytes = [0; 4];
         self.read(offset, &mut bytes)
             .then(|| u32::from_le_bytes(bytes))
     }
 
-    /// Two of them as one.
+    /// Reads a little-endian 64-bit word as two 32-bit words.
     fn long(&self, offset: u64) -> Option<u64> {
         let mut bytes = [0; 8];
         self.read(offset, &mut bytes)
@@ -46,7 +45,7 @@ impl Source for [u8] {
     }
 }
 
-/// A file of shared memory, open for reading and for nothing else.
+/// A file of shared memory, opened for reading only.
 #[derive(Debug)]
 pub struct SharedFile {
     file: File,
@@ -55,10 +54,10 @@ pub struct SharedFile {
 }
 
 impl SharedFile {
-    /// Opens a regular file; follows no link, waits for nobody.
+    /// Opens a regular file; follows no link and does not block.
     ///
     /// # Errors
-    /// It is not there, is no regular file, or is not for us to read.
+    /// Fails if the file does not exist, is not a regular file, or is not readable.
     pub fn open(path: &Path) -> io::Result<Self> {
         let file = File::options()
             .read(true)
@@ -75,19 +74,19 @@ impl SharedFile {
         })
     }
 
-    /// Which file it is, whatever its name means by now.
+    /// Returns the identity of the open file, whichever file its name refers to now.
     #[must_use]
     pub const fn inode(&self) -> u64 {
         self.inode
     }
 
-    /// The user whose file it is.
+    /// Returns the user that owns the file.
     #[must_use]
     pub const fn user(&self) -> u32 {
         self.user
     }
 
-    /// Whether no name leads to it any more: whoever keeps it open keeps its memory.
+    /// Returns whether the file is unlinked: keeping it open keeps its memory allocated.
     #[must_use]
     pub fn is_unlinked(&self) -> bool {
         self.file
@@ -155,7 +154,7 @@ mod tests {
         let pipe = directory.path().join("p");
         let made = std::process::Command::new("mkfifo").arg(&pipe).status();
         assert!(made.unwrap().success());
-        // A blocking open of a pipe that nobody writes to never returns.
+        // A blocking open of a pipe without a writer never returns.
         assert!(SharedFile::open(&pipe).is_err());
     }
 

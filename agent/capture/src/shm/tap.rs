@@ -1,8 +1,8 @@
-//! Looks at all ports, reads what they announce and hands on what is of interest.
+//! Polls all ports, reads the announced messages and passes on those of interest.
 //!
-//! Never writes, locks or registers: the peers cannot tell that it is there. A message that several
-//! ports announce is read once. Ports that are silent are looked at less often, so that a hundred
-//! idle ones cost little. Sleeping between looks is the caller's.
+//! Never writes, locks or registers: participants cannot detect it. A message that several ports
+//! announce is read once. Silent ports are polled less often, so that a hundred idle ones cost
+//! little. The caller sleeps between polls.
 
 mod recent_messages;
 
@@ -23,42 +23,42 @@ use super::source::SharedFile;
 use crate::system::thread_cpu;
 use recent_messages::{Identity, RecentMessages};
 
-/// Ports and segments that are open at once.
+/// Most ports and segments open at once.
 const MAX_PORTS: usize = 512;
 const MAX_SEGMENTS: usize = 512;
-/// Messages read in one look; the rest of a flood is read in the next.
+/// Most messages read per poll; the rest of a flood is read in the next.
 const PER_LOOK: usize = 2048;
 const PER_LOOK_IN_A_HURRY: usize = 64;
-/// A port that was silent for so long is looked at this often only.
+/// Silence after which a port is polled less often, and that interval.
 const SILENT_AFTER: u64 = 2_000_000_000;
 const SILENT_EVERY: u64 = 10_000_000;
-/// How long a segment that could not be opened is not tried again.
+/// Pause before another attempt to open a segment.
 const RETRY: u64 = 50_000_000;
-/// How often directories are looked at, and processes gone through.
+/// Interval of listing directories and visiting processes.
 const LIST_EVERY: u64 = 100_000_000;
-/// How often a port that is not laid out yet is looked at.
+/// Interval of polling a port that is not initialized yet.
 const TRY_EVERY: u64 = 1_000_000;
 const FIND_EVERY: u64 = 1_000_000_000;
 const FIND_IN_A_HURRY: u64 = 10_000_000_000;
 
-/// What is open and how far it was read.
+/// The open files and the read positions.
 pub struct Tap {
     directories: ShmDirectories,
-    /// By number.
+    /// Ports, by number.
     ports: Vec<Open>,
-    /// Ports that were listed and are not laid out yet.
+    /// Ports that are listed but not initialized yet.
     unborn: Vec<(PortKey, PathBuf)>,
-    /// Ports whose process is dead, by their inodes: they are looked at again at the next search.
+    /// Ports of dead processes, with their inodes: they are tried again at the next scan.
     abandoned: HashSet<(PortKey, u64)>,
     segments: HashMap<SegmentKey, Segment>,
     remembered: RecentMessages,
-    /// The rules, and what is wanted.
+    /// The rules and the interest map.
     pub classifier: MessageClassifier,
-    /// Whether it has to be back soon: what takes long is put off.
+    /// Whether the next poll is urgent: slow work is postponed.
     pub is_hurried: bool,
-    /// Whether every message is wanted: silent ports are looked at as often as others.
+    /// Whether every message is needed: silent ports are polled as often as others.
     pub misses_nothing: bool,
-    /// The calendar, in nanoseconds since the Unix epoch.
+    /// The wall clock, in nanoseconds since the Unix epoch.
     calendar: Box<dyn FnMut() -> u64>,
     counters: Counters,
     opened: u64,
@@ -71,11 +71,11 @@ pub struct Tap {
     latest: HashMap<(SegmentId, u32), usize>,
     records: Vec<Record>,
     allowance: CpuAllowance,
-    /// The port that is looked at first.
+    /// Index of the port that is polled first.
     turn: usize,
 }
 
-/// What the tap met.
+/// Counters of the tap.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counters {
     /// Ports open now.
@@ -84,27 +84,27 @@ pub struct Counters {
     pub segments: u64,
     /// Directories of shared memory.
     pub directories: u64,
-    /// Messages announced at ports, each port's for itself.
+    /// Messages announced at ports, counted per port.
     pub announced: u64,
-    /// Messages read, each once.
+    /// Messages read, each counted once.
     pub read: u64,
-    /// Of those, captured whole.
+    /// Messages among them that were captured whole.
     pub captured: u64,
-    /// Bytes of those.
+    /// Bytes of the captured messages.
     pub captured_bytes: u64,
-    /// Announced, but overwritten in the ring or used again before they were read.
+    /// Announced, but overwritten in the ring or reused before they were read.
     pub missed: u64,
-    /// Announced and never filled in: their writer died.
+    /// Announced but never filled in: their writer died.
     pub unfilled: u64,
     /// In segments that could not be opened.
     pub unreachable: u64,
-    /// Contradictory or no RTPS.
+    /// Malformed or not RTPS.
     pub malformed: u64,
-    /// Read, and left out: they stood there when their process was dead already.
+    /// Read but discarded: their process was already dead.
     pub abandoned: u64,
-    /// Looks that came so late that a ring may have gone round unnoticed.
+    /// Polls so late that a ring may have wrapped around unnoticed.
     pub uncertain: u64,
-    /// Files and directories left out because of a cap.
+    /// Files and directories skipped because of a cap.
     pub left_out: u64,
 }
 
@@ -115,30 +115,30 @@ struct Open {
     key: PortKey,
     file: SharedFile,
     port: Port,
-    /// When it last announced anything, and when it is looked at next.
+    /// Time of its last announcement, and of its next poll.
     busy: u64,
     due: u64,
 }
 
 enum Segment {
-    /// With a number of its own: another file may have its name and inode later.
+    /// An open file with a unique number: another file may get the same name and inode later.
     Open(SharedFile, u64),
-    /// Not to be opened, as of then.
+    /// Could not be opened at this time.
     Missing(u64),
 }
 
-/// When a message was read: its times and whether those tell when it was sent.
+/// Times of reading a message, and whether they show when it was sent.
 #[derive(Clone, Copy)]
 struct Reading {
     monotonic: u64,
-    /// After the message was announced, so never before it was sent.
+    /// Wall clock after the announcement was read, so never before the message was sent.
     calendar: u64,
-    /// It was announced since the last look.
+    /// Whether it was announced since the previous poll.
     is_timely: bool,
 }
 
 impl Tap {
-    /// Nothing open. `calendar` gives nanoseconds since the Unix epoch.
+    /// Creates a tap without open files. `calendar` returns nanoseconds since the Unix epoch.
     #[must_use]
     pub fn new(directories: ShmDirectories, calendar: impl FnMut() -> u64 + 'static) -> Self {
         Self {
@@ -167,17 +167,18 @@ impl Tap {
         }
     }
 
-    /// Whether directories are listed at `now`, or listing has used up its share of the CPU.
+    /// Returns whether directories are listed at `now`; `false` if listing has used up its CPU
+    /// share.
     pub fn may_list(&mut self, now: u64) -> bool {
         self.allowance.is_left(now)
     }
 
-    /// So many nanoseconds of CPU time went into noticing files.
+    /// Charges CPU time spent on noticing files, in nanoseconds.
     pub const fn spend(&mut self, nanoseconds: u64) {
         self.allowance.spend(nanoseconds);
     }
 
-    /// Lists directories with the next look, and looks at every port however silent it was.
+    /// Lists directories and polls every port at the next poll, even silent ones.
     pub fn expect_participant(&mut self) {
         self.listed = 0;
         for open in &mut self.ports {
@@ -185,7 +186,7 @@ impl Tap {
         }
     }
 
-    /// Lets go of everything that is open. What is there then is found with the next look.
+    /// Closes every file. The next poll opens the existing ones again.
     pub fn close_all(&mut self) {
         self.ports.clear();
         self.abandoned.clear();
@@ -193,13 +194,13 @@ impl Tap {
         (self.listed, self.found) = (0, 0);
     }
 
-    /// Whether participants met since the last time that was asked: a port appeared, or an
-    /// endpoint was announced.
+    /// Returns whether participants discovered each other since the last call: a port appeared, or
+    /// an endpoint was announced.
     pub fn take_discovery_seen(&mut self) -> bool {
         std::mem::take(&mut self.met)
     }
 
-    /// The directories that are looked at.
+    /// Iterates over the observed directories.
     pub fn directories(&self) -> impl Iterator<Item = &Path> {
         self.directories
             .directories
@@ -207,19 +208,19 @@ impl Tap {
             .map(|directory| directory.path.as_path())
     }
 
-    /// How many.
+    /// Returns the number of observed directories.
     #[must_use]
     pub fn directory_count(&self) -> usize {
         self.directories.directories.len()
     }
 
-    /// Whether there is any port.
+    /// Returns whether any port exists.
     #[must_use]
     pub fn has_ports(&self) -> bool {
         !self.ports.is_empty()
     }
 
-    /// What it met so far.
+    /// Returns the counters.
     #[must_use]
     pub fn counters(&self) -> Counters {
         let open = |segment: &&Segment| matches!(segment, Segment::Open(..));
@@ -232,8 +233,8 @@ impl Tap {
         }
     }
 
-    /// Looks everywhere once, at `now` nanoseconds of the monotonic clock; appends what is of
-    /// interest. How many messages were announced.
+    /// Polls everything once, at `now` nanoseconds of the monotonic clock; appends items of
+    /// interest. Returns the number of announced messages.
     pub fn poll(&mut self, now: u64, found: &mut Vec<Item>) -> usize {
         self.now = now;
         self.classifier.refill(now);
@@ -262,7 +263,7 @@ impl Tap {
             if self.ports.get(index).is_some_and(|open| open.due <= now) {
                 announced += self.poll_port(index, now, found);
                 if announced >= most {
-                    // A flood at one port must not keep the others from being read.
+                    // A flood at one port must not starve the others.
                     self.turn = index + 1;
                     break;
                 }
@@ -301,12 +302,12 @@ impl Tap {
                 }
             }
             None => {
-                // Truncated or overwritten; if it is a port again, the next listing finds it.
+                // Truncated or overwritten; if it becomes a port again, the next listing finds it.
                 self.counters.malformed += 1;
                 self.ports.remove(index);
             }
         }
-        // A buffer that was announced again has lost what it held: only the last use can be read.
+        // A reused buffer has lost its previous content: only the last use can be read.
         let mut latest = std::mem::take(&mut self.latest);
         let directories = announced.iter().enumerate();
         latest.extend(directories.map(|(index, it)| ((it.segment, it.node), index)));
@@ -327,7 +328,8 @@ impl Tap {
         number
     }
 
-    /// Reads one message. What stood in a ring before we came tells nothing of its time.
+    /// Reads one message. For messages that were in a ring before it was opened, the time of
+    /// sending is unknown.
     fn read(
         &mut self,
         (directory, generation, port): PortKey,
@@ -385,7 +387,7 @@ impl Tap {
         self.counters.read += 1;
         if judgement == MessageVerdict::Captured {
             self.counters.captured += 1;
-            // Samples that are read are no news of participants.
+            // Samples that are read do not indicate a new participant.
             let is_news = !(self.misses_nothing && self.classifier.is_wanted);
             self.met |= self.classifier.announces && is_news;
             self.counters.captured_bytes += bytes.len() as u64;
@@ -427,7 +429,7 @@ impl Tap {
         self.segments.insert(key, segment);
     }
 
-    /// Opens what is new and lets go of what is gone or is another file by now.
+    /// Opens new files and closes those that are gone or were replaced.
     fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
         let every = if self.is_hurried {
             FIND_IN_A_HURRY
@@ -476,8 +478,8 @@ impl Tap {
         self.attach(now, found);
     }
 
-    /// Opens ports that have come to be. What stands in them already counts while the process that
-    /// sent it lives: files of a killed one stay until another takes their names.
+    /// Opens ports that were initialized. Their existing messages count only if the sending process
+    /// lives: files of a killed process stay until another one reuses their names.
     fn attach(&mut self, now: u64, found: &mut Vec<Item>) {
         self.tried = now;
         let mut attached = Vec::new();
@@ -491,7 +493,7 @@ impl Tap {
             }
             let (_, _, number) = key;
             let Some((port, backlog)) = Port::attach(&file, number, now) else {
-                // Not laid out yet, or not as known.
+                // Not initialized yet, or of an unknown layout.
                 self.unborn.push((key, path));
                 continue;
             };
@@ -507,7 +509,7 @@ impl Tap {
                 calendar: (self.calendar)(),
                 is_timely: false,
             };
-            // Read before anything else: names are overwritten within 50 us.
+            // Read first: names are overwritten within 50 us.
             let read = backlog.iter().map(|descriptor| {
                 let mut items = Vec::new();
                 self.read(key, descriptor, reading, &mut items);
@@ -539,8 +541,8 @@ impl Tap {
         }
     }
 
-    /// Closes a port for one of this user, if another user has more than this one would have: of
-    /// that user's the one that has been idle longest. So nobody's ports keep out another's.
+    /// Closes a port in favour of this user if another user has more ports than this one would
+    /// have: the one that has been idle longest. So no user can exclude another.
     fn make_room(&mut self, user: u32) -> bool {
         let mut open: HashMap<u32, usize> = HashMap::new();
         for port in &self.ports {
@@ -562,7 +564,7 @@ impl Tap {
         true
     }
 
-    /// Whether the process that made this segment is dead.
+    /// Returns whether the process that created this segment is dead.
     fn is_abandoned(&self, locks: &Locks, (directory, generation, id): SegmentKey) -> bool {
         let directory = self.directories.directories.get(&directory);
         let name = Name::Segment(generation, id).file_name();

@@ -1,8 +1,9 @@
-//! Where in a Fast DDS library a message is copied into shared memory: its symbol table says it.
+//! Finds the function of a Fast DDS library that copies a message into shared memory, in its symbol
+//! table.
 //!
-//! The file is somebody else's, perhaps a container's: every read is bounded, nothing is mapped, and
-//! nothing is allocated that the file does not hold. Reads ELF64 of this machine (System V ABI, gABI
-//! chapters 4 and 5), of which only symbols, strings and loadable segments.
+//! The file is untrusted, perhaps a container's: every read is bounded, nothing is mapped, and no
+//! more is allocated than the file holds. Reads ELF64 of this machine (System V ABI, gABI chapters
+//! 4 and 5): symbols, strings and loadable segments only.
 
 use std::fs::File;
 use std::io;
@@ -12,8 +13,9 @@ use ros2probe_wire::{Cursor, Endianness, WireError};
 
 use crate::filter::Form;
 
-/// `SharedMemTransport::copy_to_shared_buffer`, called once for each message that goes into shared
-/// memory; `send` above it is called for all others, too. What follows tells the parameters.
+/// `SharedMemTransport::copy_to_shared_buffer`, called once per message that goes into shared
+/// memory; `send` above it is called for all other messages, too. The parameters follow in the
+/// mangled name.
 const FUNCTION: &str = "_ZN8eprosima7fastdds4rtps18SharedMemTransport21copy_to_shared_bufferE";
 /// `(unsigned char const*, unsigned int, ..)`: Fast DDS 2.x.
 const WHOLE: &str = "PKhj";
@@ -34,53 +36,53 @@ const SYMBOLS: u32 = 2;
 const DYNAMIC_SYMBOLS: u32 = 11;
 const LOADED: u32 = 1;
 const IS_FUNCTION: u8 = 2;
-/// Sections and segments of a header table.
+/// Most sections and segments of a header table.
 const MAX_ENTRIES: u16 = 1024;
-/// Fast DDS has some ten thousand symbols with one or two megabytes of names; with all debugging
-/// symbols, ten times that.
+/// Longest table. Fast DDS has some ten thousand symbols with one or two megabytes of names; with
+/// all debugging symbols, ten times that.
 const MAX_TABLE: u64 = 16 << 20;
 const MAX_NAMES: u64 = 32 << 20;
-/// x86-64: `endbr64`, where functions begin that may be jumped to. A breakpoint there is stepped over
-/// slowly; the next instruction, a `push`, is done by the kernel itself.
+/// x86-64: `endbr64`, the landing pad of indirect calls. The kernel single-steps a breakpoint on
+/// it, which is slow, but emulates the `push` that follows.
 const LANDING: [u8; 4] = [0xf3, 0x0f, 0x1e, 0xfa];
 
-/// Where to look at messages.
+/// The probe's position in a library.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Entry {
     /// Offset of the instruction in the file.
     pub offset: u64,
-    /// How the function gets its message.
+    /// How the function receives its message.
     pub form: Form,
 }
 
-/// Why a library cannot be looked into.
+/// Why a library cannot be probed.
 #[derive(Debug, thiserror::Error)]
 pub enum LibraryError {
     /// The file cannot be read.
     #[error("it cannot be read")]
     Read(#[from] io::Error),
-    /// A length or an offset that the file does not hold.
+    /// A length or offset exceeds the file.
     #[error("not a library: {0}")]
     Malformed(WireError),
-    /// Not ELF, or larger than a library is.
+    /// Not ELF, or too large for a library.
     #[error("not a library for this machine")]
     Foreign,
-    /// It has been built without, or the function is called otherwise.
+    /// The library was built without symbols, or the function has another name.
     #[error(
-        "it has no symbol SharedMemTransport::copy_to_shared_buffer of Fast DDS 2.x or 3.x, or has \
-         been stripped of it"
+        "it has no symbol SharedMemTransport::copy_to_shared_buffer of Fast DDS 2.x or 3.x: use an \
+         unstripped library"
     )]
     NoSymbol,
 }
 
-/// From a parser that reads bytes at hand.
+/// Converts the error of a parser over bytes in memory.
 impl From<WireError> for LibraryError {
     fn from(error: WireError) -> Self {
         Self::Malformed(error)
     }
 }
 
-/// A table of the file: where it is and how large.
+/// Offset and size of a table in the file.
 #[derive(Clone, Copy)]
 struct Section {
     kind: u32,
@@ -97,10 +99,10 @@ struct Segment {
     size: u64,
 }
 
-/// Looks for the function.
+/// Finds the function.
 ///
 /// # Errors
-/// The file is not what it should be, or does not name it.
+/// Fails if the file is malformed, or does not name the function.
 pub fn find(file: &File) -> Result<Entry, LibraryError> {
     let bytes: [u8; HEADER] = array(file, 0)?;
     let header = Header::read(&bytes)?;
@@ -110,7 +112,7 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
         .iter()
         .map(|bytes| section(bytes))
         .collect::<Result<Vec<_>, _>>()?;
-    // A stripped library has the first kind only, and that is enough.
+    // A stripped library has only the first kind, which is sufficient.
     for kind in SYMBOL_TABLES {
         let tables = sections.iter().filter(|section| section.kind == kind);
         for symbols in tables {
@@ -127,7 +129,7 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
     Err(LibraryError::NoSymbol)
 }
 
-/// What the file header says of its tables.
+/// Positions of the tables, from the file header.
 struct Header {
     segments: u64,
     segment_count: u16,
@@ -166,7 +168,7 @@ impl Header {
     }
 }
 
-/// The function's address among these symbols, and how it gets its message.
+/// Returns the function's address in these symbols, and how it receives its message.
 fn search(
     file: &File,
     symbols: &Section,
@@ -202,7 +204,7 @@ fn search(
     Ok(None)
 }
 
-/// Where in the file lies what is loaded at this address, behind a landing pad.
+/// Returns the file offset of the code loaded at this address, behind a landing pad.
 fn directory(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
     let segments = table(file, header.segments, header.segment_count, SEGMENT)?;
     let (segments, _) = segments.as_chunks::<SEGMENT>();
@@ -258,7 +260,8 @@ fn table(file: &File, offset: u64, count: u16, size: usize) -> Result<Vec<u8>, L
     part(file, offset, u64::from(count) * size as u64)
 }
 
-/// Part of the file; the caller has bounded `size`. One that the file does not hold is not allocated.
+/// Reads a part of the file; the caller has bounded `size`. Allocates nothing if the file is
+/// shorter.
 fn part(file: &File, offset: u64, size: u64) -> Result<Vec<u8>, LibraryError> {
     let end = offset.checked_add(size);
     if end.is_none_or(|end| end > file.metadata().map_or(0, |metadata| metadata.len())) {
@@ -284,11 +287,11 @@ pub(super) mod tests {
 
     use super::*;
 
-    /// What follows the function's name in a 2.x and in a 3.x library.
+    /// The rest of the mangled name in a 2.x and in a 3.x library.
     const OF_2: &str = "PKhjRKNSt6chrono10time_pointE";
     const OF_3: &str = "RKSt6vectorINS1_13NetworkBufferESaIS4_EEjRKNSt6chronoE";
 
-    /// A library with one segment, loaded at 0x1000, of which the first 0x200 bytes are tables.
+    /// A library with one segment, loaded at 0x1000, whose first 0x200 bytes are tables.
     fn image(name: &str, code: &[u8]) -> Vec<u8> {
         let mut names = vec![0];
         names.extend(name.as_bytes());

@@ -1,9 +1,9 @@
-//! Every message into Fast DDS's shared memory, seen in the process that sends it.
+//! Every message into Fast DDS's shared memory, read in the process that sends it.
 //!
-//! On request only: it puts a breakpoint into code that other processes run. They notice nothing but
-//! a microsecond for each message. In return nothing is sampled: the kernel program sees a message
-//! before it is copied, so names, samples and losses are as exact as at a socket. It sees what is
-//! handed over; what a full port or a full segment refuses afterwards it does not tell.
+//! Opt-in, because it puts a breakpoint into code of other processes, which costs them a
+//! microsecond per message. In return nothing is sampled: the kernel program reads a message before
+//! it is copied, so names, samples and losses are as exact as at a socket. It sees messages passed
+//! to the transport, even those that a full port or segment then refuses.
 
 pub mod library;
 pub mod processes;
@@ -25,54 +25,55 @@ use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use rustix::thread::{CapabilitySet, capabilities};
 
-/// A process hands over a hundred thousand messages a second if it can, ten times what a socket
-/// takes: its ring is larger by this.
+/// Factor by which the record ring is larger: a process can write a hundred thousand messages per
+/// second, ten times the rate of a socket.
 const RECORD_RINGS: usize = 4;
 
-/// Why messages are not seen in the processes that send them.
+/// Why messages cannot be read in the processes that send them.
 #[derive(Debug, thiserror::Error)]
 pub enum UprobeError {
-    /// Breakpoints in other processes, and looking which processes there are.
-    #[error("it needs {0}")]
+    /// A capability for breakpoints in other processes, or for listing processes, is missing.
+    #[error("uprobes need {0}")]
     Missing(String),
-    /// The control group.
+    /// The control group cannot be inspected.
     #[error("the cgroup {} cannot be inspected", path.display())]
     Cgroup {
-        /// Its directory.
+        /// Path of its directory.
         path: PathBuf,
-        /// Why.
+        /// Cause of the failure.
         #[source]
         source: io::Error,
     },
-    /// The kernel does not tell a program which control group a process is in.
-    #[error("for one control group (capture.cgroup) it takes Linux 5.16")]
+    /// The kernel does not expose a process's control group to programs.
+    #[error("uprobes limited to one control group (capture.cgroup) need Linux 5.16")]
     Scope(#[source] FilterError),
-    /// The kernel programs.
+    /// The kernel programs cannot be loaded.
     #[error(transparent)]
     Filter(#[from] FilterError),
 }
 
-/// Capabilities that uprobes in other processes need. `CAP_PERFMON` alone sufficed from Linux 5.8 on,
-/// and later kernels refuse it. Reading which files the processes of other users map needs both.
+/// Capabilities required by uprobes in other processes. `CAP_PERFMON` alone sufficed from Linux 5.8
+/// on, but later kernels refuse it. Reading the mapped files of other users' processes needs both.
 const REQUIRED: [(CapabilitySet, &str); 2] = [
     (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
     (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE"),
 ];
 
-/// Capabilities that attaching uprobes needs.
+/// Returns the capabilities required for attaching uprobes.
 #[must_use]
 pub fn required() -> CapabilitySet {
     REQUIRED.iter().map(|(one, _)| *one).collect()
 }
 
-/// Names of the capabilities that attaching uprobes needs and `effective` lacks.
+/// Returns the names of required capabilities that `effective` lacks.
 #[must_use]
 pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
     let lacking = REQUIRED.iter().filter(|(one, _)| !effective.contains(*one));
     lacking.map(|(_, name)| *name).collect()
 }
 
-/// What the calling thread lacks; nothing when its capabilities cannot be read.
+/// Returns the missing capabilities of the calling thread; empty if its capabilities cannot be
+/// read.
 fn missing() -> Vec<&'static str> {
     capabilities(None).map_or_else(|_| Vec::new(), |sets| lacking(sets.effective))
 }
@@ -89,7 +90,7 @@ impl Uprobe {
     /// [`Self::want`]. `cgroup`: only for processes of this control group.
     ///
     /// # Errors
-    /// A capability is missing, or the kernel has no uprobes.
+    /// Fails if a capability is missing, or if the kernel has no uprobes.
     pub fn open(
         cgroup: Option<&Path>,
         ring_bytes: usize,
@@ -122,28 +123,28 @@ impl Uprobe {
         })
     }
 
-    /// Looks for more libraries to attach them to from now on, in a thread that keeps the privileges
-    /// for that.
+    /// Starts a thread with the required privileges that finds further libraries and attaches to
+    /// them.
     ///
     /// # Errors
-    /// There can be no more threads.
+    /// Fails if the thread cannot be started.
     pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
         self.search.start(spawn)
     }
 
-    /// Readable when a ring is half full.
+    /// Returns descriptors that are readable when a ring is half full.
     pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
         self.reader.descriptors()
     }
 
-    /// Whether every sample is wanted of a writer that may send into shared memory. Matters where
-    /// the programs are attached on demand alone.
+    /// Sets whether every sample of a writer that may use shared memory is needed. Matters only if
+    /// programs are attached on demand.
     pub fn want(&self, wanted: bool) {
         self.search.want(wanted);
     }
 
-    /// Gives the model what was found, and once the programs are no longer attached, that nothing
-    /// more is found.
+    /// Passes the messages found to the model and, after the programs are detached, that no more
+    /// will be found.
     pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) {
         let is_attached = self.search.is_attached();
         self.reader.poll(clocks, observer);
@@ -154,42 +155,42 @@ impl Uprobe {
         self.was_attached = is_attached;
     }
 
-    /// Gives the model what still waits, at the end.
+    /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.reader.drain(clocks, observer);
     }
 
-    /// The kernel programs' maps.
+    /// Returns the kernel programs' maps.
     #[must_use]
     pub const fn filter(&self) -> &Filter {
         self.reader.filter()
     }
 
-    /// The kernel programs' maps, to tell them what is of interest.
+    /// Returns the kernel programs' maps, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         self.reader.filter_mut()
     }
 
-    /// What was taken in so far.
+    /// Returns the reader, for its counters.
     #[must_use]
     pub const fn reader(&self) -> &FilterReader {
         &self.reader
     }
 
-    /// What is attached, and what is not covered.
+    /// Returns the attached libraries, and which processes are not covered.
     #[must_use]
     pub fn facts(&self) -> Facts {
         self.search.facts()
     }
 
-    /// Whether every process that uses Fast DDS's shared memory is seen this way.
+    /// Returns whether every process that uses Fast DDS's shared memory is covered.
     #[must_use]
     pub fn covers_all(&self) -> bool {
         self.search.covers_all()
     }
 }
 
-/// A control group's number: the inode of its directory.
+/// Returns a control group's id: the inode of its directory.
 fn inode(path: &Path) -> Result<u64, UprobeError> {
     let metadata = File::open(path).and_then(|directory| directory.metadata());
     let metadata = metadata.map_err(|source| UprobeError::Cgroup {

@@ -1,7 +1,7 @@
-//! Which processes use Fast DDS, and which file their library is.
+//! Finds the processes that use Fast DDS, and the files of their libraries.
 //!
-//! Reads `/proc/<pid>/maps` of processes that are new, of young ones for a while, and of the others
-//! now and then: a library may be loaded late. Looks into no memory.
+//! Reads `/proc/<pid>/maps` of new processes, of young ones for a while, and of the others
+//! occasionally: a library may be loaded late. Reads no process memory.
 
 use std::collections::{HashMap, HashSet};
 use std::fs::{self, File};
@@ -12,49 +12,50 @@ use crate::shm::directories::Scope;
 
 /// Names of the library: Fast DDS 2.x, 3.x. A version may follow.
 const LIBRARIES: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
-/// Files of its shared memory, that whoever sends or receives there maps, however it was linked.
+/// Files of its shared memory, which every sender and receiver maps, even if it is linked
+/// statically.
 const SHARED: [&str; 2] = ["/dev/shm/fastrtps_", "/dev/shm/fastdds_"];
-/// Of a replaced or removed file.
+/// Suffix of a replaced or removed file.
 const DELETED: &str = " (deleted)";
-/// Who holds locks.
+/// File that lists the holders of locks.
 const LOCKS: &str = "/proc/locks";
-/// Text of one process's map that is read: some forty thousand mappings.
+/// Most bytes read of one process's map: some forty thousand mappings.
 const MAX_TEXT: u64 = 4 << 20;
-/// A process that was met no more often than this may still be loading libraries; an older one is
-/// asked again at every so many rounds.
+/// Number of rounds in which a new process may still be loading libraries; afterwards it is
+/// inspected only once per so many rounds.
 const YOUNG: u32 = 10;
 const ROUNDS: u32 = 32;
 
-/// A library's file, by the device and inode that processes map.
+/// Device and inode of a library's file, as in the processes' maps.
 #[derive(Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct LibraryId {
     /// `major:minor`, as the kernel writes it.
     pub device: String,
-    /// Inode.
+    /// Inode of the file.
     pub inode: u64,
 }
 
 /// A library in a process.
 #[derive(Clone, PartialEq, Eq, Debug)]
 pub struct Mapped {
-    /// The file.
+    /// Identity of the file.
     pub id: LibraryId,
-    /// Its name in the process's own file system.
+    /// Its path in the process's own file system.
     pub path: PathBuf,
-    /// Its first range of addresses, as the kernel writes it.
+    /// Its first address range, as the kernel writes it.
     pub range: String,
 }
 
-/// What a process maps of Fast DDS.
+/// Files of Fast DDS that a process maps.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
 pub struct Use {
-    /// Its libraries.
+    /// Libraries of Fast DDS.
     pub libraries: Vec<Mapped>,
-    /// It has files of Fast DDS's shared memory open.
+    /// Whether it maps files of Fast DDS's shared memory.
     pub shares: bool,
 }
 
-/// All processes that are looked at.
+/// All inspected processes.
 #[derive(Debug)]
 pub struct Processes {
     scope: Scope,
@@ -65,12 +66,12 @@ pub struct Processes {
 struct Process {
     met: u32,
     use_of_it: Use,
-    /// Its map may not be read.
+    /// Its map cannot be read for lack of permission.
     is_closed: bool,
 }
 
 impl Use {
-    /// From the text of a map.
+    /// Parses the text of a map.
     #[must_use]
     pub fn parse(text: &str) -> Self {
         let mut found = Self::default();
@@ -106,7 +107,7 @@ impl Use {
         Ok(Self::parse(&String::from_utf8_lossy(&bytes)))
     }
 
-    /// Whether it has to do with Fast DDS at all.
+    /// Returns whether the process uses Fast DDS at all.
     #[must_use]
     pub const fn is_any(&self) -> bool {
         self.shares || !self.libraries.is_empty()
@@ -114,7 +115,7 @@ impl Use {
 }
 
 impl Processes {
-    /// None found yet.
+    /// Creates an empty set.
     #[must_use]
     pub fn new(scope: Scope) -> Self {
         Self {
@@ -123,7 +124,7 @@ impl Processes {
         }
     }
 
-    /// One process, found already.
+    /// Creates a set with one process.
     #[cfg(test)]
     pub(super) fn of(process: u32, use_of_it: Use) -> Self {
         let known = Process {
@@ -137,7 +138,7 @@ impl Processes {
         }
     }
 
-    /// Looks which there are. `all`: also at those that had nothing to do with Fast DDS lately.
+    /// Visits processes. `all`: includes those that recently did not use Fast DDS.
     pub fn find(&mut self, all: bool) {
         let mut before = std::mem::take(&mut self.known);
         for pid in self.scope.processes() {
@@ -169,7 +170,7 @@ impl Processes {
         }
     }
 
-    /// Those that use Fast DDS.
+    /// Iterates over the processes that use Fast DDS.
     pub fn using(&self) -> impl Iterator<Item = (u32, &Use)> {
         self.known
             .iter()
@@ -177,7 +178,8 @@ impl Processes {
             .map(|(pid, process)| (*pid, &process.use_of_it))
     }
 
-    /// One that may not be looked at and may use Fast DDS: whoever does holds locks.
+    /// Returns a process that cannot be inspected and may use Fast DDS, because it holds one of its
+    /// locks.
     #[must_use]
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);
@@ -192,7 +194,7 @@ impl Processes {
     }
 }
 
-/// Whether a file by this name is Fast DDS's library.
+/// Returns whether a file of this name is Fast DDS's library.
 #[must_use]
 pub fn is_library(name: &str) -> bool {
     let version = LIBRARIES
@@ -201,11 +203,11 @@ pub fn is_library(name: &str) -> bool {
     version.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// Who holds the lock that a line of [`LOCKS`] is about, if it is one of the kind that Fast DDS takes
+/// Returns the holder of the lock in a line of [`LOCKS`], if it is of the kind that Fast DDS takes
 /// for its ports and segments.
 fn holder(line: &str) -> Option<u32> {
     let mut fields = line.split_ascii_whitespace().skip(1);
-    // Of a lock that is waited for, an arrow comes first.
+    // An arrow precedes a lock that a process waits for.
     let kind = fields.find(|field| *field != "->")?;
     (kind == "FLOCK").then(|| fields.nth(2)?.parse().ok())?
 }

@@ -1,8 +1,8 @@
-//! The thread that follows which libraries are in use, and attaches to them.
+//! The thread that finds the libraries in use and attaches to them.
 //!
-//! Attached once to a file, a probe is in every process that maps it, also in those that come later.
-//! A library that nobody uses any more is let go after a while: a robot that is started again is
-//! seen from its first message on. It reads `/proc` and library files, and writes nothing.
+//! Attached once to a file, a probe is in every process that maps it, including later ones. A
+//! library that no process uses is detached only after a while, so that a restarted robot is seen
+//! from its first message. The thread reads `/proc` and library files, and writes nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, OpenOptions};
@@ -22,23 +22,23 @@ use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::DirectoryWatch;
 use crate::threads::{Spawn, Task};
 
-/// How often processes are gone through when nothing happens.
+/// Interval of visiting processes if nothing happens.
 const EVERY: Duration = Duration::from_secs(1);
-/// A participant that starts creates several files at once.
+/// How long to collect events: a starting participant creates several files at once.
 const GATHER: Duration = Duration::from_millis(20);
-/// How long a library that nobody uses stays attached.
+/// How long an unused library stays attached.
 const LINGER: Duration = Duration::from_secs(60);
-/// How long one that could not be attached to is not tried again.
+/// Pause before another attempt to attach to a library.
 const RETRY: Duration = Duration::from_secs(5);
-/// Between the first look at shared memory and the last message that is seen in its process.
+/// Time between resuming the polls of shared memory and detaching the probes.
 const OVERLAP: Duration = Duration::from_millis(400);
 /// Why nothing is attached on demand.
 const RESTING: &str =
     "capture.shm.exact is auto, and no samples are read of a topic that goes through shared memory";
-/// Libraries with a probe of their own: images of containers on one host.
+/// Most libraries with a probe: images of containers on one host.
 const MAX_LIBRARIES: usize = 64;
 
-/// Where libraries are installed, and where ROS's distributions are.
+/// Directories of installed libraries and of ROS distributions.
 const INSTALLED: [&str; 5] = [
     "/usr/lib/x86_64-linux-gnu",
     "/usr/lib/aarch64-linux-gnu",
@@ -48,48 +48,49 @@ const INSTALLED: [&str; 5] = [
 ];
 const DISTRIBUTIONS: &str = "/opt/ros";
 
-/// The thread, from the outside.
+/// Handle of the thread.
 pub struct LibrarySearch {
     shared: Arc<Shared>,
-    /// What the thread is given when it begins.
+    /// State passed to the thread when it starts.
     waiting: Option<(Attachments, Scope)>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// What is attached, and what is not covered.
+/// The attached libraries, and which processes are not covered.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Facts {
     /// Libraries in use.
     pub libraries: Vec<LibraryFacts>,
-    /// Why some process may send what is not seen this way; `None` = none does.
+    /// Why some process may send without being seen; `None` = all are covered.
     pub uncovered: Option<String>,
 }
 
-/// One library.
+/// State of one library.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LibraryFacts {
-    /// Its name in the file system of a process that uses it.
+    /// Its path in the file system of a process that uses it.
     pub path: PathBuf,
-    /// Processes that use it.
+    /// Number of processes that use it.
     pub processes: usize,
-    /// Why it is not attached to.
+    /// Why it is not attached; `None` if it is.
     pub refused: Option<String>,
 }
 
 struct Shared {
     facts: Mutex<Facts>,
-    /// Also until the first look is over: it takes a moment, and what is installed is seen.
+    /// Also set until the first search ends: that takes a moment, and installed libraries are
+    /// attached.
     covers_all: AtomicBool,
-    /// Whether it is to be attached.
+    /// Whether the probes are needed.
     wanted: AtomicBool,
-    /// Whether anything may be attached.
+    /// Whether any probe may be attached.
     attached: AtomicBool,
-    /// It may be wanted no longer.
+    /// Whether probes are attached only while they are needed.
     on_demand: bool,
     stop: AtomicBool,
 }
 
-/// All libraries that were met.
+/// All known libraries.
 struct Attachments {
     probes: Probes,
     libraries: BTreeMap<LibraryId, Library>,
@@ -101,11 +102,11 @@ struct Library {
     processes: usize,
     used: Instant,
     tried: Instant,
-    /// Attached to before anybody used it, and kept.
+    /// Attached before any process used it, and kept.
     is_installed: bool,
 }
 
-/// Why a library is not attached to.
+/// Why a library is not attached.
 #[derive(Debug, thiserror::Error)]
 enum Refusal {
     #[error("it cannot be opened")]
@@ -119,7 +120,7 @@ enum Refusal {
 }
 
 impl Facts {
-    /// It is attached on demand, and nobody demands it.
+    /// Returns the facts while probes are attached on demand and not needed.
     fn resting() -> Self {
         Self {
             libraries: Vec::new(),
@@ -128,7 +129,7 @@ impl Facts {
     }
 }
 
-/// Nobody has looked yet.
+/// Returns the facts before the first search.
 impl Default for Facts {
     fn default() -> Self {
         Self {
@@ -139,16 +140,16 @@ impl Default for Facts {
 }
 
 impl LibrarySearch {
-    /// Attaches to what is installed, and to nothing else before it is started; `on_demand` to nothing
-    /// before it is wanted.
+    /// Attaches to installed libraries before the thread starts; with `on_demand` to none until
+    /// they are needed.
     #[must_use]
     pub fn new(probes: Probes, scope: Scope, on_demand: bool) -> Self {
         let mut attachments = Attachments {
             probes,
             libraries: BTreeMap::new(),
         };
-        // A participant says its names once, within a tenth of a second: what is there already is
-        // not waited for.
+        // A participant announces its names once, within a tenth of a second: installed libraries
+        // are attached in advance.
         if !on_demand {
             attachments.install(&installed(), Instant::now());
         }
@@ -171,11 +172,11 @@ impl LibrarySearch {
         }
     }
 
-    /// Starts looking, once, in a thread that gives up all it does not need; the caller may give up
-    /// everything afterwards.
+    /// Starts the search, once, in a thread that drops the privileges it does not need; the caller
+    /// may drop all of its own afterwards.
     ///
     /// # Errors
-    /// There can be no more threads.
+    /// Fails if the thread cannot be started.
     pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
         let Some((attachments, scope)) = self.waiting.take() else {
             return Ok(());
@@ -187,7 +188,7 @@ impl LibrarySearch {
         Ok(())
     }
 
-    /// Attaches, or lets go of everything, where that is done on demand.
+    /// Attaches or detaches all probes, if they are attached on demand.
     pub fn want(&self, wanted: bool) {
         let shared = &self.shared;
         if !shared.on_demand || shared.wanted.swap(wanted, Ordering::AcqRel) == wanted {
@@ -198,20 +199,20 @@ impl LibrarySearch {
         }
     }
 
-    /// Whether anything may be attached.
+    /// Returns whether any probe may be attached.
     #[must_use]
     pub fn is_attached(&self) -> bool {
         self.shared.attached.load(Ordering::Acquire)
     }
 
-    /// What is attached, and what is not covered.
+    /// Returns the attached libraries, and which processes are not covered.
     #[must_use]
     pub fn facts(&self) -> Facts {
         let facts = self.shared.facts.lock();
         facts.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Whether every process that uses Fast DDS's shared memory is seen.
+    /// Returns whether every process that uses Fast DDS's shared memory is covered.
     #[must_use]
     pub fn covers_all(&self) -> bool {
         self.shared.covers_all.load(Ordering::Acquire)
@@ -222,25 +223,25 @@ impl Drop for LibrarySearch {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
-            // It wakes within a second otherwise, and nobody waits for that long at the end.
+            // Otherwise it wakes within a second, too long for a shutdown.
             thread.thread().unpark();
             drop(thread);
         }
     }
 }
 
-/// The thread.
+/// The thread's main function.
 fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
     let mut processes = Processes::new(scope.clone());
     let mut shared_memory = ShmDirectories::new(scope);
-    // Without it, a participant that starts is noticed within a second.
+    // Without inotify, a starting participant is noticed within a second.
     let mut watch = DirectoryWatch::new().ok();
     let mut watched = BTreeSet::new();
     let (mut somebody_came, mut asked_all) = (true, None::<Instant>);
     while !shared.stop.load(Ordering::Acquire) {
         if !shared.wanted.load(Ordering::Acquire) {
             if shared.attached.load(Ordering::Acquire) {
-                // Shared memory is looked at again before nothing is seen here any more.
+                // Polling of shared memory resumes before the probes are detached.
                 shared.report(Facts::resting());
                 std::thread::sleep(OVERLAP);
                 attachments.libraries.clear();
@@ -258,7 +259,7 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
         if all {
             asked_all = Some(now);
         }
-        // Who is new comes first.
+        // New processes come first.
         processes.find(false);
         attachments.follow(&processes, now);
         if all {
@@ -302,7 +303,7 @@ impl Shared {
 }
 
 impl Attachments {
-    /// Attaches to libraries that nobody uses yet.
+    /// Attaches to installed libraries that no process uses yet.
     fn install(&mut self, paths: &[PathBuf], now: Instant) {
         for path in paths {
             let Ok(metadata) = fs::metadata(path) else {
@@ -316,7 +317,7 @@ impl Attachments {
             if self.libraries.contains_key(&id) || self.libraries.len() >= MAX_LIBRARIES {
                 continue;
             }
-            // If it cannot be, that is said when somebody uses it.
+            // A failure is reported when a process uses the library.
             if let Ok(probe) = attach(&mut self.probes, path) {
                 tracing::info!(library = %path.display(), "uprobe attached in advance");
                 let library = Library {
@@ -332,7 +333,7 @@ impl Attachments {
         }
     }
 
-    /// Attaches to what is new, and lets go of what nobody has used for a while.
+    /// Attaches to new libraries, and detaches those that have been unused for a while.
     fn follow(&mut self, processes: &Processes, now: Instant) {
         for library in self.libraries.values_mut() {
             library.processes = 0;
@@ -359,7 +360,7 @@ impl Attachments {
             .get(id)
             .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY);
         if !is_known && (self.libraries.contains_key(id) || self.libraries.len() < MAX_LIBRARIES) {
-            // The very file that the process maps, whatever its name means by now.
+            // Refers to the file that the process maps, even if its path now names another one.
             let file = PathBuf::from(format!("/proc/{process}/map_files/{range}"));
             let probe = attach(&mut self.probes, &file);
             let probe = probe.map_err(|refusal| in_words(&refusal));
@@ -421,7 +422,7 @@ impl Attachments {
     }
 }
 
-/// Libraries where they are usually installed; none of a container's.
+/// Returns Fast DDS's libraries in the usual directories of this host, not of containers.
 fn installed() -> Vec<PathBuf> {
     let mut directories: Vec<_> = INSTALLED.iter().map(PathBuf::from).collect();
     let distributions = fs::read_dir(DISTRIBUTIONS).into_iter().flatten().flatten();
@@ -443,7 +444,7 @@ fn installed() -> Vec<PathBuf> {
 }
 
 fn attach(probes: &mut Probes, path: &Path) -> Result<Probe, Refusal> {
-    // One that would keep us waiting is none of a library.
+    // A file whose open blocks is not a library.
     let file = OpenOptions::new()
         .read(true)
         .custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY)
@@ -464,7 +465,7 @@ mod tests {
     use super::*;
     use crate::filter::{Filter, FilterSettings};
 
-    /// Maps a file into this process, for good.
+    /// Maps a file into this process permanently.
     fn map(file: &fs::File) {
         // SAFETY: a new private mapping at an address of the kernel's choice; nothing refers to it.
         let mapped = unsafe {
@@ -488,7 +489,7 @@ mod tests {
             fs::write(&path, library::tests::library()).unwrap();
             map(&fs::File::open(&path).unwrap());
         }
-        // Other tests expect this process to use none of Fast DDS.
+        // Other tests expect this process not to use Fast DDS.
         let maps = fs::read_to_string("/proc/self/maps").unwrap();
         let mut used = Use::parse(&maps.replace("/library.", "/libfastdds.so."));
         assert_eq!(used.libraries.len(), MAX_LIBRARIES + 1);
@@ -513,7 +514,7 @@ mod tests {
             "{uncovered}"
         );
 
-        // The last one has none; the first is given up, and what it leaves is taken.
+        // The last one has no probe; the first is detached, and its place is used.
         used.libraries.remove(0);
         let fewer = Processes::of(process, used);
         let later = start + RETRY + LINGER + EVERY;

@@ -35,7 +35,7 @@ fn the_interest_map_takes_so_many_and_refuses_the_next() {
         put(number).unwrap();
     }
     assert!(put(INTEREST_CAPACITY).is_err());
-    // Those that are there can be changed.
+    // Existing entries can still be changed.
     put(0).unwrap();
 }
 
@@ -157,7 +157,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
         sent += SAMPLES;
         sent
     };
-    // All that comes is younger than this, so none of it is settled.
+    // All records are younger than this, so none is settled.
     let before = Clocks::read();
     while counter(&intake, Counter::RecordsLost) == 0 {
         for _ in 0..50 {
@@ -169,7 +169,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
     assert_eq!(taken, MAX_WAITING);
     assert_eq!(observer.snapshot(before.now).records, 0);
 
-    // Once they count there is room again: what was in the ring counts too, and what comes.
+    // Afterwards there is room again: records left in the ring count too, and so do new ones.
     let mut later = Clocks::read();
     later.now = Timestamp(later.now.0 + SECOND);
     later.monotonic += SECOND;

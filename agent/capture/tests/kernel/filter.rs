@@ -1,4 +1,4 @@
-//! The kernel program against the user-space walk: the same records, to the byte.
+//! The kernel program against the user-space walk: the same records, byte for byte.
 //!
 //! Every frame of every capture goes through the loaded program (BPF_PROG_TEST_RUN: no interface,
 //! no socket) and through the reassembly and walk of user space. Needs root.
@@ -187,7 +187,7 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
         let name = entry.unwrap().file_name().into_string().unwrap();
         assert!(listed.contains(&*format!("src/{name}")), "{name}");
     }
-    // Files that a list kept by hand left out for long.
+    // Files that a hand-written list once omitted.
     for name in [
         "frame.rs",
         "parameters.rs",
@@ -214,7 +214,7 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
         let command = command.args(["-c", arguments]).current_dir(&copied);
         command.output().unwrap().status.success()
     };
-    // As it would be just after it was built.
+    // The list as it would be just after a build.
     let sums = "{ head -n 1 filter.bpf.sha256; sed 1d filter.bpf.sha256 | cut -c67- | xargs sha256sum; } \
                 > new && mv new filter.bpf.sha256";
     assert!(run("bash", sums));

@@ -1,6 +1,6 @@
-//! The probe on the way into shared memory, on a program that hands messages over as Fast DDS does:
-//! what the kernel reads in its memory is what was handed over, in one piece and in a list of
-//! buffers, however that is cut. Needs root and a kernel with uprobes.
+//! The probe on the path into shared memory, tested on a program that passes messages as Fast DDS
+//! does: the kernel reads the same bytes, in one piece and in a list of buffers, however they are
+//! cut. Needs root and a kernel with uprobes.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -25,7 +25,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 const PATIENCE: Duration = Duration::from_secs(10);
 const EXACT: u16 = flag::SHM | flag::EXACT;
 
-/// A process that hands messages over, a filter that looks at it, and whom it pretends to be.
+/// A process that passes messages, a filter that observes it, and the participant that it imitates.
 struct Handing {
     filter: Filter,
     probe: Option<Probe>,
@@ -67,7 +67,7 @@ impl Handing {
         })
     }
 
-    /// Hands a message over, cut into buffers of these lengths.
+    /// Passes a message, cut into buffers of these lengths.
     fn hand(&mut self, message: &[u8], lengths: &[usize]) -> Result<()> {
         assert_eq!(lengths.iter().sum::<usize>(), message.len());
         hand(&mut self.sender, message, lengths)
@@ -83,7 +83,7 @@ impl Handing {
         std::iter::from_fn(|| self.filter.next_record()).collect()
     }
 
-    /// Whole messages, as they were captured.
+    /// Returns whole captured messages.
     fn captured(&mut self) -> Vec<Vec<u8>> {
         let (mut wholes, mut messages) = (PieceAssembler::default(), Vec::new());
         while let Some(captured) = self.filter.next_piece() {
@@ -118,7 +118,7 @@ fn hand(sender: &mut Process, message: &[u8], lengths: &[usize]) -> Result<()> {
     sender.wait_for("handed", PATIENCE)
 }
 
-/// Ways to cut a message of this length. Fast DDS cuts before payloads and their padding.
+/// Returns ways to cut a message of this length. Fast DDS cuts before payloads and their padding.
 fn cuts(form: Form, length: usize) -> Vec<Vec<usize>> {
     if form == Form::Whole {
         return vec![vec![length]];
@@ -152,7 +152,7 @@ fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()>
                 handing.talker.message(SAMPLES_WRITER, 1, &[0; 320]).len() - 320 + size,
             ) {
                 let mut message = handing.talker.sample(size);
-                // INFO_TS before, so that there is a time to be found.
+                // Preceded by INFO_TS, so that a timestamp is in force.
                 let time = [9, 1, 8, 0, 1, 0, 0, 0, 2, 0, 0, 0];
                 let at = 20;
                 message.splice(at..at, time);
@@ -169,7 +169,7 @@ fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()>
         let records = handing.records();
         assert_eq!(records.len(), expected.len(), "{:?}", handing.counts()?);
         for (record, expected) in records.iter().zip(&expected) {
-            // Without an address user space says IPv6.
+            // Without an address, user space sets the IPv6 flag.
             let flags = (expected.flags & !flag::IPV6) | EXACT;
             let time = record.time;
             assert!(time > 0);
@@ -199,7 +199,7 @@ fn what_is_captured_is_whole() -> Result<()> {
                 expected.push(message.clone());
             }
         }
-        // Nobody has announced it: captured, too.
+        // An unannounced writer: captured, too.
         let long = handing.talker.message(SAMPLES_WRITER, 1, &vec![7; 65_000]);
         let cut = match form {
             Form::Whole => vec![long.len()],
@@ -220,7 +220,7 @@ fn longer_messages_than_datagrams_count_and_what_is_unreadable_is_counted() -> R
     for form in [Form::Whole, Form::List] {
         let mut handing = Handing::new(form)?;
         handing.meter()?;
-        // A length of 0 says that the submessage goes on to the end.
+        // A length of 0: the submessage extends to the end.
         let mut long = handing.talker.message(SAMPLES_WRITER, 5, &vec![7; 40_000]);
         long.splice(22..24, [0, 0]);
         long.extend(vec![7; 100_000]);
@@ -264,7 +264,7 @@ fn processes_of_other_control_groups_and_those_behind_the_probe_s_end_are_not_se
     handing.probe = None;
     handing.hand(&message, &[message.len()])?;
     assert_eq!(handing.records(), []);
-    // Those of tests that run beside this one are in the same file.
+    // Probes of parallel tests are in the same file.
     let deadline = Instant::now() + PATIENCE;
     loop {
         let code = harness::code::at_function(&handing.sender, &handing.program)?;

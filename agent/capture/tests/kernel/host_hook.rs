@@ -1,4 +1,4 @@
-//! The host hook on real sockets: what passes is seen whole, each copy with its socket, nothing is
+//! The host hook on real sockets: traffic is seen whole, each copy with its socket, nothing is
 //! dropped, and nothing stays behind. Needs root.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -31,8 +31,8 @@ const GROUP: Ipv4Addr = Ipv4Addr::new(239, 255, 0, 1);
 
 static NEXT: AtomicU16 = AtomicU16::new(0);
 
-/// Payloads of UDP datagrams: in one frame of MTU 1500, in a few, in as many as there can be, and
-/// around the size of a piece.
+/// Sizes of UDP payloads: in one frame of MTU 1500, in several, in the largest number, and around
+/// the size of a piece.
 const SIZES: [usize; 8] = [64, 1_400, 1_500, 16_384, 16_385, 60_000, 65_000, 65_507];
 
 /// A cgroup and the host hook on it.
@@ -55,7 +55,7 @@ impl Observed {
         std::iter::from_fn(|| self.filter.next_record()).collect()
     }
 
-    /// Captured datagrams with their first piece, put together.
+    /// Returns captured datagrams, reassembled, with their first piece.
     fn captured(&mut self) -> Vec<(Piece, Vec<u8>)> {
         let mut whole: BTreeMap<u32, (Piece, Vec<u8>)> = BTreeMap::new();
         while let Some(captured) = self.filter.next_piece() {
@@ -76,7 +76,7 @@ impl Observed {
             .1)
     }
 
-    /// A socket of this cgroup on a host.
+    /// Opens a socket of this cgroup on a host.
     fn socket(&self, host: &Namespace, address: &str) -> Result<UdpSocket> {
         let address: SocketAddr = address.parse()?;
         let socket = self
@@ -94,7 +94,7 @@ impl Observed {
     }
 }
 
-/// A socket of the cgroup in a multicast group of the host's interface.
+/// Opens a socket of the cgroup in a multicast group of the host's interface.
 fn member(observed: &Observed, host: &Namespace, port: u16) -> Result<UdpSocket> {
     let socket = observed.make(host, || shared(port))??;
     socket.join_multicast_v4(&GROUP, &host.address())?;
@@ -102,12 +102,12 @@ fn member(observed: &Observed, host: &Namespace, port: u16) -> Result<UdpSocket>
     Ok(socket)
 }
 
-/// A socket on a port that others have too.
+/// Opens a socket on a shared port.
 fn shared(port: u16) -> io::Result<UdpSocket> {
     // SAFETY: no preconditions.
     let socket = unsafe { libc::socket(libc::AF_INET, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
     assert!(socket >= 0, "socket: {}", io::Error::last_os_error());
-    // SAFETY: a descriptor that was just made and that nobody else has.
+    // SAFETY: a new descriptor without another owner.
     let socket = unsafe { OwnedFd::from_raw_fd(socket) };
     let on = 1_u32;
     let address = libc::sockaddr_in {
@@ -162,7 +162,7 @@ fn link() -> Result<Link> {
     Ok(link)
 }
 
-/// A DATA in a datagram of `size` bytes, whose bytes differ.
+/// A DATA in a datagram of `size` varying bytes.
 fn payload(number: u32, size: usize) -> Vec<u8> {
     let mut bytes = program_run::message(WRITER, number..=number, size - 44);
     for (at, byte) in bytes.iter_mut().enumerate().skip(44) {
@@ -310,8 +310,8 @@ fn two_sockets_in_one_group_are_two_records_and_one_capture() -> Result<()> {
     let captured = observed.captured();
     assert_eq!(captured.len(), 1, "of all copies");
     assert!(captured[0].1 == sent);
-    // Each socket has the capture or a record: to a group, the kernel shows what is received here
-    // before what is sent.
+    // Each socket has the capture or a record: for a group, the kernel delivers locally before it
+    // sends.
     let metered = observed.records();
     let seen: BTreeSet<_> = metered
         .iter()
@@ -368,7 +368,7 @@ fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go()
     let used = observed.socket(&host, "127.0.0.1:0")?;
     let mut numbers = 1..;
     let mut arrives = |observed: &mut Observed, cpu, socket: &UdpSocket| -> Result<()> {
-        // Whom a CPU delivers to alone, it need not look for each time.
+        // The hook caches the socket that a CPU delivers to.
         program_run::go_to_cpu(cpu);
         sender.send_to(&payload(numbers.next().unwrap(), 64), socket.local_addr()?)?;
         socket.recv(&mut [0; 64])?;
@@ -422,7 +422,7 @@ fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go()
     Ok(())
 }
 
-/// Programs on a cgroup, in both directions (BPF_PROG_QUERY).
+/// Returns the numbers of programs on a cgroup, in both directions (BPF_PROG_QUERY).
 fn attached(cgroup: &Path) -> Result<[usize; 2]> {
     let directory = File::open(cgroup)?;
     let count = |direction| {
@@ -445,7 +445,7 @@ struct CgroupSkbPrograms {
 }
 
 impl CgroupSkbPrograms {
-    /// How many programs of an `enum bpf_attach_type` there are: 0 is ingress, 1 is egress.
+    /// Returns the number of programs of an `enum bpf_attach_type`: 0 is ingress, 1 is egress.
     fn query(directory: &File, attach_type: u32) -> io::Result<usize> {
         const BPF_PROG_QUERY: libc::c_int = 16;
         let mut ids = [0_u32; 64];
@@ -475,7 +475,7 @@ impl CgroupSkbPrograms {
     }
 }
 
-/// Sends datagrams of all sizes and gives how many arrive.
+/// Sends datagrams of all sizes and returns how many arrive.
 fn delivered(sender: &UdpSocket, receiver: &UdpSocket) -> Result<usize> {
     receiver.set_read_timeout(Some(Duration::from_millis(300)))?;
     let (mut buffer, mut arrived) = (vec![0; 65_536], 0);
@@ -501,7 +501,7 @@ fn other_programs_keep_their_places_and_everything_is_delivered() -> Result<()> 
     assert_eq!(delivered(&sender, &receiver)?, sent);
     assert_eq!(other.records().len(), 2 * sent);
 
-    // Ours comes second, and a third after it.
+    // Ours is attached second, and a third one after it.
     let mut ours = Filter::load_host(&FilterSettings::default())?;
     ours.set_interest(WRITER, Some(Verdict::Meter))?;
     ours.attach(&File::open(&path)?)?;
@@ -526,7 +526,8 @@ fn other_programs_keep_their_places_and_everything_is_delivered() -> Result<()> 
     Ok(())
 }
 
-/// Links go with their last descriptor, which the kernel puts away a little later.
+/// Waits for the number of programs: the kernel removes links shortly after their last descriptor
+/// is closed.
 fn wait_attached(cgroup: &Path, programs: [usize; 2]) -> Result<()> {
     let deadline = Instant::now() + Duration::from_secs(5);
     while attached(cgroup)? != programs {

@@ -1,5 +1,5 @@
-//! Where datagrams die inside this host, told by name: in full receive buffers and in reassembly;
-//! and who holds a socket. Needs root.
+//! Datagrams lost inside this host, attributed to their samples: in full receive buffers and in
+//! reassembly; and the processes that hold a socket. Needs root.
 
 mod full_buffers;
 mod reassembly;
@@ -29,7 +29,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 static NEXT: AtomicU16 = AtomicU16::new(0);
 
-/// A cgroup, the host hook on it, and what looks further inside.
+/// A cgroup, the host hook on it, and the tracepoint programs.
 struct Observed {
     filter: Filter,
     cgroup: Cgroup,
@@ -56,7 +56,7 @@ impl Observed {
         owners.refresh(&BTreeSet::from([socket])).unwrap()
     }
 
-    /// The records of a writer that come within the time given.
+    /// Returns the records of a writer that arrive within the given time.
     fn records(&mut self, writer: Guid, within: Duration) -> Vec<Record> {
         let deadline = Instant::now() + within;
         let mut found = Vec::new();
@@ -82,7 +82,7 @@ impl Observed {
             .1
     }
 
-    /// A socket of the cgroup in a host's network.
+    /// Opens a socket of the cgroup in a host's network.
     fn socket(&self, host: &Namespace, address: &str) -> UdpSocket {
         let address: SocketAddr = address.parse().unwrap();
         let path = forged::path(host);
@@ -91,7 +91,7 @@ impl Observed {
     }
 }
 
-/// A bound socket that others may share the address with.
+/// Opens a bound socket that can share its address.
 fn shared_socket(address: SocketAddr) -> UdpSocket {
     let domain = if address.is_ipv4() {
         libc::AF_INET
@@ -101,7 +101,7 @@ fn shared_socket(address: SocketAddr) -> UdpSocket {
     // SAFETY: takes no pointers.
     let descriptor = unsafe { libc::socket(domain, libc::SOCK_DGRAM | libc::SOCK_CLOEXEC, 0) };
     assert!(descriptor >= 0);
-    // SAFETY: a descriptor that was just made and that nobody else has.
+    // SAFETY: a new descriptor without another owner.
     let socket = unsafe { UdpSocket::from_raw_fd(descriptor) };
     set(&socket, libc::SO_REUSEADDR, 1);
     let (storage, len) = raw(address);
@@ -129,7 +129,7 @@ fn raw(address: SocketAddr) -> (Vec<u8>, libc::socklen_t) {
 }
 
 fn set(socket: &UdpSocket, option: libc::c_int, value: libc::c_int) {
-    // SAFETY: the option's value is an int, which both pointers say and which outlive the call.
+    // SAFETY: both pointers refer to an int, the option's type, and outlive the call.
     let result = unsafe {
         libc::setsockopt(
             socket.as_raw_fd(),
@@ -142,11 +142,11 @@ fn set(socket: &UdpSocket, option: libc::c_int, value: libc::c_int) {
     assert_eq!(result, 0);
 }
 
-/// SO_COOKIE: the number that the kernel gives a socket when it is asked for it.
+/// Returns SO_COOKIE: the kernel assigns a socket this number on the first query.
 fn cookie(socket: &UdpSocket) -> u64 {
     let mut cookie = 0_u64;
     let mut len = libc::socklen_t::try_from(size_of_val(&cookie)).unwrap();
-    // SAFETY: the option's value is 8 bytes, which both pointers say and which outlive the call.
+    // SAFETY: both pointers refer to 8 bytes, the option's size, and outlive the call.
     let result = unsafe {
         libc::getsockopt(
             socket.as_raw_fd(),
@@ -185,7 +185,7 @@ fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_pro
     let bind = || UdpSocket::bind("127.0.0.1:0").unwrap();
     let socket = netns::within(&forged::path(&host), bind).unwrap();
     let cookie = cookie(&socket);
-    // A thread's children are born in the process id namespace that it has made.
+    // A thread's children belong to the PID namespace that it has created.
     let contained = std::thread::spawn(|| {
         // SAFETY: takes no pointers.
         assert_eq!(unsafe { libc::unshare(libc::CLONE_NEWPID) }, 0);
@@ -197,7 +197,7 @@ fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_pro
             .unwrap()
     });
     let mut child = contained.join().unwrap();
-    // The name changes only after the parent has heard that all is well.
+    // The name changes only after the parent has learned that exec succeeded.
     let name = format!("/proc/{}/comm", child.id());
     while std::fs::read_to_string(&name).unwrap() != "sleep\n" {
         std::thread::yield_now();
@@ -226,8 +226,7 @@ fn talker(number: u32) -> (Talker, Guid) {
     (talker, guid)
 }
 
-/// What of `sent` a socket that reads afterwards has got, and what is missing; samples by sequence
-/// number and first fragment.
+/// Received and missing samples of a socket, by sequence number and first fragment.
 type FragmentNumbers = BTreeSet<(u64, u32)>;
 
 fn fragment_numbers<'a>(records: impl IntoIterator<Item = &'a Record>) -> FragmentNumbers {
@@ -236,7 +235,7 @@ fn fragment_numbers<'a>(records: impl IntoIterator<Item = &'a Record>) -> Fragme
         .collect()
 }
 
-/// Time for what was sent to have come through.
+/// Time until everything sent has arrived.
 const SETTLED: Duration = Duration::from_millis(200);
 
 fn observed_link(number: u32, verdict: Verdict) -> (Observed, Link, Talker, Guid) {

@@ -1,9 +1,9 @@
-//! `make demo`: a robot and an operator's host in network namespaces of their own, the agent beside
-//! the robot, and a live summary of what it exports. Nothing of it touches the machine's network;
-//! the metrics, the control API and the page are relayed to ports of this machine, so that `rp`,
-//! `curl` and a browser reach them as they would reach an agent of this host.
+//! `make demo`: a robot and an operator's host in separate network namespaces, the agent on the
+//! robot, and a live summary of its metrics. The machine's own network is not touched. The metrics,
+//! the control API and the page are relayed to ports of this machine, so that `rp`, `curl` and a
+//! browser reach them as on a real host.
 //!
-//! It only reads what anybody can read from `/metrics`.
+//! It reads only `/metrics`, which is public.
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
@@ -24,19 +24,19 @@ mod relay;
 mod summary;
 
 const REFRESH: Duration = Duration::from_secs(2);
-/// The agent's own ports, used here too when they are free.
+/// The agent's default ports, used here too if they are free.
 const METRICS: u16 = 17400;
 const API: u16 = 17401;
 
 #[derive(Parser)]
 #[command(about = "Shows the agent watching a small robot; needs root for network namespaces")]
 struct Options {
-    /// The agent; `rp` of the same build when left out
+    /// The agent; default: `rp` of the same build
     #[arg(long)]
     agent: Option<PathBuf>,
     #[arg(long, default_value = "config/ros2probe.yaml")]
     config: PathBuf,
-    /// End by itself after so many seconds
+    /// End after this many seconds
     #[arg(long)]
     seconds: Option<f64>,
     #[arg(long, hide = true)]
@@ -128,8 +128,8 @@ async fn demo(options: &Options) -> Result<()> {
     }
 }
 
-/// The configuration, with the sockets of one of the two hosts only: both are this machine. An agent
-/// of this machine keeps its unix socket. Loopback has all rights (`Agent::start`).
+/// Returns the configuration for the sockets of one host only, since both hosts are this machine.
+/// An agent of this machine keeps its unix socket. Loopback has all rights (`Agent::start`).
 fn for_one_host(config: &Path, cgroup: &Path) -> Result<String> {
     let mut text = std::fs::read_to_string(config)
         .with_context(|| format!("cannot read {}", config.display()))?;

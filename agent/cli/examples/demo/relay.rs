@@ -1,5 +1,5 @@
-//! Carries TCP connections of this machine to a host's loopback. A unix socket joins the two, since
-//! the file system is common to all network namespaces; no interface or route is added anywhere.
+//! Relays TCP connections of this machine to a host's loopback. A unix socket joins the two, since
+//! network namespaces share the file system; no interface or route is added.
 
 use std::io;
 use std::net::{Ipv4Addr, Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -18,16 +18,16 @@ pub(crate) struct Relay {
     _remote: Process,
 }
 
-/// What of the agent is reached from this machine.
+/// The relayed listeners of the agent.
 pub(crate) struct Relays {
     pub(crate) metrics: Relay,
-    /// The control API, and the page.
+    /// The control API and the page.
     pub(crate) api: Relay,
 }
 
 impl Relays {
-    /// What commands have to be given so that they find the agent: nothing where it listens as one
-    /// of this host would.
+    /// Returns the options with which commands reach the agent; empty if the default ports are
+    /// relayed.
     pub(crate) fn options(&self, port: u16) -> String {
         match self.api.address() {
             address if address.port() == port => String::new(),
@@ -37,7 +37,7 @@ impl Relays {
 }
 
 impl Relay {
-    /// Listens on `port` of this machine, or on any free one when it is taken.
+    /// Listens on `port` of this machine, or on any free port if it is taken.
     pub(crate) fn start(host: &Namespace, directory: &Path, port: u16) -> Result<Relay> {
         let socket = directory.join(format!("relay-{port}"));
         let program = std::env::current_exe().context("cannot tell where this program is")?;
@@ -72,7 +72,7 @@ impl Relay {
     }
 }
 
-/// The relay's end on the host.
+/// Runs the relay's end on the host.
 pub(crate) fn serve(socket: &Path, port: u16) -> Result<()> {
     let listener = UnixListener::bind(socket)
         .with_context(|| format!("cannot listen on {}", socket.display()))?;
@@ -85,7 +85,7 @@ pub(crate) fn serve(socket: &Path, port: u16) -> Result<()> {
     Ok(())
 }
 
-/// Copies both ways until each side has said its last; errors only end the connection.
+/// Copies both ways until both sides have closed; an error only ends the connection.
 fn carry(tcp: &TcpStream, unix: &UnixStream) {
     std::thread::scope(|scope| {
         scope.spawn(|| {

@@ -8,9 +8,9 @@ use ros2probe_testing::harness::agent::Scrape;
 use ros2probe_testing::harness::network::Link;
 
 pub(crate) struct Summary {
-    /// Whether the table may replace the one before.
+    /// Whether the table may overwrite the previous one.
     redraws: bool,
-    /// Sum and count of each topic's latency at the scrape before.
+    /// Sum and count of each topic's latency at the previous scrape.
     latencies: BTreeMap<String, (f64, f64)>,
 }
 
@@ -62,7 +62,7 @@ impl Summary {
         println!("the page: http://localhost:{}/", api.port());
     }
 
-    /// Mean time from the writer's timestamp to the wire since the scrape before.
+    /// Returns the mean time from the writer's timestamp to the wire since the previous scrape.
     fn latency(&mut self, scrape: &Scrape, topic: &str) -> String {
         let value = |name| scrape.sum(name, &[("topic", topic)]);
         let sum = value("ros2_topic_latency_seconds_sum");

@@ -14,7 +14,7 @@ const TOPICS_OF_A_NODE: usize = 20;
 const TYPE: &str = "sensor_msgs/Imu";
 const DEPTH: usize = 10;
 
-/// Sends an Imu on each of `topics` topics, `rate` times a second, from as many nodes as it takes.
+/// Sends an Imu on each of `topics` topics, `rate` times per second, from as many nodes as needed.
 pub(crate) async fn talk(
     context: &Context,
     topics: usize,
@@ -32,7 +32,7 @@ pub(crate) async fn talk(
         spin(&mut node)?;
     }
     println!("ready");
-    // One after the other, as if each node had a timer of its own.
+    // One after the other, as if each node had its own timer.
     let sending = periodic(rate * topics as f64, stop, move |count| {
         let turn = usize::try_from(count).unwrap_or_default() % topics;
         let publisher = publishers.get(turn).context("a publisher is missing");
@@ -41,7 +41,7 @@ pub(crate) async fn talk(
     tokio::task::spawn_blocking(move || join([sending])).await?
 }
 
-/// Receives what [`talk`] sends.
+/// Receives the messages of [`talk`].
 pub(crate) async fn hear(context: &Context, topics: usize, stop: &Arc<AtomicBool>) -> Result<()> {
     let qos = reliable(DEPTH);
     for first in (0..topics).step_by(TOPICS_OF_A_NODE) {

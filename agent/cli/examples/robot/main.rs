@@ -1,10 +1,10 @@
-//! A small robot made of real ROS 2 participants (crate `ros2-client` on RustDDS), for machines
-//! without ROS: the demo watches it and the tests count what it sends. It promises nothing about
-//! the agent and never talks to it; it only behaves as nodes do.
+//! A small robot of real ROS 2 participants (crate `ros2-client` on RustDDS), for machines without
+//! ROS: the demo observes it and the tests count its messages. It behaves like any node and does
+//! not communicate with the agent.
 //!
 //! `lidar`, `base` and `monitor` are the demo's processes; `pub` and `sub` are the test peers and
-//! share their command line and log format with `agent/cli/tests/peers`; `talkers` and `listeners` have
-//! many small topics (`crowd`).
+//! share their command line and log format with `agent/cli/tests/peers`; `talkers` and `listeners`
+//! have many small topics (`crowd`).
 
 use std::fs::File;
 use std::io::{BufRead, Write};
@@ -60,25 +60,25 @@ struct Options {
     depth: usize,
     #[arg(long, default_value_t = 0)]
     domain: u16,
-    /// Fully qualified node name; further ones get a silent endpoint on `<topic>_<n>`
+    /// Fully qualified node name; each further one gets a silent endpoint on `<topic>_<n>`
     #[arg(long)]
     node: Vec<String>,
     /// Write one JSON object per event to this file
     #[arg(long)]
     log: Option<PathBuf>,
-    /// Endpoints to be matched with before sending
+    /// Matched endpoints to wait for before sending
     #[arg(long, default_value_t = 1)]
     peers: usize,
     /// Once matched, wait for a line on standard input before sending
     #[arg(long)]
     hold: bool,
-    /// After so many samples, and so many more, wait for a line again; 0 means never
+    /// Number of samples after which to wait for a line again, repeatedly; 0 means never
     #[arg(long, default_value_t = 0)]
     stretch: u64,
     /// Seconds to stay after the last sample was sent
     #[arg(long, default_value_t = 1.0)]
     linger: f64,
-    /// Bytes of each socket's receive buffer, as far as net.core.rmem_max goes
+    /// Bytes of each socket's receive buffer, limited by net.core.rmem_max
     #[arg(long, default_value_t = 4 << 20)]
     receive_buffer: usize,
 }
@@ -135,7 +135,8 @@ async fn lidar(
     let mut imu = node(context, "/imu_driver", NodeOptions::new())?;
     let points = advertise(&mut lidar, "/points", "sensor_msgs/PointCloud2", &sensor)?;
     let scan = advertise(&mut lidar, "/scan", "sensor_msgs/LaserScan", &sensor)?;
-    // RustDDS drops what its history overwrites before it is sent: half a second survives a busy CPU.
+    // RustDDS drops samples that its history overwrites before they are sent: half a second
+    // survives a busy CPU.
     let patient = QosProfile::default().history(History::KeepLast { depth: 100 });
     let measurements = advertise(&mut imu, "/imu", "sensor_msgs/Imu", &patient)?;
     spin(&mut lidar)?;
@@ -239,7 +240,7 @@ async fn monitor(
     join([driving])
 }
 
-/// The `pub` role: waits for its peers, sends `count` samples at `rate`, logs each.
+/// Runs the `pub` role: waits for its peers, sends `count` samples at `rate`, logs each.
 async fn publish(
     context: &Context,
     options: &Options,
@@ -316,7 +317,7 @@ async fn publish(
     Ok(())
 }
 
-/// The `sub` role: logs every sample it is given, with the writer's sequence number.
+/// Runs the `sub` role: logs every received sample with the writer's sequence number.
 async fn subscribe(
     context: &Context,
     options: &Options,
@@ -423,7 +424,8 @@ async fn wait_for_line() -> Result<()> {
     .await?
 }
 
-/// The event log: one JSON object per line, written at once so that a killed process leaves it whole.
+/// The event log: one JSON object per line, flushed at once, so that a killed process leaves a
+/// complete log.
 struct Log {
     file: Option<Mutex<File>>,
 }
@@ -531,8 +533,8 @@ fn spin(node: &mut Node) -> Result<()> {
     Ok(())
 }
 
-/// Calls `action` with 0, 1, 2, ... at `rate` until it says no or the process is told to stop.
-/// Deadlines are absolute: a late call does not shift the ones after it.
+/// Calls `action` with 0, 1, 2, ... at `rate` until it returns `false` or the process is stopped.
+/// Deadlines are absolute: a late call does not delay later ones.
 fn periodic(
     rate: f64,
     stop: &Arc<AtomicBool>,

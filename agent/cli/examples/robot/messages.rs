@@ -1,5 +1,5 @@
-//! The ROS messages the robot speaks, in the member order of their `.msg` definitions: serde and
-//! CDR follow it. Only what the roles need is here; no message is ever invented or shortened.
+//! The robot's ROS messages, with fields in the order of their `.msg` definitions, which serde and
+//! CDR follow. Contains the messages of the roles only, all of them complete.
 
 use std::fmt;
 
@@ -9,7 +9,7 @@ use ros2_client::builtin_interfaces::Time;
 use serde::de::{Deserializer, Visitor};
 use serde::{Deserialize, Serialize, Serializer};
 
-/// What a serialized `PointCloud2` has around its `data` when `fields` is empty and `frame_id` is
+/// Bytes of a serialized `PointCloud2` besides its `data` if `fields` is empty and `frame_id` is
 /// `lidar`: 4 bytes of encapsulation, 48 before the data and 1 after.
 const POINT_CLOUD_OVERHEAD: usize = 53;
 const FLOAT32: u8 = 7;
@@ -45,7 +45,7 @@ pub(crate) struct PointCloud2 {
 }
 
 impl PointCloud2 {
-    /// A cloud of x, y, z and intensity with about `data_size` bytes of points.
+    /// Returns a cloud of x, y, z and intensity with about `data_size` bytes of points.
     pub(crate) fn with_fields(data_size: usize) -> PointCloud2 {
         let names = ["x", "y", "z", "intensity"];
         let fields = names.iter().zip((0_u32..).step_by(4));
@@ -58,7 +58,7 @@ impl PointCloud2 {
         PointCloud2::of(fields.collect(), 16, data_size - data_size % 16)
     }
 
-    /// A cloud whose serialized form, encapsulation included, has exactly `size` bytes.
+    /// Returns a cloud whose serialized form, encapsulation included, has exactly `size` bytes.
     pub(crate) fn of_serialized_size(size: usize) -> Result<PointCloud2> {
         let data = size
             .checked_sub(POINT_CLOUD_OVERHEAD)
@@ -90,8 +90,8 @@ impl PointCloud2 {
         }
     }
 
-    /// A copy with the stamp of now and the application's sequence number in the first eight bytes
-    /// of the points.
+    /// Returns a copy with the current time as stamp and the application's sequence number in the
+    /// first eight bytes of the points.
     pub(crate) fn numbered(&self, sequence: u64) -> PointCloud2 {
         let mut cloud = self.stamped();
         for (byte, number) in cloud.data.0.iter_mut().zip(sequence.to_le_bytes()) {
@@ -109,8 +109,8 @@ impl PointCloud2 {
     }
 }
 
-/// What points are filled with: every place can be told from its neighbours, and every fragment
-/// from another. As `pattern` in `agent/cli/tests/peers/peer.hpp`.
+/// Returns the byte at an offset of the points: adjacent bytes differ, and so do fragments. Equals
+/// `pattern` in `agent/cli/tests/peers/peer.hpp`.
 fn pattern(place: usize) -> u8 {
     let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
     low
@@ -217,7 +217,7 @@ pub(crate) struct AddTwoIntsResponse {
 impl Message for AddTwoIntsRequest {}
 impl Message for AddTwoIntsResponse {}
 
-/// `uint8[]`, moved as one block: element by element a point cloud costs a core.
+/// `uint8[]`, copied as one block: copying a point cloud element by element takes a whole core.
 #[derive(Clone)]
 struct Bytes(Vec<u8>);
 

@@ -1,12 +1,13 @@
-//! Lets the process be stopped and continued. SIGCONT, like a debugger, ends a waiting `epoll_wait`
-//! with EINTR, which RustDDS 0.15 takes for the end of its event loop: it would never receive again.
+//! Allows the process to be stopped and continued. SIGCONT, like a debugger, interrupts
+//! `epoll_wait` with EINTR, which RustDDS 0.15 treats as the end of its event loop: it would never
+//! receive again.
 
 use std::ffi::c_int;
 
-/// Takes the place of the C library's function in this program: waits again when interrupted.
+/// Replaces the C library's function in this program: waits again after an interruption.
 ///
 /// # Safety
-/// As of `epoll_wait(2)`: `events` has room for `max_events`.
+/// The same as for `epoll_wait(2)`: `events` has room for `max_events`.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn epoll_wait(
     epoll: c_int,
@@ -15,7 +16,7 @@ unsafe extern "C" fn epoll_wait(
     timeout: c_int,
 ) -> c_int {
     loop {
-        // SAFETY: the caller's arguments, unchanged; without a signal mask it is epoll_wait.
+        // SAFETY: the caller's arguments, unchanged; without a signal mask it equals epoll_wait.
         let ready =
             unsafe { libc::epoll_pwait(epoll, events, max_events, timeout, std::ptr::null()) };
         let interrupted = std::io::Error::last_os_error().kind() == std::io::ErrorKind::Interrupted;

@@ -1,5 +1,6 @@
-//! What every table costs when it is full: forged participants, endpoints and samples up to the
-//! built-in caps, one kind after the other, and the agent's memory after each. It only tells.
+//! Memory of every table when it is full: forges participants, endpoints and samples up to the
+//! default caps, one kind after the other, and prints the agent's memory after each. It checks
+//! nothing.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -11,31 +12,31 @@ use ros2probe_testing::harness::agent::{Agent, METRICS, ON_THE_WIRE, Scrape, get
 use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::usage::Usage;
 
-/// The built-in caps (`limits` in the configuration).
+/// The default caps (`limits` in the configuration).
 const PARTICIPANTS: u32 = 1000;
 const ENDPOINTS: u32 = 8192;
 /// Each participant has a writer for samples, one for `ros_discovery_info`, and readers.
 const READERS: u32 = ENDPOINTS / PARTICIPANTS - 2;
-/// Nobody listens there: the packets are for the agent alone.
+/// No process listens on this port: only the agent sees the packets.
 const NOBODY: u16 = 7399;
-/// After so many packets a pause: fast enough for leases of 12 s, slow enough for every ring.
+/// Packets between pauses: fast enough for leases of 12 s, slow enough for every ring.
 const BURST: usize = 8;
 const PAUSE: Duration = Duration::from_millis(2);
-/// Participants that announce their endpoints before all repeat that they are there.
+/// Participants that announce their endpoints before all participants renew their leases.
 const GROUP: usize = 250;
 const SAMPLE: usize = 320;
 /// A history of a minute's samples and several snapshots.
 const ROUNDS: u32 = 20;
 
-/// What one kind of entry costs.
+/// Memory of one kind of entry.
 struct Step {
     what: &'static str,
     entries: u32,
-    /// Of the agent, with this many and all before them.
+    /// Memory of the agent with this many entries and all previous kinds.
     unreclaimable: u64,
 }
 
-/// Fills the tables of an agent on the wire and prints what it takes.
+/// Fills the tables of an agent on the wire and prints its memory.
 pub(crate) fn measure(program: &Path) -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;
@@ -85,7 +86,7 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         unreclaimable: settled()?,
     });
     for round in 0..ROUNDS {
-        // What they send keeps them alive, but says nothing of their leases.
+        // Samples assert liveliness but do not renew the SPDP lease.
         if round % 3 == 0 {
             send(&mut talkers.iter().map(Talker::participant))?;
         }
@@ -97,6 +98,12 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         unreclaimable: settled()?,
     });
     let page = scraped(&agent)?;
+    print(steps, page);
+    Ok(())
+}
+
+/// Prints the table of what each kind of entry costs, and the cost of a scrape.
+fn print(steps: Vec<Step>, page: Scraped) {
     println!(
         "| entries | how many | MB unreclaimable | bytes each |\n| --- | ---: | ---: | ---: |"
     );
@@ -127,10 +134,9 @@ pub(crate) fn measure(program: &Path) -> Result<()> {
         bytes as f64 / 1e6,
         unreclaimable as f64 / 1e6,
     );
-    Ok(())
 }
 
-/// The most memory in the course of a scrape, and what the page told.
+/// The maximum memory during a scrape, and the scraped figures.
 struct Scraped {
     unreclaimable: u64,
     bytes: usize,
@@ -160,7 +166,7 @@ fn scraped(agent: &Agent<'_>) -> Result<Scraped> {
     })
 }
 
-/// Everything that a participant announces: two writers, its readers, its node.
+/// Returns all announcements of a participant: two writers, its readers, its node.
 fn announced((talker, number): (&Talker, u32)) -> Vec<Vec<u8>> {
     let [_, entities, samples, node] = talker.introduction(&format!("node{number}"));
     let readers = (0..READERS).map(|reader| {

@@ -1,7 +1,7 @@
-//! How small the shipped agent is: its file, how soon it is there, and its memory while there is
-//! nothing to see and nobody asks, and while it measures 200 topics with a scrape every 5 s, with the
-//! default configuration. What counts is memory that cannot be reclaimed; it does not depend on how
-//! busy the machine is: too much of it fails.
+//! Footprint of the shipped agent: its file size, its startup time, and its memory with the default
+//! configuration. Memory is measured idle without scrapes, and with 200 measured topics and a
+//! scrape every 5 s. Only memory that cannot be reclaimed counts; it does not depend on the
+//! machine's load, so too much of it is a failure.
 
 use std::fmt;
 use std::fs;
@@ -13,7 +13,7 @@ use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use crate::report::Miss;
 use ros2probe_testing::harness::agent::{Agent, METRICS, get};
@@ -22,32 +22,31 @@ use ros2probe_testing::harness::peer::robot;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::usage::Memory;
 
-/// The configuration as it is shipped.
+/// The shipped configuration.
 const CONFIGURATION: &str = include_str!("../../../../config/ros2probe.yaml");
 pub(crate) const TOPICS: usize = 200;
-/// Of each topic.
+/// Messages per second of each topic.
 const RATE: &str = "5";
 const SCRAPES: Duration = Duration::from_secs(5);
-/// Between two looks at the memory: a scrape's page is there for some 20 ms.
+/// Interval of reading the memory: a scrape's page exists for some 20 ms.
 const SAMPLING: Duration = Duration::from_millis(5);
-/// What is done once has been done, seconds after the start.
+/// Time after the start until one-time work is done.
 const SETTLED: Duration = Duration::from_secs(10);
 const STARTS: usize = 5;
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What the agent may take that cannot be reclaimed, while there is nothing to see, and while it
-/// measures [`TOPICS`].
+/// Most unreclaimable memory of the agent, when idle, and while it measures [`TOPICS`].
 const IDLE: u64 = 8_000_000;
 const BUSY: u64 = 16_000_000;
 
-/// Everything about one binary.
+/// All figures of one binary.
 pub(crate) struct Footprint {
-    /// Name and bytes of the file, and of the same for other machines if it was built.
+    /// Name and size of the file, and of the binaries for other architectures, if they were built.
     sizes: Vec<(String, u64)>,
     sources: Vec<OfSource>,
 }
 
-/// With one source.
+/// Figures with one source.
 struct OfSource {
     name: &'static str,
     /// Medians.
@@ -58,16 +57,16 @@ struct OfSource {
     topics: usize,
 }
 
-/// How long it took from its start.
+/// Times from the start of the process.
 #[derive(Clone, Copy)]
 struct Start {
-    /// Until the service manager was told that it is ready.
+    /// Until it notified the service manager that it is ready.
     ready: Duration,
-    /// Until there was a page of metrics.
+    /// Until it served the first metrics page.
     scrape: Duration,
 }
 
-/// A process that ends with its value.
+/// A process that is killed when its value is dropped.
 struct Killed(Child);
 
 impl Footprint {
@@ -129,7 +128,7 @@ impl OfSource {
 }
 
 impl Start {
-    /// Medians of a few.
+    /// Returns the medians of several runs.
     fn measure(
         host: &Namespace,
         program: &Path,
@@ -159,7 +158,7 @@ impl Start {
             UnixDatagram::bind(notify).context("cannot bind a socket for READY=1")?;
         agent_totals.set_nonblocking(true)?;
         let began = Instant::now();
-        // It ends with this thread, whatever happens.
+        // It ends with this thread in any case.
         let mut command = Command::new("setpriv");
         command.args(["--pdeathsig", "KILL"]).arg(program);
         command.args(["run", "--config"]).arg(configuration);
@@ -189,7 +188,7 @@ impl Start {
     }
 }
 
-/// The agent's at the moment at which there was most of it, `scraped` meanwhile or left alone.
+/// Returns the agent's maximum memory, with or without scrapes.
 fn most_during(length: Duration, agent: &Agent<'_>, scraped: bool) -> Result<Memory> {
     let began = Instant::now();
     let host = agent.host;
@@ -268,8 +267,8 @@ impl Drop for Killed {
     }
 }
 
-/// The shipped configuration with one source; at the sockets of these hosts only, because others on
-/// this machine may have something to see.
+/// Returns the shipped configuration with one source; at the sockets of these hosts only, because
+/// other processes on this machine may send.
 pub(crate) fn configured(source: &str, link: &Link) -> Result<String> {
     let mut text = CONFIGURATION.to_owned();
     let cgroup = link.cgroup().display().to_string();
@@ -288,7 +287,7 @@ pub(crate) fn configured(source: &str, link: &Link) -> Result<String> {
     Ok(text)
 }
 
-/// Processes that talk on [`TOPICS`] topics from one host to the other.
+/// Starts processes that communicate on [`TOPICS`] topics from one host to the other.
 pub(crate) fn crowd(link: &Link) -> Result<[Process; 2]> {
     let topics = TOPICS.to_string();
     let start = |host: &Namespace, role: &str| -> Result<Process> {
@@ -303,7 +302,7 @@ pub(crate) fn crowd(link: &Link) -> Result<[Process; 2]> {
     ])
 }
 
-/// Topics with messages, once there are all of them or it took too long.
+/// Returns the number of topics with messages, after all have some or a timeout expires.
 pub(crate) fn wait_for_topics(agent: &Agent<'_>) -> Result<usize> {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -321,7 +320,7 @@ fn counted(agent: &Agent<'_>) -> Result<usize> {
     Ok(messages.filter(|messages| *messages > 0.0).count())
 }
 
-/// Whether the agent of the calling thread's namespace answers with its metrics.
+/// Returns whether the agent in the calling thread's namespace serves its metrics.
 fn is_page() -> Result<bool> {
     let mut stream = TcpStream::connect("127.0.0.1:17400")?;
     stream.write_all(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")?;
@@ -330,7 +329,7 @@ fn is_page() -> Result<bool> {
     Ok(answer.starts_with("HTTP/1.1 200") && answer.contains("ros2probe_build_info"))
 }
 
-/// The agent's file, and that for the other architecture where it was built, too.
+/// Returns the size of the agent's file, and of the other architecture's if it was built.
 fn sizes(program: &Path) -> Result<Vec<(String, u64)>> {
     let own = fs::canonicalize(program)?;
     let mut files = vec![own.clone()];

@@ -1,11 +1,13 @@
-//! `make bench`: what observing costs. Each workload runs between two hosts with nobody watching,
-//! with the agent (host hook, then packet sockets), and with one more Cyclone DDS subscriber in C++
-//! instead, in turns; the table shows the observer's CPU time and memory, and what all of it spent.
+//! `make bench`: the cost of observing. Each workload runs between two hosts without an observer,
+//! with the agent (host hook, then packet sockets), and with an additional Cyclone DDS subscriber
+//! in C++, in turns. The table shows CPU time and memory of the observer, and the total of all
+//! processes.
 //!
-//! Before that, how small the agent is (`footprint`) and what open pages cost (`tabs`).
+//! Before that it measures the agent's footprint (`footprint`) and the cost of open pages (`tabs`).
 //!
-//! What holds on a busy machine too (memory, bytes copied, messages counted) is checked, and ends
-//! this with a failure; CPU time is compared with its targets, and only told.
+//! Figures that do not depend on the machine's load (memory, bytes copied, messages counted) are
+//! checked and end the run with a failure; CPU time is compared with its targets, and only
+//! reported.
 
 mod caps;
 mod footprint;
@@ -28,7 +30,7 @@ use ros2probe_testing::harness::peer::{Stack, Stream};
 #[derive(Parser)]
 #[command(about = "Measures what observing costs; needs root for network namespaces")]
 struct Options {
-    /// The agent; when left out, the static one that is shipped
+    /// The agent; default: the shipped static binary
     #[arg(long)]
     agent: Option<PathBuf>,
     /// Length of each measurement
@@ -37,8 +39,8 @@ struct Options {
     /// Measurements of each kind; the table shows medians
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..))]
     rounds: u16,
-    /// Only workloads whose name contains this; `footprint` for sizes, start and memory,
-    /// `caps` for the memory of full tables, `tabs` for open pages
+    /// Only workloads whose name contains this; `footprint` for sizes, startup and memory, `caps`
+    /// for the memory of full tables, `tabs` for open pages
     #[arg(long, default_value = "")]
     only: String,
     /// Only publishers and subscribers of this DDS
@@ -53,13 +55,13 @@ enum StackName {
     Rust,
 }
 
-/// One line of the table to be.
+/// One line of the table.
 struct Workload {
     name: &'static str,
-    /// Bytes and rate of each topic.
+    /// Bytes per message and rate of each topic.
     topics: &'static [(usize, f64)],
     stacks: &'static [Stack],
-    /// CPU seconds that the reference implementation needs for 20 s (docs/benchmarks.md), where known.
+    /// CPU seconds of the reference implementation for 20 s (docs/benchmarks.md), if known.
     reference: Option<f64>,
 }
 
@@ -139,7 +141,8 @@ fn main() -> Result<ExitCode> {
     })
 }
 
-/// Nobody, agent, subscriber, and again: what else the machine does meets all.
+/// Measures without an observer, with the agent, and with the subscriber, in turns, so that the
+/// machine's other work affects all alike.
 fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Row> {
     let streams = workload.topics.iter().enumerate();
     let streams: Vec<_> = streams
@@ -161,7 +164,7 @@ fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options)
     Ok(row)
 }
 
-/// In the target directory, of this machine's architecture.
+/// Returns the binary in the target directory for this machine's architecture.
 fn shipped() -> Result<PathBuf> {
     let program = std::env::current_exe().context("cannot tell where this program is")?;
     let target = program.ancestors().nth(3);

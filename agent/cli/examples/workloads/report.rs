@@ -1,4 +1,4 @@
-//! The table, as Markdown, and what is not as it should be.
+//! The table, as Markdown, and the missed targets.
 
 use std::fmt;
 
@@ -20,36 +20,36 @@ pub(crate) struct Row {
     windows: Vec<Window>,
 }
 
-/// What the agent may cost.
+/// Limits for the agent's cost.
 pub(crate) struct Targets {
-    /// Of the subscriber's CPU time.
+    /// Fraction of the subscriber's CPU time.
     of_subscriber: f64,
-    /// Of the reference implementation's.
+    /// Fraction of the reference implementation's CPU time.
     of_reference: f64,
     /// Bytes that cannot be reclaimed.
     unreclaimable: u64,
-    /// Bytes copied, of the traffic, where samples are large.
+    /// Fraction of the traffic that is copied, for large samples.
     copied: f64,
-    /// The agent with the host hook, of one core.
+    /// Fraction of a core for the agent with the host hook.
     of_core: f64,
-    /// All there is with the host hook, of what it takes without, where samples are large.
+    /// All processes with the host hook, as a fraction of those without it, for large samples.
     of_workload: f64,
 }
 
-/// One target that was not met.
+/// One target that was missed.
 pub(crate) struct Miss {
     what: String,
-    /// It does not depend on how busy the machine is.
+    /// Whether it is a failure: the figure does not depend on the machine's load.
     pub(crate) fails: bool,
 }
 
 impl Miss {
-    /// On any machine.
+    /// Creates a miss that fails on any machine.
     pub(crate) const fn failing(what: String) -> Miss {
         Miss { what, fails: true }
     }
 
-    /// On a machine that is as busy as this one.
+    /// Creates a miss that is only noted, since it depends on the machine's load.
     pub(crate) const fn noted(what: String) -> Miss {
         Miss { what, fails: false }
     }
@@ -178,7 +178,8 @@ impl Row {
         median(self.of(observer).map(|window| window.cpu))
     }
 
-    /// What there is besides the observer spends in the kernel for it shows here only.
+    /// Returns the additional work of the other processes in the kernel, which is visible only
+    /// here.
     fn beside_nobody(&self, observer: Observer) -> f64 {
         let median = |who| median(self.of(who).map(|window| window.workload));
         median(observer) / median(Observer::Nobody)
@@ -188,7 +189,7 @@ impl Row {
         !self.name.contains("320 B")
     }
 
-    /// Medians by observer.
+    /// Returns medians by observer.
     fn each(&self, value: impl Fn(&Window) -> f64) -> String {
         let medians = Observer::ALL.map(|who| median(self.of(who).map(&value)));
         medians.map(|median| format!("{median:.2}")).join(", ")

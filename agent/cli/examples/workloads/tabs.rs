@@ -1,5 +1,5 @@
-//! What open pages cost: the agent's CPU time and memory with 0, 1 and 10 streams of `/live` while it
-//! measures 200 topics, and what a stream carries.
+//! Cost of open pages: the agent's CPU time and memory with 0, 1 and 10 streams of `/live` while it
+//! measures 200 topics, and the traffic of a stream.
 
 use std::fs;
 use std::io::{Read as _, Write as _};
@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use crate::footprint::{TOPICS, configured, crowd, wait_for_topics};
 use crate::report::Miss;
@@ -18,30 +18,30 @@ use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::usage::Usage;
 
-/// Streams that are open together.
+/// Numbers of streams open at the same time.
 const COUNTS: [usize; 3] = [0, 1, 10];
-/// Between opening the streams and the measurement: the whole state has been sent.
+/// Time between opening the streams and the measurement, for sending the whole state.
 const SETTLED: Duration = Duration::from_secs(5);
-/// Share of a core that one page may take.
+/// Most of a core that one page may use.
 const OF_CORE: f64 = 0.01;
 
-/// The agent with some streams.
+/// Figures of the agent with some streams.
 struct Open {
     streams: usize,
-    /// CPU time over wall time.
+    /// CPU time divided by wall time.
     of_core: f64,
     unreclaimable: u64,
-    /// Of each stream, a second.
+    /// Bytes per second of each stream.
     bytes: u64,
 }
 
-/// A stream that is read, until its value is dropped.
+/// A stream that is read until its value is dropped.
 struct Tab {
     stream: TcpStream,
     bytes: Arc<AtomicU64>,
 }
 
-/// Prints the table. Returns a miss if one page takes more than its share.
+/// Prints the table. Returns a miss if one page exceeds its share.
 pub(crate) fn measure(program: &Path, length: Duration) -> Result<Vec<Miss>> {
     let link = Link::new()?;
     let directory = tempfile::tempdir().context("cannot create a directory")?;
@@ -120,7 +120,7 @@ impl Tab {
 
 impl Drop for Tab {
     fn drop(&mut self) {
-        // Ends the thread that reads.
+        // Ends the reading thread.
         let _ = self.stream.shutdown(Shutdown::Both);
     }
 }

@@ -1,4 +1,4 @@
-//! One measurement: a publisher, its subscriber, perhaps an observer, for a while.
+//! One measurement: a publisher, its subscriber and optionally an observer, for some time.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -13,12 +13,12 @@ use ros2probe_testing::harness::usage::{Memory, Usage, machine_idle, softirq_cpu
 
 /// Time for discovery to settle and caches to fill before the window opens.
 const WARM_UP: Duration = Duration::from_secs(3);
-/// Between two looks at the observer's memory.
+/// Interval of reading the observer's memory.
 const SAMPLING: Duration = Duration::from_secs(1);
-/// CPU times are told for this long.
+/// Length of time to which CPU times are scaled.
 pub(crate) const UNIT_SECONDS: f64 = 20.0;
 
-/// Who watches.
+/// The observer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Observer {
     Nobody,
@@ -34,25 +34,25 @@ pub(crate) struct Window {
     pub(crate) observer: Observer,
     /// CPU seconds of the whole machine, per 20 s.
     pub(crate) machine: f64,
-    /// Those of publisher, subscriber, observer and the kernel's packet threads.
+    /// CPU seconds of publisher, subscriber, observer and the kernel's packet threads, per 20 s.
     pub(crate) workload: f64,
     /// CPU seconds of the observer, per 20 s.
     pub(crate) cpu: f64,
-    /// The most memory of the observer seen in the window.
+    /// The observer's maximum memory in the window.
     pub(crate) memory: Memory,
     /// Samples written, from the publishers' first to their last.
     pub(crate) sent: u64,
-    /// What the agent says at the end.
+    /// The agent's counters at the end.
     pub(crate) agent_totals: Option<AgentTotals>,
 }
 
-/// The agent's numbers over its whole life, start included.
+/// The agent's counters over its whole life, startup included.
 pub(crate) struct AgentTotals {
     pub(crate) counted: f64,
     pub(crate) lost: f64,
-    /// Frames and records that the kernel dropped before the agent saw them.
+    /// Frames and records that the kernel dropped before the agent read them.
     pub(crate) dropped: f64,
-    /// Bytes copied to user space, of the bytes that crossed the link.
+    /// Bytes copied to user space, as a fraction of the bytes that crossed the link.
     pub(crate) copied: f64,
 }
 
@@ -64,8 +64,8 @@ impl Observer {
         Observer::Subscriber,
     ];
 
-    /// The agent's configuration, if it is the agent. With the host hook it sees both hosts, as it
-    /// does where all nodes live on one, and what else runs on the machine it does not see.
+    /// Returns the configuration if the observer is the agent. With the host hook it observes both
+    /// hosts, as if all nodes ran on one, but nothing else on the machine.
     fn configuration(self, link: &Link) -> Option<String> {
         let capture = match self {
             Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
@@ -216,7 +216,7 @@ impl Spent {
     }
 }
 
-/// Bytes that a host has put on its cable.
+/// Returns the bytes that a host has sent on its link.
 fn bytes_sent(host: &Namespace) -> Result<f64> {
     let counter = run(&format!(
         "ip netns exec {} cat /sys/class/net/{INTERFACE}/statistics/tx_bytes",

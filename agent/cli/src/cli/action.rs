@@ -47,7 +47,7 @@ struct List {
 
 #[derive(Args, Debug)]
 struct Info {
-    /// Name of the action, as /fibonacci
+    /// Name of the action, e.g. /fibonacci
     action_name: String,
     /// Also print the action's type
     #[arg(short = 't', long)]
@@ -61,7 +61,7 @@ struct Info {
 
 #[derive(Args, Debug)]
 struct Type {
-    /// Name of the action, as /fibonacci
+    /// Name of the action, e.g. /fibonacci
     action_name: String,
     #[command(flatten)]
     target: Target,
@@ -69,7 +69,7 @@ struct Type {
 
 #[derive(Args, Debug)]
 struct Find {
-    /// The type, as example_interfaces/action/Fibonacci
+    /// The type, e.g. example_interfaces/action/Fibonacci
     action_type: String,
     /// Only print the number of actions
     #[arg(short = 'c', long)]

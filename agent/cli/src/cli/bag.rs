@@ -28,15 +28,15 @@ pub(crate) struct Bag {
 enum Verb {
     /// Record messages into a bag
     Record(Box<Record>),
-    /// Make a bag of a capture
+    /// Convert a capture to a bag
     Convert(Box<Convert>),
     /// Print information about a bag
     Info(Info),
-    /// Make a bag whole again: files that were never finished, and metadata.yaml
+    /// Complete a bag: unfinished files and metadata.yaml
     #[command(after_help = "\
-Files that are complete stay as they are. One that was never finished is rewritten beside itself and
-replaced; bytes in it that are no whole record are kept in FILE.mcap.rest.
-Exit code: 0 when everything is in the bag, 1 otherwise.")]
+Complete files are not changed. An unfinished file is rewritten beside itself and replaced; bytes of
+an incomplete record are kept in FILE.mcap.rest.
+Exit code: 0 if everything is in the bag, 1 otherwise.")]
     Reindex(Reindex),
 }
 
@@ -56,7 +56,7 @@ struct Info {
     /// Sort topics, services and actions by this
     #[arg(long, value_enum, default_value_t)]
     sort: Sort,
-    /// Whose output is printed [default: ROS_DISTRO, else jazzy]
+    /// Distribution whose output to print [default: ROS_DISTRO, else jazzy]
     #[arg(long, value_parser = dialect::parser())]
     distro: Option<Dialect>,
 }

@@ -12,16 +12,17 @@ use super::record::Record;
 #[derive(Args, Debug)]
 #[command(
     after_help = "\
-The whole capture (`rp bag record --replay FILE --from T --until T` takes a part), at the speed of this
-machine: nothing is dropped. Messages have the times at which they were captured. What was never whole on the wire is not
-in the bag and is named at the end, and in the bag's metadata. No privilege and no agent is needed.
-Exit code: 0 when everything is in the bag; 3 when the bag is written and something is missing:
-fragments, messages before the announcement of their writer, unknown writers, topics that pass
-through memory, other domains, the end of a cut capture; 1 when there is nothing to read or to write.
+Converts the whole capture at the speed of this machine and drops nothing. For a part of a capture,
+use `rp bag record --replay FILE --from T --until T`. Messages keep their capture times. Messages that
+were incomplete on the wire are missing in the bag; they are reported at the end and in its metadata.
+Needs neither privileges nor an agent.
+Exit code: 0 if everything is in the bag; 3 if something is missing in it: fragments, messages before
+their writer's announcement, unknown writers, topics in memory, other domains, the end of a truncated
+capture; 1 if the capture cannot be read or the bag cannot be written.
 
 Examples:
   rp bag convert robot.pcap.gz drive                     every topic
-  rp bag convert robot.pcap drive /tf /tf_static         some
+  rp bag convert robot.pcap drive /tf /tf_static         some topics
   rp bag convert robot.pcap drive -e '^/camera/' --storage-preset-profile zstd_fast",
     mut_arg("output", |it| it.hide(true)),
     mut_arg("replay", |it| it.hide(true)),
@@ -36,7 +37,7 @@ Examples:
 pub(crate) struct Convert {
     /// The capture: pcap or pcapng, may be gzipped
     capture: PathBuf,
-    /// Directory to make
+    /// Directory to create
     bag: PathBuf,
     #[command(flatten)]
     record: Record,

@@ -3,8 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use ros2probe_model::discovery::hexadecimal;
-use ros2probe_wire::GuidPrefix;
+use ros2probe_daemon::discover::{GuidPrefix, participants};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -27,7 +26,7 @@ pub(crate) struct Discover {
     /// Ask this participant, by its GUID prefix: 24 hexadecimal digits
     #[arg(long, value_name = "PREFIX", value_parser = prefix, conflicts_with = "all")]
     pub(crate) participant: Option<GuidPrefix>,
-    /// Ask every participant that is heard
+    /// Ask every participant found
     #[arg(long)]
     pub(crate) all: bool,
     /// Print what would be sent, but send nothing
@@ -43,35 +42,13 @@ pub(crate) struct Discover {
     #[arg(long, value_name = "SECONDS", default_value_t = 10,
         value_parser = clap::value_parser!(u64).range(1..=120))]
     pub(crate) listen: u64,
-    /// Configuration file, for its `capture`; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    /// Configuration file, for its `capture` section [default: /etc/ros2probe/ros2probe.yaml, if it
+    /// exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
 }
 
 fn prefix(text: &str) -> Result<GuidPrefix, String> {
-    // The label `participant` goes on with the entity.
-    let text = text.strip_suffix(".000001c1").unwrap_or(text);
-    let prefix = hexadecimal(text).map(GuidPrefix);
+    let prefix = participants::prefix(text);
     prefix.ok_or_else(|| "must be 24 hexadecimal digits, as in ros2_participant_info".to_owned())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_participant_is_named_as_the_metrics_name_it() {
-        let digits = "010f1a2b3c4d5e6f00000000";
-        assert_eq!(prefix(digits).unwrap().to_string(), digits);
-        assert_eq!(prefix(&format!("{digits}.000001c1")), prefix(digits));
-        for wrong in [
-            "",
-            "010f",
-            "all",
-            &digits[1..],
-            &format!("{digits}.00000103"),
-        ] {
-            assert!(prefix(wrong).is_err(), "{wrong}");
-        }
-    }
 }

@@ -23,12 +23,12 @@ use ros2probe_daemon::agent::DEFAULT_CONFIG;
 It checks the kernel, privileges, interfaces, ROS variables and processes, buffers and the clock of
 this host, and asks the agent, if one is running, what it sees. It changes nothing. If no agent is
 running and privileges allow, it briefly loads the agent's kernel programs to test the kernel.
-Checks that this user may not do are `unknown`, with the command for them: mostly `sudo rp doctor`.
+Checks without the required permission are `unknown`, with the command to run: often `sudo rp doctor`.
 With --host it reports only on that agent and its graph, with --replay on the capture's graph.
 Without --domain it reports on every domain, whatever ROS_DOMAIN_ID is.
 Verdicts: ok, note (by choice, or good to know), unknown, warning (something will be missing or
 wrong), problem (broken). A line with `>` is the remedy: a command, or a line of the configuration.
-Exit codes: 0 no problem (warnings are none), 1 a problem, or no answer with --host, 2 wrong usage.
+Exit codes: 0 no problem (warnings allowed), 1 a problem, or no answer with --host, 2 wrong usage.
 
 Examples:
   sudo rp doctor                        all of it
@@ -42,7 +42,7 @@ pub(crate) struct Doctor {
     /// Also show the evidence of lines without a problem
     #[arg(short, long, conflicts_with = "json")]
     verbose: bool,
-    /// Configuration file of the agent; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    /// Configuration file of the agent [default: /etc/ros2probe/ros2probe.yaml, if it exists]
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     #[command(flatten)]

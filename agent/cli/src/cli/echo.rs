@@ -3,11 +3,13 @@
 use std::process::ExitCode;
 
 use anyhow::Result;
+use bytes::Bytes;
 use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::ros2::Refused;
 use ros2probe::ros2::echo::{self, FieldPath, Lost, mixed_offers};
 use ros2probe::ros2::name::full_name;
+use ros2probe_api::samples::Sample;
 use ros2probe_api::topics::Topic;
 use ros2probe_daemon::escape::visible_lines;
 use ros2probe_message::TypeName;
@@ -27,7 +29,7 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 --filter takes an expression over `m`, the message (or the field that --field selects): m.pose.x > 1.5,
 'error' in m.msg, len(m.ranges) == 0, 0 <= m.level < 3 and not m.done. It knows fields, [index],
 numbers, strings, comparisons, in, and, or, not, + - * / // % **, lists, abs, all, any, bool, float,
-int, len, max, min, str, sum, and of strings startswith, endswith, lower, upper.
+int, len, max, min, str, sum, and for strings startswith, endswith, lower, upper.
 
 rp does not subscribe, so it cannot request messages that were sent before.
 
@@ -36,9 +38,9 @@ Examples:
   rp topic echo /odom --field pose.pose.position --filter 'm.x > 10'
   rp topic echo /points --replay robot.pcap --no-arr")]
 pub(crate) struct Echo {
-    /// Name of the topic, as /chatter
+    /// Name of the topic, e.g. /chatter
     topic_name: String,
-    /// Type of its messages, as std_msgs/msg/String [default: the announced one]
+    /// Type of its messages, e.g. std_msgs/msg/String [default: the announced one]
     message_type: Option<String>,
     #[command(flatten)]
     printing: Printing,
@@ -57,7 +59,7 @@ pub(crate) struct Echo {
     /// Print one message, then end
     #[arg(long)]
     once: bool,
-    /// End after so many seconds
+    /// End after this many seconds
     #[arg(long, value_name = "SECONDS", value_parser = positive)]
     timeout: Option<f64>,
     /// Print times and sequence number before each message
@@ -86,7 +88,6 @@ pub(crate) struct Echo {
 impl Echo {
     pub(crate) fn ask(self) -> Result<ExitCode> {
         let options = self.options()?;
-        let raw = options.raw;
         let name = full_name(&self.topic_name).map_err(user_error)?;
         if self.lost_messages {
             eprintln!(
@@ -98,14 +99,14 @@ impl Echo {
             known.map_err(|_| UserError("The passed message type is invalid".to_owned()))?;
         }
         let domain_id = self.target.domain()?;
-        let mut types = Types::new(self.printing.library(&self.target));
+        let types = Types::new(self.printing.library(&self.target));
         let agent = Agent::reach_stream(&self.target)?;
         let mut output = Output::new();
 
         // What a capture has is known when it has been read.
         let is_waiting = self.target.replay.is_some();
         let known = topic(&agent, domain_id, &name)?;
-        let mut expected = match &known {
+        let expected = match &known {
             Some(known) => {
                 if !self.matching.any() {
                     output.write(&mixed_offers(&known.publishers))?;
@@ -117,7 +118,7 @@ impl Echo {
             }
             None => self.message_type.clone(),
         };
-        if let Some(expected) = expected.as_deref().filter(|_| !raw) {
+        if let Some(expected) = expected.as_deref().filter(|_| !options.raw) {
             let publishers = known.as_ref().map(|known| known.publishers.as_slice());
             let hash = publishers.and_then(|publishers| publishers.first()?.type_hash.as_deref());
             types.find(expected, hash)?;
@@ -125,73 +126,27 @@ impl Echo {
         if let Some(known) = &known {
             hint(&name, known, expected.as_deref());
         }
-
-        let mut echo = echo::Echo::new(options);
-        let mut lost = Lost::default();
-        let mut start = None;
-        let mut is_seen = false;
         let names = std::slice::from_ref(&name);
         let mut notes = Notes::begin(&agent, domain_id, is_waiting, names, NOT_ALL_PRINTED);
-        let went = follow(&agent, domain_id, names, &mut notes, |received, now| {
-            let start = *start.get_or_insert(now);
-            let mut text = String::new();
-            let mut is_enough = false;
-            match received {
-                StreamItem::Clock => {}
-                StreamItem::Missed(missed) => text = lost.missed(missed),
-                StreamItem::Message(sample, payload) => {
-                    if !is_seen
-                        && known.is_none()
-                        && self.message_type.is_none()
-                        && let Some(known) = topic(&agent, domain_id, &name)?
-                    {
-                        expected = self.expected(&known)?;
-                    }
-                    is_seen = true;
-                    let wanted = self.message_type.as_ref().or(expected.as_ref());
-                    if wanted.is_none_or(|wanted| *wanted == sample.message_type) {
-                        let message_type = if raw { None } else { types.of(sample) };
-                        let text = echo.message(sample, message_type.as_deref(), &payload);
-                        let text = text.map_err(user_error)?;
-                        eprint!("{}", visible_lines(&text.err));
-                        if let Some(message) = text.out {
-                            if self.clear {
-                                output.write(CLEAR)?;
-                            }
-                            output.write(&for_stdout(message))?;
-                            is_enough = self.once;
-                        }
-                    }
-                }
-            }
-            if !text.is_empty() && !self.no_lost_messages {
-                output.write(&text)?;
-            }
-            is_enough |= self
-                .timeout
-                .is_some_and(|timeout| elapsed(start, now) >= timeout);
-            Ok(if is_enough {
-                StreamStatus::Stopped
-            } else {
-                StreamStatus::Open
-            })
+        let mut printer = Printer {
+            command: &self,
+            agent: &agent,
+            domain_id,
+            name: &name,
+            is_raw: options.raw,
+            types,
+            echo: echo::Echo::new(options),
+            lost: Lost::default(),
+            output,
+            expected,
+            is_known: known.is_some(),
+            start: None,
+            is_seen: false,
+        };
+        let status = follow(&agent, domain_id, names, &mut notes, |item, now| {
+            printer.print(item, now)
         })?;
-        let is_over = matches!(
-            went,
-            StreamStatus::CaptureEnded | StreamStatus::CaptureTruncated
-        );
-        if is_over && !is_seen && known.is_none() && self.message_type.is_none() {
-            match topic(&agent, domain_id, &name)? {
-                Some(known) => drop(self.expected(&known)?),
-                None => return self.unknown(&agent, domain_id, &mut output),
-            }
-        }
-        if echo.unreadable() > 1 {
-            eprintln!("rp: {} messages could not be read", echo.unreadable());
-        }
-        Ok(ExitCode::from(u8::from(
-            went == StreamStatus::CaptureTruncated,
-        )))
+        printer.finish(status)
     }
 
     fn options(&self) -> Result<echo::Options> {
@@ -238,6 +193,107 @@ impl Echo {
         names_of(agent, domain_id)?;
         let text = "Could not determine the type for the passed topic";
         Err(UserError(text.to_owned()).into())
+    }
+}
+
+/// Prints the items of a stream.
+struct Printer<'a> {
+    command: &'a Echo,
+    agent: &'a Agent,
+    domain_id: u32,
+    name: &'a str,
+    is_raw: bool,
+    types: Types,
+    echo: echo::Echo,
+    lost: Lost,
+    output: Output,
+    /// The type to print messages by.
+    expected: Option<String>,
+    /// The topic was known before its first message.
+    is_known: bool,
+    /// Time of the first item.
+    start: Option<i64>,
+    is_seen: bool,
+}
+
+impl Printer<'_> {
+    fn print(&mut self, item: StreamItem<'_>, now: i64) -> Result<StreamStatus> {
+        let start = *self.start.get_or_insert(now);
+        let mut is_enough = false;
+        match item {
+            StreamItem::Clock => {}
+            StreamItem::Missed(missed) => {
+                let text = self.lost.missed(missed);
+                if !text.is_empty() && !self.command.no_lost_messages {
+                    self.output.write(&text)?;
+                }
+            }
+            StreamItem::Message(sample, payload) => {
+                is_enough = self.message(sample, &payload)? && self.command.once;
+            }
+        }
+        let timeout = self.command.timeout;
+        is_enough |= timeout.is_some_and(|timeout| elapsed(start, now) >= timeout);
+        Ok(if is_enough {
+            StreamStatus::Stopped
+        } else {
+            StreamStatus::Open
+        })
+    }
+
+    /// Prints a message of the expected type; whether it was printed.
+    fn message(&mut self, sample: &Sample, payload: &Bytes) -> Result<bool> {
+        if self.is_unknown()
+            && let Some(known) = topic(self.agent, self.domain_id, self.name)?
+        {
+            self.expected = self.command.expected(&known)?;
+        }
+        self.is_seen = true;
+        let wanted = self
+            .command
+            .message_type
+            .as_ref()
+            .or(self.expected.as_ref());
+        if wanted.is_some_and(|wanted| *wanted != sample.message_type) {
+            return Ok(false);
+        }
+        let message_type = if self.is_raw {
+            None
+        } else {
+            self.types.of(sample)
+        };
+        let text = self.echo.message(sample, message_type.as_deref(), payload);
+        let text = text.map_err(user_error)?;
+        eprint!("{}", visible_lines(&text.err));
+        let Some(message) = text.out else {
+            return Ok(false);
+        };
+        if self.command.clear {
+            self.output.write(CLEAR)?;
+        }
+        self.output.write(&for_stdout(message))?;
+        Ok(true)
+    }
+
+    /// Nothing tells the type of the topic yet.
+    const fn is_unknown(&self) -> bool {
+        !self.is_seen && !self.is_known && self.command.message_type.is_none()
+    }
+
+    fn finish(mut self, status: StreamStatus) -> Result<ExitCode> {
+        let is_truncated = status == StreamStatus::CaptureTruncated;
+        let is_over = is_truncated || status == StreamStatus::CaptureEnded;
+        if is_over && self.is_unknown() {
+            let command = self.command;
+            match topic(self.agent, self.domain_id, self.name)? {
+                Some(known) => drop(command.expected(&known)?),
+                None => return command.unknown(self.agent, self.domain_id, &mut self.output),
+            }
+        }
+        if self.echo.unreadable() > 1 {
+            eprintln!("rp: {} messages could not be read", self.echo.unreadable());
+        }
+        Ok(ExitCode::from(u8::from(is_truncated)))
     }
 }
 

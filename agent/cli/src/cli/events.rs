@@ -18,9 +18,9 @@ use super::{Output, UserError};
 /// `rp service echo`.
 #[derive(Args, Debug)]
 pub(crate) struct ServiceEcho {
-    /// Name of the service, as /add_two_ints
+    /// Name of the service, e.g. /add_two_ints
     service_name: String,
-    /// Its type, as example_interfaces/srv/AddTwoInts [default: the announced one]
+    /// Its type, e.g. example_interfaces/srv/AddTwoInts [default: the announced one]
     service_type: Option<String>,
     #[command(flatten)]
     printing: Printing,
@@ -35,9 +35,9 @@ pub(crate) struct ServiceEcho {
 /// `rp action echo`.
 #[derive(Args, Debug)]
 pub(crate) struct ActionEcho {
-    /// Name of the action, as /fibonacci
+    /// Name of the action, e.g. /fibonacci
     action_name: String,
-    /// Its type, as example_interfaces/action/Fibonacci [default: the announced one]
+    /// Its type, e.g. example_interfaces/action/Fibonacci [default: the announced one]
     action_type: Option<String>,
     /// Only these parts, separated by `|`: GOAL_SERVICE, CANCEL_SERVICE, RESULT_SERVICE,
     /// FEEDBACK_TOPIC, STATUS_TOPIC

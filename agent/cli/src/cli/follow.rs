@@ -49,8 +49,8 @@ pub(crate) struct Printing {
     /// Print sequences in YAML flow style
     #[arg(long)]
     flow_style: bool,
-    /// Directory that has definitions as package/msg/Type.msg; may be repeated. Looked at before
-    /// an installed ROS and the definitions that come with rp
+    /// Directory with definitions (package/msg/Type.msg); may be repeated. Searched before an
+    /// installed ROS and the embedded definitions
     #[arg(long, value_name = "DIR")]
     definitions: Vec<PathBuf>,
 }

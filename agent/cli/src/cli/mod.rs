@@ -48,9 +48,9 @@ pub(crate) enum Command {
     /// Run the agent: observe this host or a capture, serve /metrics
     Run(Run),
     /// Check a configuration file and report every mistake
-    #[command(after_help = "Exit code: 0 when it is good, 78 when it is not.")]
+    #[command(after_help = "Exit code: 0 if the file is valid, 78 otherwise.")]
     CheckConfig {
-        /// The file
+        /// Configuration file to check
         #[arg(default_value = DEFAULT_CONFIG)]
         file: PathBuf,
     },

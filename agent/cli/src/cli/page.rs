@@ -19,9 +19,9 @@ const OPENER: &str = "xdg-open";
 /// `rp page`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-The agent serves the page beside its API. The address that is printed holds a token behind the `#`,
-which browsers send to nobody; the page keeps it for its tab. Without the token the page shows what
-`api.loopback` grants. The agent gives tokens over its unix socket, or for its token file.
+The agent serves the page beside its API. The printed address contains a token behind the `#`, which
+browsers never send; the page keeps it in its tab. Without the token the page has the rights of
+`api.loopback`. The agent issues tokens over its unix socket, or to holders of its token file.
 
 With --host of another robot it prints the command that brings its page to this computer.
 

@@ -13,7 +13,7 @@ use ros2probe::ros2::name::full_name;
 use ros2probe::ros2::rates::{Arrival, End, Named, Origin, Quantity, Rates};
 use ros2probe::ros2::{Dialect, Refused};
 use ros2probe_api::path::encoded;
-use ros2probe_api::samples::{Line, MissedReason};
+use ros2probe_api::samples::{Line, MissedReason, Sample};
 
 use super::follow::{AGENT_ENDED, END_OF_CAPTURE, MessageFilter, library};
 use super::interrupt::INTERRUPTED;
@@ -161,113 +161,55 @@ fn measure(
     topics: Topics,
     target: &Target,
     hidden: bool,
-    mut sieve: Option<MessageFilter>,
+    sieve: Option<MessageFilter>,
 ) -> Result<ExitCode> {
     let dialect = target.dialect();
     let domain_id = target.domain()?;
-    let mut names = Vec::new();
-    let (mut rates, query) = if topics.all {
-        if !topics.names.is_empty() {
-            return Err(
-                UserError("Cannot specify both --all/-a and topic names".to_owned()).into(),
-            );
+    let names = topics.names(quantity, dialect)?;
+    let (mut rates, query) = match &names {
+        None => {
+            let query = format!("all=true&hidden={hidden}");
+            (Rates::of_all(quantity, dialect, window), query)
         }
-        let query = format!("all=true&hidden={hidden}");
-        (Rates::of_all(quantity, dialect, window), query)
-    } else {
-        if topics.names.is_empty() {
-            return Err(unnamed(quantity, dialect));
+        Some(named) => {
+            let query: Vec<String> = named.iter().map(|named| encoded(&named.name)).collect();
+            let query = format!("topic={}", query.join(","));
+            (Rates::of(quantity, dialect, window, named.clone()), query)
         }
-        let named = topics.names.into_iter().map(|typed| {
-            let name = full_name(&typed)?;
-            Ok(Named { typed, name })
-        });
-        let named: Vec<Named> = named.collect::<Result<_, Refused>>().map_err(user_error)?;
-        names = named.iter().map(|named| named.name.clone()).collect();
-        let query: Vec<String> = names.iter().map(|name| encoded(name)).collect();
-        let query = format!("topic={}", query.join(","));
-        (Rates::of(quantity, dialect, window, named), query)
     };
+    let names: Vec<String> = names
+        .into_iter()
+        .flatten()
+        .map(|named| named.name)
+        .collect();
     let agent = Agent::reach_stream(target)?;
     let is_replay = target.replay.is_some();
-    let mut notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
+    let notes = Notes::begin(&agent, domain_id, is_replay, &names, sampled(quantity));
     rates.sampled_reported(notes.sampled());
-    let mut code = ExitCode::SUCCESS;
     let payload = sieve.is_some();
     let path = format!("/samples?{query}&domain_id={domain_id}&payload={payload}");
     let mut lines = agent.stream(&path)?;
     let mut output = Output::new();
+    let mut measurement = Measurement {
+        agent: &agent,
+        domain_id,
+        rates,
+        notes,
+        sieve,
+        code: ExitCode::SUCCESS,
+    };
     while let Some(line) = lines.line()? {
         let line: Line = serde_json::from_slice(&line)?;
-        let over = match line {
-            Line::Open(open) => {
-                let topics = open.topics.into_iter();
-                let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
-                if present.is_empty() {
-                    names_of(&agent, domain_id)?;
-                }
-                rates.opened(&present)
-            }
-            Line::Sample(sample) => {
-                notes.received(&sample.topic, false);
-                let arrival = Arrival {
-                    time: sample.time_ns,
-                    size: sample.size,
-                    header_stamp: sample.header_stamp_ns,
-                };
-                let payload = match sample.payload_bytes {
-                    Some(length) => lines.bytes(usize::try_from(length)?)?,
-                    None => Bytes::new(),
-                };
-                let passes = match &mut sieve {
-                    Some(sieve) => sieve.passes(&sample, &payload)?,
-                    None => true,
-                };
-                let appeared = rates.appeared(&sample.topic, &[sample.message_type]);
-                appeared.and_then(|()| match passes {
-                    false => Ok(()),
-                    // Whether those that were not seen would pass is not known.
-                    true if sample.sampled && sieve.is_none() => {
-                        let origin = Origin {
-                            writer: &sample.writer,
-                            number: sample.sequence_number,
-                        };
-                        rates.sampled(&sample.topic, arrival, origin)
-                    }
-                    true => rates.arrived(&sample.topic, arrival),
-                })
-            }
-            Line::Clock(clock) => {
-                rates.clock(clock.time_ns);
-                notes.now()?;
-                Ok(())
-            }
-            Line::Missed(missed) => {
-                // Arrivals are counted without their bytes.
-                if matches!(
-                    missed.reason,
-                    MissedReason::QueueFull | MissedReason::Unannounced
-                ) {
-                    notes.missed(&missed);
-                }
-                Ok(())
-            }
-            Line::End(end) => {
-                rates.finish();
-                if end.reason == END_OF_CAPTURE {
-                    notes.end()?;
-                    Err(End::Idle)
-                } else if agent.outcome().is_some() {
-                    // The rest of the capture cannot be read, which stderr says.
-                    notes.end()?;
-                    code = ExitCode::FAILURE;
-                    Err(End::Idle)
-                } else {
-                    Err(End::Refused(Refused(format!("rp: {AGENT_ENDED}"))))
-                }
-            }
+        let length = match &line {
+            Line::Sample(sample) => sample.payload_bytes,
+            _ => None,
         };
-        let text = rates.take();
+        let payload = match length {
+            Some(length) => lines.bytes(usize::try_from(length)?)?,
+            None => Bytes::new(),
+        };
+        let over = measurement.line(line, &payload)?;
+        let text = measurement.rates.take();
         if !text.out.is_empty() {
             output.write(&text.out)?;
         }
@@ -278,7 +220,111 @@ fn measure(
             Err(End::Refused(refused)) => return Err(user_error(refused)),
         }
     }
-    Ok(code)
+    Ok(measurement.code)
+}
+
+/// A measurement that takes the lines of a stream.
+struct Measurement<'a> {
+    agent: &'a Agent,
+    domain_id: u32,
+    rates: Rates,
+    notes: Notes<'a>,
+    sieve: Option<MessageFilter>,
+    code: ExitCode,
+}
+
+impl Measurement<'_> {
+    /// Takes a line, and the payload of a sample; returns why the measurement ends, if it does.
+    fn line(&mut self, line: Line, payload: &Bytes) -> Result<Result<(), End>> {
+        Ok(match line {
+            Line::Open(open) => {
+                let topics = open.topics.into_iter();
+                let present: Vec<_> = topics.map(|topic| (topic.topic, topic.types)).collect();
+                if present.is_empty() {
+                    names_of(self.agent, self.domain_id)?;
+                }
+                self.rates.opened(&present)
+            }
+            Line::Sample(sample) => self.sample(&sample, payload)?,
+            Line::Clock(clock) => {
+                self.rates.clock(clock.time_ns);
+                self.notes.now()?;
+                Ok(())
+            }
+            Line::Missed(missed) => {
+                // Arrivals are counted without their bytes.
+                if matches!(
+                    missed.reason,
+                    MissedReason::QueueFull | MissedReason::Unannounced
+                ) {
+                    self.notes.missed(&missed);
+                }
+                Ok(())
+            }
+            Line::End(end) => {
+                self.rates.finish();
+                let is_truncated = end.reason != END_OF_CAPTURE;
+                if is_truncated && self.agent.outcome().is_none() {
+                    return Ok(Err(End::Refused(Refused(format!("rp: {AGENT_ENDED}")))));
+                }
+                self.notes.end()?;
+                if is_truncated {
+                    // The rest of the capture cannot be read, which stderr says.
+                    self.code = ExitCode::FAILURE;
+                }
+                Err(End::Idle)
+            }
+        })
+    }
+
+    fn sample(&mut self, sample: &Sample, payload: &Bytes) -> Result<Result<(), End>> {
+        self.notes.received(&sample.topic, false);
+        let arrival = Arrival {
+            time: sample.time_ns,
+            size: sample.size,
+            header_stamp: sample.header_stamp_ns,
+        };
+        let passes = match &mut self.sieve {
+            Some(sieve) => sieve.passes(sample, payload)?,
+            None => true,
+        };
+        let types = std::slice::from_ref(&sample.message_type);
+        let appeared = self.rates.appeared(&sample.topic, types);
+        Ok(appeared.and_then(|()| match passes {
+            false => Ok(()),
+            // Whether those that were not seen would pass is not known.
+            true if sample.sampled && self.sieve.is_none() => {
+                let origin = Origin {
+                    writer: &sample.writer,
+                    number: sample.sequence_number,
+                };
+                self.rates.sampled(&sample.topic, arrival, origin)
+            }
+            true => self.rates.arrived(&sample.topic, arrival),
+        }))
+    }
+}
+
+impl Topics {
+    /// The topics to measure; `None` = all.
+    fn names(self, quantity: Quantity, dialect: Dialect) -> Result<Option<Vec<Named>>> {
+        if self.all {
+            if !self.names.is_empty() {
+                let text = "Cannot specify both --all/-a and topic names";
+                return Err(UserError(text.to_owned()).into());
+            }
+            return Ok(None);
+        }
+        if self.names.is_empty() {
+            return Err(unnamed(quantity, dialect));
+        }
+        let named = self.names.into_iter().map(|typed| {
+            let name = full_name(&typed)?;
+            Ok(Named { typed, name })
+        });
+        let named: Result<_, Refused> = named.collect();
+        named.map(Some).map_err(user_error)
+    }
 }
 
 /// What being sampled means for this quantity.

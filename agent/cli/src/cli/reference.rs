@@ -17,7 +17,7 @@ Examples:
   rp completions zsh > /usr/local/share/zsh/site-functions/_rp
   rp completions fish > ~/.config/fish/completions/rp.fish")]
 pub(crate) struct Completions {
-    /// Whose
+    /// Shell
     #[arg(value_enum)]
     shell: Shell,
 }
@@ -29,8 +29,8 @@ Examples:
   rp man | man -l -
   rp man /usr/local/share/man/man1")]
 pub(crate) struct Manual {
-    /// Write a page for each command there, rp.1, rp-topic.1, rp-topic-list.1 and so on; when left
-    /// out, the page of `rp` itself goes to stdout
+    /// Directory for one page per command: rp.1, rp-topic.1, rp-topic-list.1, ... [default: print the
+    /// page of `rp` to stdout]
     #[arg(value_name = "DIR")]
     directory: Option<PathBuf>,
 }

@@ -4,13 +4,12 @@ use std::path::PathBuf;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use ros2probe_capture::pcap::Speed;
-use ros2probe_daemon::agent::{Listen, Options};
+use ros2probe_daemon::agent::{Listen, Options, Speed};
 use ros2probe_daemon::config::{Access, Watch};
 
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Signals: SIGHUP reads the configuration again, SIGTERM and SIGINT end the agent.
+Signals: SIGHUP reloads the configuration, SIGTERM and SIGINT end the agent.
 Exit codes: 0 ended on request, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
 RUST_LOG, read at the start, overrides the configured log level.
 
@@ -19,7 +18,7 @@ Examples:
   rp run --replay robot.pcap.gz --report          print the capture's metrics to stdout
   rp run --replay robot.pcap --watch '/camera/**' --metrics 127.0.0.1:9400")]
 pub(crate) struct Run {
-    /// Configuration file; when left out, /etc/ros2probe/ros2probe.yaml if there is one
+    /// Configuration file [default: /etc/ros2probe/ros2probe.yaml, if it exists]
     #[arg(long, value_name = "FILE")]
     pub(crate) config: Option<PathBuf>,
     /// Observe a capture (pcap or pcapng, may be gzipped) instead of this host; needs no privilege
@@ -41,8 +40,8 @@ pub(crate) struct Run {
     /// configured one
     #[arg(long, value_name = "ADDR|off", value_parser = listen)]
     pub(crate) api: Option<Listen>,
-    /// What loopback clients of the control API may do without a token, instead of the configured
-    /// level
+    /// Rights of loopback clients of the control API without a token, instead of the configured
+    /// ones
     #[arg(
         long,
         value_name = "LEVEL",

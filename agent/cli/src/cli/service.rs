@@ -55,7 +55,7 @@ struct List {
 
 #[derive(Args, Debug)]
 struct Type {
-    /// Name of the service, as /talker/list_parameters
+    /// Name of the service, e.g. /talker/list_parameters
     service_name: String,
     #[command(flatten)]
     target: Target,
@@ -63,7 +63,7 @@ struct Type {
 
 #[derive(Args, Debug)]
 struct Find {
-    /// The type, as rcl_interfaces/srv/ListParameters
+    /// The type, e.g. rcl_interfaces/srv/ListParameters
     service_type: String,
     /// Only print the number of services
     #[arg(short = 'c', long)]
@@ -77,7 +77,7 @@ struct Find {
 
 #[derive(Args, Debug)]
 struct Info {
-    /// Name of the service, as /talker/list_parameters
+    /// Name of the service, e.g. /talker/list_parameters
     service_name: String,
     #[command(flatten)]
     spinning: Spinning,

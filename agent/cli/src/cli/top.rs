@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::Args;
 use ros2probe::client::{Agent, Target};
 use ros2probe::top::{self, Column, Options};
-use ros2probe_capture::pcap::Speed;
+use ros2probe_daemon::agent::Speed;
 
 use super::{Output, UserError};
 
@@ -17,8 +17,8 @@ const MAX_INTERVAL: f64 = 3600.0;
 /// `rp top`.
 #[derive(Args, Debug)]
 #[command(after_help = "\
-Without --domain it shows all domains. Keys: press ? in it. NO_COLOR and the locale are honoured.
-Topics that are not watched are not measured: w has the selected one measured until rp top ends.
+Without --domain it shows all domains. Press ? for the keys. NO_COLOR and the locale are honoured.
+Topics that are not watched are not measured: press w to measure the selected one until rp top ends.
 
 Examples:
   rp top                                  the robot's topics, live

@@ -66,7 +66,7 @@ struct List {
 
 #[derive(Args, Debug)]
 struct Info {
-    /// Name of the topic, as /chatter
+    /// Name of the topic, e.g. /chatter
     topic_name: String,
     /// Also print each endpoint with its node, GID and QoS
     #[arg(short = 'v', long)]
@@ -79,7 +79,7 @@ struct Info {
 
 #[derive(Args, Debug)]
 struct Type {
-    /// Name of the topic, as /chatter
+    /// Name of the topic, e.g. /chatter
     topic_name: String,
     #[command(flatten)]
     spinning: Spinning,
@@ -89,7 +89,7 @@ struct Type {
 
 #[derive(Args, Debug)]
 struct Find {
-    /// The type, as std_msgs/msg/String
+    /// The type, e.g. std_msgs/msg/String
     topic_type: String,
     /// Only print the number of topics
     #[arg(short = 'c', long)]

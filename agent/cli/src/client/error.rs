@@ -5,8 +5,6 @@ use std::path::PathBuf;
 
 use ros2probe_api::problem::{Code, Problem, URN};
 
-use ros2probe_capture::pcap::PcapError;
-
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
@@ -18,8 +16,8 @@ pub enum ClientError {
     NoAgent,
     /// Somebody listens, but not for this user.
     #[error(
-        "the agent's socket {} may be used by root and the group ros2probe: \
-         `sudo usermod -aG ros2probe $USER`, then log in again", path.display()
+        "the agent's socket {} is accessible only to root and the group ros2probe: `sudo usermod \
+         -aG ros2probe $USER`, then log in again", path.display()
     )]
     Denied {
         /// The socket.
@@ -40,7 +38,7 @@ pub enum ClientError {
         place: String,
     },
     /// The connection ended within an answer.
-    #[error("the connection to the agent at {place} broke")]
+    #[error("the connection to the agent at {place} was lost")]
     Broke {
         /// Where.
         place: String,
@@ -106,7 +104,7 @@ pub enum ClientError {
         /// The file.
         path: PathBuf,
         /// Why not.
-        source: PcapError,
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// Not even a connection could be begun.
     #[error("cannot start the runtime of the connection")]

@@ -7,7 +7,6 @@
 
 mod error;
 mod lines;
-mod replay_agent;
 mod samples;
 mod target;
 mod transport;
@@ -26,13 +25,13 @@ use tokio::runtime::Runtime;
 use tokio::time::timeout;
 
 use ros2probe_api::problem::Code;
+use ros2probe_daemon::agent::Speed;
 use ros2probe_daemon::escape::visible;
+use ros2probe_daemon::replay_agent::Pace;
 
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
-pub use replay_agent::Outcome;
-use replay_agent::Stop;
-use ros2probe_capture::pcap::Speed;
+pub use ros2probe_daemon::replay_agent::Outcome;
 pub use samples::Samples;
 pub use target::{InvalidEnvironment, Target};
 use transport::Transport;
@@ -61,7 +60,7 @@ impl Agent {
     /// # Errors
     /// There is none, its token cannot be read, or the capture cannot.
     pub fn reach(target: &Target) -> Result<Self, ClientError> {
-        Self::find(target, Stop::AtEnd)
+        Self::find(target, Pace::Whole, false)
     }
 
     /// As [`Self::reach`], but a capture is replayed only to `--from`, else not at all, and goes on
@@ -70,7 +69,7 @@ impl Agent {
     /// # Errors
     /// As [`Self::reach`].
     pub fn reach_stream(target: &Target) -> Result<Self, ClientError> {
-        Self::find(target, Stop::AtBeginning)
+        Self::find(target, Pace::Pause, false)
     }
 
     /// As [`Self::reach`], but all topics of a capture are measured, and it goes on at `speed`, where
@@ -79,7 +78,7 @@ impl Agent {
     /// # Errors
     /// As [`Self::reach`].
     pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
-        Self::find(target, speed.map_or(Stop::AtEndMeasured, Stop::Never))
+        Self::find(target, speed.map_or(Pace::Whole, Pace::Live), true)
     }
 
     /// As [`Self::reach_stream`], but all topics of a capture are measured.
@@ -87,16 +86,16 @@ impl Agent {
     /// # Errors
     /// As [`Self::reach`].
     pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
-        Self::find(target, Stop::AtBeginningMeasured)
+        Self::find(target, Pace::Pause, true)
     }
 
-    fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
+    fn find(target: &Target, pace: Pace, measured: bool) -> Result<Self, ClientError> {
         let runtime = tokio::runtime::Builder::new_current_thread()
             .enable_all()
             .build()
             .map_err(|source| ClientError::Runtime { source })?;
         let token = target.token()?;
-        let transport = runtime.block_on(Transport::find(target, stop))?;
+        let transport = runtime.block_on(Transport::find(target, pace, measured))?;
         Ok(Self {
             runtime,
             transport,

@@ -1,31 +1,20 @@
 //! The messages of an agent's stream, with their bytes, as a subscription within the agent would
 //! give them.
 
-use std::collections::HashMap;
-use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use bytes::Bytes;
 
 use super::{Agent, ClientError, Lines, Next};
-use ros2probe_api::samples::{self, Line, Open};
-use ros2probe_daemon::subscriptions::line::announced;
-use ros2probe_daemon::subscriptions::{Item, Missed, MissedReason, NextItem, Topic};
-use ros2probe_model::discovery::hexadecimal;
-use ros2probe_model::dispatch::Sample;
-
-/// Writers that are remembered; of further ones each message makes its own description.
-const WRITERS: usize = 65_536;
+use ros2probe_api::samples::{Line, Open};
+use ros2probe_daemon::subscriptions::NextItem;
+use ros2probe_daemon::subscriptions::line_reader::LineReader;
 
 /// What an agent gives of topics, until it is dropped.
 #[derive(Debug)]
 pub struct Samples<'a> {
     lines: Lines<'a>,
-    topics: HashMap<(u32, String), Arc<Topic>>,
-    /// By writer, with what it announced.
-    writers: HashMap<String, Arc<Topic>>,
-    open: Open,
+    reader: LineReader,
 }
 
 impl<'a> Samples<'a> {
@@ -49,16 +38,14 @@ impl<'a> Samples<'a> {
         };
         Ok(Self {
             lines,
-            topics: HashMap::new(),
-            writers: HashMap::new(),
-            open,
+            reader: LineReader::new(open),
         })
     }
 
     /// What was there when it began.
     #[must_use]
     pub const fn opened(&self) -> &Open {
-        &self.open
+        self.reader.opened()
     }
 
     /// What comes next.
@@ -72,135 +59,15 @@ impl<'a> Samples<'a> {
             Next::Nothing => return Ok(NextItem::Pending),
             Next::End => return Ok(NextItem::Closed),
         };
-        Ok(match line {
-            Line::Open(_) => NextItem::Pending,
-            Line::Clock(clock) => NextItem::Item(Item::Clock(time(clock.time_ns))),
-            Line::End(_) => NextItem::Item(Item::End("the agent's stream ended")),
-            Line::Sample(facts) => {
-                let count = facts.payload_bytes.unwrap_or(0);
-                let count = usize::try_from(count).unwrap_or(usize::MAX);
-                let payload = self.lines.bytes(count)?;
-                let topic = self.writers_topic(&facts);
-                NextItem::Item(Item::Sample(Arc::new(sample(topic, &facts, payload))))
+        let payload = match &line {
+            Line::Sample(sample) => {
+                let count = sample.payload_bytes.unwrap_or(0);
+                self.lines
+                    .bytes(usize::try_from(count).unwrap_or(usize::MAX))?
             }
-            Line::Missed(facts) => {
-                let topic = self.topic(facts.domain_id, &facts.topic, None, None);
-                NextItem::Item(Item::Missed(Missed {
-                    topic,
-                    writer: guid(&facts.writer),
-                    first: facts.first_sequence_number,
-                    last: facts.last_sequence_number,
-                    samples: facts.samples,
-                    reason: match facts.reason {
-                        samples::MissedReason::Incomplete => MissedReason::Incomplete,
-                        samples::MissedReason::Lost => MissedReason::Lost,
-                        samples::MissedReason::Unannounced => MissedReason::Unannounced,
-                        samples::MissedReason::NotCaptured => MissedReason::NotCaptured,
-                        samples::MissedReason::QueueFull => MissedReason::QueueFull,
-                    },
-                }))
-            }
-        })
-    }
-
-    fn writers_topic(&mut self, facts: &samples::Sample) -> Arc<Topic> {
-        let known = self.writers.get(&facts.writer);
-        if let Some(known) = known.filter(|_| facts.offered.is_none()) {
-            return Arc::clone(known);
-        }
-        let message_type = Some(facts.message_type.as_str());
-        let offered = facts.offered.as_deref();
-        let topic = self.topic(facts.domain_id, &facts.topic, message_type, offered);
-        if self.writers.len() < WRITERS {
-            self.writers
-                .insert(facts.writer.clone(), Arc::clone(&topic));
-        }
-        topic
-    }
-
-    /// Without a type it is the one known from before.
-    fn topic(
-        &mut self,
-        domain_id: u32,
-        name: &str,
-        message_type: Option<&str>,
-        offered: Option<&samples::Offered>,
-    ) -> Arc<Topic> {
-        let key = (domain_id, name.to_owned());
-        let known = self.topics.get(&key);
-        let same = |known: &&Arc<Topic>| {
-            offered.is_none() && message_type.is_none_or(|it| it == &*known.message_type)
+            _ => Bytes::new(),
         };
-        if let Some(known) = known.filter(same) {
-            return Arc::clone(known);
-        }
-        let opened = || {
-            let mut topics = self.open.topics.iter();
-            let topic = topics.find(|topic| topic.domain_id == domain_id && topic.topic == name)?;
-            topic.types.first().map(String::as_str)
-        };
-        let message_type = message_type.or_else(opened).unwrap_or_default();
-        let topic = Arc::new(Topic {
-            domain_id: DomainId(domain_id),
-            name: name.into(),
-            dds_name: format!("rt{name}").into(),
-            message_type: message_type.into(),
-            offered: offered.map(|offered| Arc::new(announced(offered))),
-        });
-        self.topics.insert(key, Arc::clone(&topic));
-        topic
-    }
-}
-
-fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: bytes::Bytes) -> Sample {
-    Sample {
-        topic,
-        time: time(facts.time_ns),
-        writer: guid(&facts.writer),
-        sequence_number: facts.sequence_number,
-        source_timestamp: facts.source_timestamp_ns.map(time),
-        header_stamp: facts.header_stamp_ns.and_then(stamp),
-        size: facts.size,
-        sampled: facts.sampled,
-        payload: Some(payload),
-    }
-}
-
-fn time(nanoseconds: i64) -> Timestamp {
-    Timestamp(u64::try_from(nanoseconds).unwrap_or(0))
-}
-
-fn stamp(nanoseconds: i64) -> Option<(i32, u32)> {
-    let seconds = i32::try_from(nanoseconds.div_euclid(SECOND.cast_signed())).ok()?;
-    let rest = u32::try_from(nanoseconds.rem_euclid(SECOND.cast_signed())).ok()?;
-    Some((seconds, rest))
-}
-
-/// Unknown where it is written in some other way.
-fn guid(text: &str) -> Guid {
-    let parts = text.split_once('.').and_then(|(prefix, entity)| {
-        Some(Guid {
-            prefix: GuidPrefix(hexadecimal(prefix)?),
-            entity: EntityId(hexadecimal(entity)?),
-        })
-    });
-    parts.unwrap_or_default()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn writers_and_stamps_are_read_as_they_are_written() {
-        let writer = Guid {
-            prefix: GuidPrefix([1, 0x0f, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]),
-            entity: EntityId([0, 0, 0x12, 3]),
-        };
-        assert_eq!(guid(&writer.to_string()), writer);
-        assert_eq!(guid("hello"), Guid::default());
-        assert_eq!(stamp(1_500_000_000), Some((1, 500_000_000)));
-        assert_eq!(stamp(-1), Some((-1, 999_999_999)));
-        assert_eq!(stamp(i64::MAX), None);
+        let item = self.reader.item(&line, payload);
+        Ok(item.map_or(NextItem::Pending, NextItem::Item))
     }
 }

@@ -7,10 +7,9 @@ use clap::Args;
 
 use super::ClientError;
 use crate::ros2::{Dialect, dialect};
+use ros2probe_api::MAX_DOMAIN_ID;
 use ros2probe_daemon::run::CaptureTime;
 
-/// Highest domain there is.
-const MAX_DOMAIN: u32 = 232;
 /// A longer file is no token.
 const MAX_TOKEN: u64 = 4096;
 
@@ -18,10 +17,10 @@ const MAX_TOKEN: u64 = 4096;
 #[derive(Args, Clone, Debug, Default)]
 #[command(next_help_heading = "Which agent")]
 pub struct Target {
-    /// The agent on another host; its port is 17401 when left out
+    /// The agent on another host; the default port is 17401
     #[arg(long, value_name = "HOST[:PORT]", conflicts_with = "socket")]
     pub host: Option<String>,
-    /// File that holds the agent's token [default: $ROS2PROBE_TOKEN_FILE]
+    /// File with the agent's token [default: $ROS2PROBE_TOKEN_FILE]
     #[arg(long, value_name = "FILE")]
     pub token_file: Option<PathBuf>,
     /// The agent behind this unix socket [default: /run/ros2probe/api.sock, then loopback]
@@ -30,24 +29,24 @@ pub struct Target {
     /// Ask a capture (pcap or pcapng, may be gzipped) instead of an agent
     #[arg(long, value_name = "FILE", conflicts_with_all = ["host", "socket"])]
     pub replay: Option<PathBuf>,
-    /// Messages from this time of the capture on: Unix seconds, or +S from its beginning
+    /// Start at this time of the capture: Unix seconds, or +S from its beginning
     #[arg(long, value_name = "T", requires = "replay")]
     pub from: Option<CaptureTime>,
-    /// The capture up to this time
+    /// End at this time of the capture
     #[arg(long, value_name = "T", requires = "replay")]
     pub until: Option<CaptureTime>,
     /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
     #[arg(long = "domain", value_name = "N",
-        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN)))]
+        value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN_ID)))]
     pub domain_id: Option<u32>,
-    /// Whose output to print [default: $ROS_DISTRO, else jazzy]
+    /// Distribution whose output to print [default: $ROS_DISTRO, else jazzy]
     #[arg(long, value_name = "DISTRO", value_parser = dialect::parser(), hide_possible_values = true)]
     pub distro: Option<Dialect>,
 }
 
 /// The environment says what cannot be.
 #[derive(Debug, thiserror::Error)]
-#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN}")]
+#[error("ROS_DOMAIN_ID is `{0}`, must be a number up to {MAX_DOMAIN_ID}")]
 pub struct InvalidEnvironment(String);
 
 impl Target {
@@ -63,7 +62,7 @@ impl Target {
             Ok(text) if !text.trim().is_empty() => {
                 let domain_id = text.trim().parse().ok();
                 domain_id
-                    .filter(|domain_id| *domain_id <= MAX_DOMAIN)
+                    .filter(|domain_id| *domain_id <= MAX_DOMAIN_ID)
                     .ok_or(InvalidEnvironment(text))
             }
             _ => Ok(0),

@@ -16,8 +16,8 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 
-use super::replay_agent::{Outcome, ReplayAgent, Stop};
 use super::{ClientError, Target};
+use ros2probe_daemon::replay_agent::{Outcome, Pace, ReplayAgent, ReplayError, ReplayOptions};
 
 /// Where the package and the service manager put the agent's socket.
 const SOCKET: &str = "/run/ros2probe/api.sock";
@@ -41,9 +41,27 @@ pub(super) enum Transport {
 
 impl Transport {
     /// As `target` says; else by what there is on this host.
-    pub(super) async fn find(target: &Target, stop: Stop) -> Result<Self, ClientError> {
+    pub(super) async fn find(
+        target: &Target,
+        pace: Pace,
+        measured: bool,
+    ) -> Result<Self, ClientError> {
         if let Some(capture) = &target.replay {
-            let replayed = ReplayAgent::start(capture, target, stop).await?;
+            let options = ReplayOptions {
+                from: target.from,
+                until: target.until,
+                measured,
+                pace,
+            };
+            let report = |line: &str| eprintln!("rp: {line}");
+            let replayed = ReplayAgent::start(capture, options, report).await;
+            let replayed = replayed.map_err(|error| match error {
+                ReplayError::Capture(source) => ClientError::Capture {
+                    path: capture.clone(),
+                    source: source.into(),
+                },
+                ReplayError::Start(source) => ClientError::Runtime { source },
+            })?;
             return Ok(Self::ReplayAgent(Box::new(replayed)));
         }
         if let Some(host) = &target.host {

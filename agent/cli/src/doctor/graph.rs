@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
+use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
 
@@ -30,7 +31,7 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings.extend(restored(participants));
     findings.extend(unknown_writers(answers));
     findings.extend(secured(participants));
-    findings.extend(aside(answers));
+    findings.extend(off_the_network(answers));
     findings.extend(mismatches(&answers.topics.topics));
     findings
 }
@@ -185,100 +186,108 @@ fn secured(participants: &[Participant<'_>]) -> Option<Finding> {
 }
 
 /// Topics of which no pair of endpoints uses the network.
-fn aside(answers: &Answers) -> Vec<Finding> {
-    let able = |ability: &str| {
-        let mut abilities = answers.health.abilities.iter();
-        abilities.any(|each| each.able && each.ability == ability)
-    };
-    let of = |way: &str| -> Vec<&Topic<'_>> {
+fn off_the_network(answers: &Answers) -> Vec<Finding> {
+    let transports = [
+        shared_memory(&answers.health),
+        OffNetwork {
+            transport: "data_sharing",
+            severity: Severity::Warning,
+            words: ("use", "only Fast DDS data sharing and cannot be observed"),
+            remedy: Some(|finding| {
+                finding.elsewhere(
+                    "<data_sharing><kind>OFF</kind></data_sharing>    # Fast DDS's profile of the writer",
+                )
+            }),
+        },
+        OffNetwork {
+            transport: "iceoryx",
+            severity: Severity::Warning,
+            words: ("use", "only iceoryx and cannot be observed"),
+            remedy: Some(|finding| {
+                finding.elsewhere(
+                    "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI",
+                )
+            }),
+        },
+        OffNetwork {
+            transport: "same_process",
+            severity: Severity::Note,
+            words: ("stay", "inside one process and cannot be observed"),
+            remedy: None,
+        },
+    ];
+    let findings = transports.into_iter().filter_map(|each| {
         let topics = answers.topics.topics.iter();
-        topics
-            .filter(|topic| !topic.vanished && way_aside(topic) == Some(way))
-            .collect()
-    };
-    let mut findings = Vec::new();
-    let mut report = |check,
-                      severity,
-                      topics: &[&Topic<'_>],
-                      (verb, words): (&str, &str),
-                      remedy: Option<Helps>| {
+        let topics: Vec<&Topic<'_>> = topics
+            .filter(|topic| !topic.vanished && off_network(topic) == Some(each.transport))
+            .collect();
+        each.finding(&topics)
+    });
+    findings.collect()
+}
+
+/// What is reported of topics that use one transport aside from the network.
+struct OffNetwork {
+    transport: &'static str,
+    severity: Severity,
+    /// The verb in the plural, and the rest of the sentence.
+    words: (&'static str, &'static str),
+    remedy: Option<Helps>,
+}
+
+impl OffNetwork {
+    fn finding(self, topics: &[&Topic<'_>]) -> Option<Finding> {
         if topics.is_empty() {
-            return;
+            return None;
         }
+        let (verb, words) = self.words;
         let s = if topics.len() == 1 { "s" } else { "" };
         let sentence = format!(
             "{} {verb}{s} {words}: {}",
             many(topics.len(), "topic"),
             listed(topics)
         );
-        let finding = Finding::new(AREA, check, severity, sentence);
+        let finding = Finding::new(AREA, self.transport, self.severity, sentence);
         let finding = finding.seen(topics.len().to_string(), "GET /topics passages");
-        findings.push(match remedy {
+        Some(match self.remedy {
             Some(helps) => helps(finding),
             None => finding,
-        });
-    };
-    let shared = of("shared_memory");
-    if able("shared_memory_exact") {
-        let words = ("use", "only Fast DDS shared memory; every message is seen");
-        report("shared_memory", Severity::Ok, &shared, words, None);
-    } else if able("shared_memory") {
-        let words = ("use", "only Fast DDS shared memory, which is sampled");
-        report(
-            "shared_memory",
-            Severity::Note,
-            &shared,
-            words,
-            Some(|finding| {
-                finding.configure(
-                    "capture: {shm: {exact: uprobe}}    # every message; instruments the senders",
-                )
-            }),
-        );
-    } else {
-        let words = ("use", "only Fast DDS shared memory, which is not read");
-        report(
-            "shared_memory",
-            Severity::Warning,
-            &shared,
-            words,
-            Some(|finding| finding.configure("capture: {shm: {mode: auto}}")),
-        );
+        })
     }
-    report(
-        "data_sharing",
-        Severity::Warning,
-        &of("data_sharing"),
-        ("use", "only Fast DDS data sharing and cannot be observed"),
-        Some(|finding| {
-            finding.elsewhere(
-                "<data_sharing><kind>OFF</kind></data_sharing>    # Fast DDS's profile of the writer",
-            )
-        }),
-    );
-    report(
-        "iceoryx",
-        Severity::Warning,
-        &of("iceoryx"),
-        ("use", "only iceoryx and cannot be observed"),
-        Some(|finding| {
-            finding.elsewhere(
-                "<SharedMemory><Enable>false</Enable></SharedMemory>    # in CYCLONEDDS_URI",
-            )
-        }),
-    );
-    report(
-        "same_process",
-        Severity::Note,
-        &of("same_process"),
-        ("stay", "inside one process and cannot be observed"),
-        None,
-    );
-    findings
 }
 
-/// The way that most pairs use, where none uses the network.
-fn way_aside<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
+/// Shared memory of Fast DDS, as far as the agent reads it.
+fn shared_memory(health: &Health) -> OffNetwork {
+    let able = |ability: &str| {
+        let mut abilities = health.abilities.iter();
+        abilities.any(|each| each.able && each.ability == ability)
+    };
+    let (severity, words, remedy): (_, _, Option<Helps>) = if able("shared_memory_exact") {
+        let words = "only Fast DDS shared memory; every message is seen";
+        (Severity::Ok, words, None)
+    } else if able("shared_memory") {
+        let words = "only Fast DDS shared memory, which is sampled";
+        let remedy: Helps = |finding| {
+            finding.configure(
+                "capture: {shm: {exact: uprobe}}    # every message; instruments the senders",
+            )
+        };
+        (Severity::Note, words, Some(remedy))
+    } else {
+        let words = "only Fast DDS shared memory, which is not read";
+        let remedy: Helps = |finding| finding.configure("capture: {shm: {mode: auto}}");
+        (Severity::Warning, words, Some(remedy))
+    };
+    OffNetwork {
+        transport: "shared_memory",
+        severity,
+        words: ("use", words),
+        remedy,
+    }
+}
+
+/// The transport of most pairs, where none uses the network.
+fn off_network<'a>(topic: &'a Topic<'_>) -> Option<&'a str> {
     if topic
         .passages
         .iter()

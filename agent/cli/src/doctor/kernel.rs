@@ -1,9 +1,11 @@
 //! What the kernel has of what the agent can use: its version, its types, its compiler, control
 //! groups. What of the hooks really works is tried or asked for in `visibility`.
 
+use std::path::Path;
+
 use super::finding::{Area, Finding, Severity};
 use super::host_state::{HostState, Unread};
-use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
+use ros2probe_daemon::host_examination::CgroupHierarchy;
 
 const AREA: Area = Area::Kernel;
 const RELEASE: &str = "/proc/sys/kernel/osrelease";
@@ -148,31 +150,37 @@ fn lockdown(host: &HostState) -> Option<Finding> {
 fn control_groups(host: &HostState) -> Finding {
     let report = |severity, sentence: String| Finding::new(AREA, "cgroup", severity, sentence);
     let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
-    let Some(point) = topmost(&mounts) else {
-        let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
-            only, not sockets";
-        return report(Severity::Warning, sentence.to_owned())
-            .seen("no cgroup2", MOUNTS)
-            .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
-    };
-    let point = point.display().to_string();
-    match Cgroup::open(&host.files.path(&point)) {
-        Ok(group) if group.is_whole_host() => {
-            report(Severity::Ok, format!("cgroup v2 hierarchy of the whole host at {point}"))
+    let path = |point: &Path| host.files.path(&point.to_string_lossy());
+    let (finding, point) = match CgroupHierarchy::find(&mounts, path) {
+        CgroupHierarchy::NotMounted => {
+            let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
+                only, not sockets";
+            return report(Severity::Warning, sentence.to_owned())
+                .seen("no cgroup2", MOUNTS)
+                .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
         }
-        Ok(_) => report(
-            Severity::Note,
-            format!("{point} shows only part of the cgroup hierarchy: sockets of other \
-                containers are not visible"),
-        )
-        .elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"),
-        Err(CgroupError::Open { source, .. }) => report(
-            Severity::Unknown,
-            format!("the cgroup hierarchy at {point} cannot be opened: {source}"),
-        ),
-        Err(error) => report(Severity::Warning, error.to_string()),
-    }
-    .seen(point, MOUNTS)
+        CgroupHierarchy::WholeHost(point) => {
+            let at = point.display();
+            let sentence = format!("cgroup v2 hierarchy of the whole host at {at}");
+            (report(Severity::Ok, sentence), point)
+        }
+        CgroupHierarchy::Part(point) => {
+            let at = point.display();
+            let sentence = format!(
+                "{at} shows only part of the cgroup hierarchy: sockets of other containers are \
+                 not visible"
+            );
+            let note = report(Severity::Note, sentence);
+            (note.elsewhere("--cgroupns=host -v /sys/fs/cgroup:/sys/fs/cgroup:ro    # docker run; hostPath in Kubernetes"), point)
+        }
+        CgroupHierarchy::Unopened(point, reason) => {
+            let at = point.display();
+            let sentence = format!("the cgroup hierarchy at {at} cannot be opened: {reason}");
+            (report(Severity::Unknown, sentence), point)
+        }
+        CgroupHierarchy::Invalid(point, reason) => (report(Severity::Warning, reason), point),
+    };
+    finding.seen(point.display().to_string(), MOUNTS)
 }
 
 fn pages(host: &HostState) -> Finding {

@@ -28,8 +28,8 @@ use finding::Finding;
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
-use ros2probe_capture::error_chain::in_words;
 use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
+use ros2probe_daemon::host_examination::error_in_words;
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
 use variables::{Range, Variables};
@@ -121,7 +121,7 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     settings.shm.exact = ExactChoice::Off;
     match run::probe(&settings) {
         Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
-        Err(error) => visibility::failed(&in_words(&error)),
+        Err(error) => visibility::failed(&error_in_words(&error)),
     }
 }
 

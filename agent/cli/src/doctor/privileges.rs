@@ -115,7 +115,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
         return None;
     }
-    let missing = ros2probe_capture::uprobe::lacking(host.capabilities);
+    let missing = ros2probe_daemon::host_examination::exact_mode_lacks(host.capabilities);
     if missing.is_empty() {
         return None;
     }

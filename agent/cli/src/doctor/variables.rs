@@ -111,7 +111,7 @@ impl Variables {
             return Ok(0);
         };
         let number = text.trim().parse().ok();
-        let number = number.filter(|number| *number <= ros2probe_wire::DomainId::MAX.0);
+        let number = number.filter(|number| *number <= ros2probe_api::MAX_DOMAIN_ID);
         number.ok_or_else(|| self.shown("ROS_DOMAIN_ID").unwrap_or_default())
     }
 

@@ -1,6 +1,7 @@
 //! The lines on top: which robot, how its agent is, and above all what the agent does not see. It
 //! never looks healthy while the agent is blind.
 
+use ros2probe_api::health::Health;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
@@ -128,6 +129,21 @@ fn agent(app: &App) -> String {
     line
 }
 
+/// What was dropped, by kind.
+fn dropped(health: &Health) -> String {
+    let kinds = [
+        (health.dropped_packets, "packets"),
+        (health.dropped_records, "records"),
+        (health.dropped_datagrams, "datagrams"),
+        (health.contended_datagrams, "contended datagrams"),
+    ];
+    let kinds = kinds.iter().filter(|(count, _)| *count > 0);
+    let kinds: Vec<_> = kinds
+        .map(|(count, kind)| format!("{count} {kind}"))
+        .collect();
+    kinds.join(", ")
+}
+
 fn warnings(app: &App, now: Instant) -> Vec<Styled> {
     let mut warnings = Vec::new();
     let mut warn = |text: String| warnings.push((format!("! {text}"), Kind::Problem));
@@ -151,16 +167,6 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         warn(format!("the agent does not see the robot: {}", safe(why)));
     }
     if health.dropped() > 0 {
-        let what = [
-            (health.dropped_packets, "packets"),
-            (health.dropped_records, "records"),
-            (health.dropped_datagrams, "datagrams"),
-            (health.contended_datagrams, "contended datagrams"),
-        ];
-        let what = what.iter().filter(|(count, _)| *count > 0);
-        let what: Vec<_> = what
-            .map(|(count, what)| format!("{count} {what}"))
-            .collect();
         let when = if app.is_dropping(now) {
             "dropping now"
         } else {
@@ -168,7 +174,7 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         };
         warn(format!(
             "{when}: {}; counts are lower bounds",
-            what.join(", ")
+            dropped(health)
         ));
     }
     let unseen = app

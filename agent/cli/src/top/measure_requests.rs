@@ -8,14 +8,13 @@ use std::sync::mpsc::Sender;
 use std::thread;
 use std::time::Duration;
 
-use serde_json::{Value, json};
-
 use super::app::MeasuredBy;
 use super::poller::Request;
 use super::row::Key;
 use crate::client::{Agent, ClientError, Next};
 use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
+use ros2probe_api::watches::{Watch, WatchRequest};
 
 /// How often a connection looks whether it is still wanted.
 const POLL_INTERVAL: Duration = Duration::from_millis(200);
@@ -91,7 +90,7 @@ impl MeasureRequests {
         if !name.starts_with('/') {
             return format!("{name}: only topics with a ROS name can be watched by a client");
         }
-        match self.agent.post::<_, Value>(&path, &json!({})) {
+        match self.agent.post::<_, Watch>(&path, &WatchRequest::default()) {
             Ok(_) => {
                 let before = self.all.insert(key.clone(), MeasureRequest::Watch(path));
                 if let Some(MeasureRequest::Stream(stop)) = before {

@@ -8,11 +8,11 @@ use std::process::Stdio;
 use std::thread;
 
 use crate::installed;
-use ros2probe::message::yaml::Style;
-use ros2probe::message::{Library, Sources};
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::echo::{Echo, Options};
 use ros2probe_api::samples::Sample;
+use ros2probe_message::yaml::Style;
+use ros2probe_message::{Library, Sources};
 use serde::Deserialize;
 
 /// Processes of the oracle at a time.

@@ -23,7 +23,7 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 use ros2probe_testing::forged::{Carrier as _, Sender, Talker, path, talk};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape};

@@ -15,8 +15,8 @@ use std::sync::mpsc;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::agent_facts::{Ability, SourceKind};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
+use ros2probe_daemon::agent_facts::{Ability, SourceKind};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};

@@ -433,7 +433,7 @@ fn span(numbers: &BTreeSet<u64>) -> Result<u64> {
 /// The report in a bag's metadata.
 fn report_of(bag: &Path) -> Result<Value> {
     let text = fs::read_to_string(bag.join("metadata.yaml"))?;
-    let metadata = ros2probe::bag::metadata::Metadata::read(&text)?;
+    let metadata = ros2probe_bag::metadata::Metadata::read(&text)?;
     let report = metadata.custom_data.get("ros2probe");
     Ok(serde_json::from_str(report.context("no report")?)?)
 }

@@ -255,9 +255,9 @@ async function keys(tab) {
     await tab.heading(name);
     await until('the title', async () => (await tab.page.title()).startsWith(`${name} · `));
   }
-  // Pause closes the stream; the figures stand still and say so.
+  // Pause closes the stream; a notice explains that the figures are not updated.
   await tab.page.keyboard.press('p');
-  await tab.shows('Paused: the figures below stand still.', 'body');
+  await tab.shows('Paused: the figures below are not updated.', 'body');
   await tab.page.keyboard.press('p');
   await tab.live();
 }

@@ -1,6 +1,6 @@
-// What the Fast DDS and the Cyclone DDS test peer have in common: the command line, the event log,
-// the pacing and the model behind ros_discovery_info. It is the same interface as the roles `pub`
-// and `sub` of agent/cli/examples/robot. Nothing here knows a middleware.
+// Shared by the Fast DDS and the Cyclone DDS test peer: the command line, the event log, the pacing
+// and the content of ros_discovery_info. The interface equals that of the roles `pub` and `sub` of
+// agent/cli/examples/robot. Independent of the middleware.
 #pragma once
 
 #include <getopt.h>
@@ -31,8 +31,7 @@ constexpr size_t kPointCloudOverhead = 53;
 
 using Guid = std::array<uint8_t, 16>;
 
-// What a point cloud's data are filled with: every place can be told from its neighbours, and
-// every fragment from another.
+// Returns the byte at an offset of a point cloud's data: adjacent bytes differ, and so do fragments.
 inline uint8_t pattern(size_t place) {
   return static_cast<uint8_t>(place * 7 + (place >> 8) * 13 + (place >> 16));
 }
@@ -75,12 +74,12 @@ struct Options {
   std::string log;
   int peers = 1;
   bool hold = false;
-  // After so many samples, and so many more, a publisher holds again; 0 means never.
+  // Number of samples after which a publisher waits again, repeatedly; 0 means never.
   uint64_t stretch = 0;
   double linger = 1.0;
-  // Of each socket, as far as net.core.rmem_max goes: room for bursts of point cloud fragments.
+  // Receive buffer per socket, limited by net.core.rmem_max: for bursts of point cloud fragments.
   uint32_t receive_buffer = 4 << 20;
-  // Of Fast DDS: the transports that it has by itself, and the sharing of histories.
+  // Fast DDS: use its default transports, and share histories.
   bool default_transport = false;
   bool data_sharing = false;
 
@@ -157,7 +156,7 @@ struct Options {
 
   size_t data_size() const { return size - kPointCloudOverhead; }
 
-  // The first node owns the topic; each further one has a silent endpoint of its own.
+  // The first node owns the topic; each further one has its own silent endpoint.
   std::string topic_of(size_t node) const {
     return node == 0 ? topic : topic + "_" + std::to_string(node);
   }
@@ -165,7 +164,7 @@ struct Options {
 
 inline std::string dds_topic(const std::string& ros_topic) { return "rt" + ros_topic; }
 
-// One JSON object per line, flushed at once: a killed process leaves a whole log.
+// One JSON object per line, flushed at once: a killed process leaves a complete log.
 class Log {
  public:
   Log(const Options& options, const char* stack) {
@@ -195,7 +194,7 @@ class Log {
          unix_ns(), seq, length, stamp);
   }
 
-  // With the writer's sequence number, where the middleware tells it.
+  // Logs the writer's sequence number if the middleware exposes it.
   void received(uint64_t seq, int64_t sn, size_t length, int64_t stamp) {
     line("{\"ev\":\"sub\",\"t\":%" PRId64 ",\"seq\":%" PRIu64 ",\"sn\":%" PRId64 ",\"len\":%zu,\"stamp_ns\":%" PRId64 "}\n",
          unix_ns(), seq, sn, length, stamp);
@@ -264,7 +263,7 @@ inline void wait_for_start(const Options& options, const std::function<int()>& m
   }
 }
 
-// Calls `write(sequence, stamp)` at the rate asked for, against absolute deadlines.
+// Calls `write(sequence, stamp)` at the requested rate, with absolute deadlines.
 inline void send_all(const Options& options, Log& log,
                      const std::function<bool(uint64_t, int64_t)>& write) {
   int64_t start = unix_ns();

@@ -7,7 +7,7 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use crate::rp;
+use crate::{read_as, rp};
 use flate2::read::MultiGzDecoder;
 use ros2probe_api::Open;
 use ros2probe_api::attributes;
@@ -27,8 +27,6 @@ use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::truth::{self, GraphLine, Scenario};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
-use serde::Serialize;
-use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 /// What a node believes is what was announced half a second ago.
@@ -400,13 +398,6 @@ fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
         .lines()
         .filter(|line| line.starts_with("ros2_qos_incompatible_pairs{"));
     assert_eq!(others.count(), 1);
-}
-
-/// Asserts that an answer reads as `T`, which writes the same again.
-fn read_as<T: DeserializeOwned + Serialize>(answer: &Value) -> T {
-    let typed: T = serde_json::from_value(answer.clone()).unwrap();
-    assert_eq!(serde_json::to_value(&typed).unwrap(), *answer);
-    typed
 }
 
 #[test]

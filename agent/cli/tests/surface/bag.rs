@@ -6,7 +6,7 @@ mod real;
 use std::fs;
 use std::path::Path;
 
-use ros2probe::bag::metadata::Metadata;
+use ros2probe_bag::metadata::Metadata;
 
 fn metadata(directory: &Path) -> Metadata {
     let text = fs::read_to_string(directory.join("metadata.yaml")).unwrap();

@@ -9,11 +9,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::rp;
-use ros2probe::agent_facts::{AgentFacts, SourceKind};
-use ros2probe::config::{Watch, Watchlist};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::surface::{Exposition, Format, MetricSources};
+use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
+use ros2probe_daemon::config::{Watch, Watchlist};
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -117,9 +117,9 @@ impl World {
     }
 
     fn page(&self) -> String {
-        let settings = ros2probe::settings_cell::Settings {
+        let settings = ros2probe_daemon::settings_cell::Settings {
             watches: vec![Arc::new(watch())],
-            ..ros2probe::settings_cell::Settings::default()
+            ..ros2probe_daemon::settings_cell::Settings::default()
         };
         let sources = MetricSources::new(SourceKind::Wire, settings);
         let agent = AgentFacts::new(SourceKind::Wire, Instant::now());

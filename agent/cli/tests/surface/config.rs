@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ros2probe::config::{Config, Limits};
+use ros2probe_daemon::config::{Config, Limits};
 use serde_json::Value;
 
 fn shipped(name: &str) -> String {

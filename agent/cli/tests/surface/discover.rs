@@ -6,11 +6,11 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::Path;
 
 use proptest::prelude::*;
-use ros2probe::discover::Refusal;
-use ros2probe::discover::message::{LocalParticipant, Message};
-use ros2probe::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
-use ros2probe::model::discovery::{Addresses, hexadecimal};
-use ros2probe::model::snapshot::{ParticipantFacts, ProcessFacts};
+use ros2probe_daemon::discover::Refusal;
+use ros2probe_daemon::discover::message::{LocalParticipant, Message};
+use ros2probe_daemon::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe_model::discovery::{Addresses, hexadecimal};
+use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::MILLISECOND;

@@ -346,7 +346,7 @@ fn loopback_gives_what_is_configured_and_the_socket_everything() {
 
 #[test]
 fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() {
-    use ros2probe::config::{Access, Config};
+    use ros2probe_daemon::config::{Access, Config};
     assert_eq!(Config::default().api.loopback, Access::Watch);
     let mut agent = LocalAgent::start(&mut rp(), &["--api-loopback", "watch"]);
     agent.wait_for_log("ready");

@@ -13,16 +13,16 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use crate::rp;
-use ros2probe::agent_facts::{AgentFacts, SourceKind};
-use ros2probe::config::{Limit, Limits, Watch, Watchlist};
-use ros2probe::model::dispatch::{Dispatch, Sample, SampleOutcome};
-use ros2probe::model::input::Input;
-use ros2probe::model::observer::{Observer, Settings};
-use ros2probe::model::snapshot::Snapshot;
-use ros2probe::subscriptions::{
+use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
+use ros2probe_daemon::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe_daemon::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
-use ros2probe::surface::MetricSources;
+use ros2probe_daemon::surface::MetricSources;
+use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
@@ -34,9 +34,9 @@ const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// How a cap stands: how much of it is used, how often it was reached.
 fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
-    let settings = ros2probe::settings_cell::Settings {
+    let settings = ros2probe_daemon::settings_cell::Settings {
         limits,
-        ..ros2probe::settings_cell::Settings::default()
+        ..ros2probe_daemon::settings_cell::Settings::default()
     };
     let sources = MetricSources::new(SourceKind::Wire, settings);
     let state = sources

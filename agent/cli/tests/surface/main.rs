@@ -9,6 +9,7 @@
 )]
 
 mod api;
+mod api_types;
 mod api_views;
 mod bag;
 mod caps;
@@ -36,7 +37,18 @@ mod web_config;
 
 use std::process::Command;
 
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
 /// `rp` of this build, with an environment that does not leak into it.
 fn rp() -> Command {
     ros2probe_testing::local_agent::rp(env!("CARGO_BIN_EXE_rp"))
+}
+
+/// Asserts that an answer of the API reads as `T`, which writes the same again.
+fn read_as<T: DeserializeOwned + Serialize>(answer: &Value) -> T {
+    let typed: T = serde_json::from_value(answer.clone()).unwrap();
+    assert_eq!(serde_json::to_value(&typed).unwrap(), *answer);
+    typed
 }

@@ -6,19 +6,19 @@ use std::net::Ipv4Addr;
 use std::path::Path;
 use std::sync::Arc;
 
-use ros2probe::agent_facts::{Ability, AgentFacts, SourceKind};
-use ros2probe::config::{Expectations, Watch};
-use ros2probe::config::{Limits, limits_markdown};
-use ros2probe::events;
-use ros2probe::model::snapshot::{
+use ros2probe_daemon::agent_facts::{Ability, AgentFacts, SourceKind};
+use ros2probe_daemon::config::{Expectations, Watch};
+use ros2probe_daemon::config::{Limits, limits_markdown};
+use ros2probe_daemon::events;
+use ros2probe_daemon::recording::SnapshotFigures;
+use ros2probe_daemon::settings_cell::Settings;
+use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, markdown};
+use ros2probe_daemon::surface::otlp::Signal;
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
-use ros2probe::model::topic_kind::TopicKind;
-use ros2probe::recording::SnapshotFigures;
-use ros2probe::settings_cell::Settings;
-use ros2probe::surface::catalogue::{CATALOGUE, Kind, markdown};
-use ros2probe::surface::otlp::Signal;
-use ros2probe::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_testing::local_agent::promtool;
 use ros2probe_testing::sample_robot;
 

@@ -6,7 +6,7 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::rp;
-use ros2probe::surface::catalogue::{CATALOGUE, Kind};
+use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 

@@ -16,7 +16,7 @@ use ros2probe_testing::local_agent::{Answer, LocalAgent, PATIENCE, ask, exchange
 use serde_json::{Value, json};
 
 /// A capture of `agent/testing/data`.
-fn data(name: &str) -> PathBuf {
+pub(crate) fn data(name: &str) -> PathBuf {
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
     data.join(name).join("capture.pcap.gz")
 }
@@ -44,12 +44,12 @@ fn code(answer: &Answer) -> String {
 }
 
 /// A stream of lines. HTTP/1.0: nothing stands between them.
-struct Lines {
+pub(crate) struct Lines {
     reader: BufReader<TcpStream>,
 }
 
 impl Lines {
-    fn open(api: SocketAddr, path: &str, headers: &str) -> Result<Self, Answer> {
+    pub(crate) fn open(api: SocketAddr, path: &str, headers: &str) -> Result<Self, Answer> {
         let mut stream = TcpStream::connect(api).unwrap();
         stream.set_read_timeout(Some(PATIENCE)).unwrap();
         let request = format!("GET {path} HTTP/1.0\r\nHost: {api}\r\n{headers}\r\n");
@@ -78,7 +78,7 @@ impl Lines {
     }
 
     /// The next line: its one member's name and value; `None` at the end.
-    fn next(&mut self) -> Option<(String, Value)> {
+    pub(crate) fn next(&mut self) -> Option<(String, Value)> {
         let mut line = String::new();
         if self.reader.read_line(&mut line).unwrap() == 0 {
             return None;
@@ -91,7 +91,7 @@ impl Lines {
     }
 
     /// Lines up to the next one of figures.
-    fn batch(&mut self) -> Vec<(String, Value)> {
+    pub(crate) fn batch(&mut self) -> Vec<(String, Value)> {
         let mut lines = Vec::new();
         loop {
             let line = self.next().unwrap();

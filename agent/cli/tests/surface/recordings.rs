@@ -354,7 +354,7 @@ fn converted(capture: &Path, bag: &Path, options: &[&str]) -> (Option<i32>, Stri
     assert!(output.stdout.is_empty(), "{output:?}");
     let said = String::from_utf8(output.stderr).unwrap();
     let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap_or_default();
-    let metadata = ros2probe::bag::metadata::Metadata::read(&metadata).ok();
+    let metadata = ros2probe_bag::metadata::Metadata::read(&metadata).ok();
     let report = metadata.and_then(|mut metadata| metadata.custom_data.remove("ros2probe"));
     let report = report.map(|report| serde_json::from_str(&report).unwrap());
     (output.status.code(), said, report.unwrap_or_default())

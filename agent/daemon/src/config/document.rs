@@ -108,30 +108,9 @@ impl Node {
                 _ => None,
             };
             let Some(node) = done else { continue };
-            match open.last_mut() {
-                None => root = Some(node),
-                Some(Open::List(_, items)) => items.push(node),
-                Some(Open::Map(_, entries, key)) => match (key.take(), node.content) {
-                    (Some(key), content) => {
-                        entries.push((
-                            key,
-                            Self {
-                                position: node.position,
-                                content,
-                            },
-                        ));
-                    }
-                    (None, Content::Scalar { text: name, .. }) => {
-                        *key = Some(Key {
-                            name,
-                            position: node.position,
-                        });
-                    }
-                    (None, _) => {
-                        mistakes.add(node.position, "", "a key must be plain text");
-                        break;
-                    }
-                },
+            if let Err(position) = node.put(&mut open, &mut root) {
+                mistakes.add(position, "", "a key must be plain text");
+                break;
             }
         }
         let empty = || Self {
@@ -142,6 +121,29 @@ impl Node {
             },
         };
         mistakes.none_or(root.unwrap_or_else(empty))
+    }
+
+    /// Puts a complete value into the innermost open container.
+    ///
+    /// # Errors
+    /// Returns its position if it is the key of a map and no scalar.
+    fn put(self, open: &mut [Open], root: &mut Option<Self>) -> Result<(), Position> {
+        match open.last_mut() {
+            None => *root = Some(self),
+            Some(Open::List(_, items)) => items.push(self),
+            Some(Open::Map(_, entries, key)) => match (key.take(), self.content) {
+                (Some(key), content) => {
+                    let position = self.position;
+                    entries.push((key, Self { position, content }));
+                }
+                (None, Content::Scalar { text: name, .. }) => {
+                    let position = self.position;
+                    *key = Some(Key { name, position });
+                }
+                (None, _) => return Err(self.position),
+            },
+        }
+        Ok(())
     }
 
     /// Nothing but comments.

@@ -9,7 +9,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Deserialize;
 use serde_json::{Map, Value, json};
 
-/// The section as it is written: keys and numbers, which the schema has checked.
+/// The section in the file: keys and numbers, validated by the schema.
 #[derive(Debug, Default, Deserialize)]
 #[serde(transparent)]
 pub(super) struct LimitsShape(BTreeMap<String, usize>);
@@ -43,7 +43,7 @@ impl JsonSchema for LimitsShape {
                 ..
             } = limit.row();
             let schema = json!({
-                "description": format!("{what}. When there are that many, {reached}."),
+                "description": format!("{what}. At the cap, {reached}."),
                 "type": "integer",
                 "format": "uint",
                 "minimum": minimum,
@@ -64,10 +64,10 @@ impl JsonSchema for LimitsShape {
     }
 }
 
-/// The caps of the configuration as a Markdown table, for `docs/limits.md`.
+/// Returns the caps of the configuration as a Markdown table, for `docs/limits.md`.
 #[must_use]
 pub fn markdown() -> String {
-    let mut table = "| `limits.` | default | what | at the cap | told in detail by |\n\
+    let mut table = "| `limits.` | default | counts | at the cap | metric |\n\
                      | --- | --- | --- | --- | --- |\n"
         .to_owned();
     for limit in Limit::ALL {
@@ -76,17 +76,17 @@ pub fn markdown() -> String {
             default,
             what,
             reached,
-            told_by,
+            metric,
             ..
         } = limit.row();
-        let told_by = match told_by {
+        let metric = match metric {
             "" => String::new(),
-            told_by => format!("`{told_by}`"),
+            metric => format!("`{metric}`"),
         };
         // Writing to a string cannot fail.
         let _ = writeln!(
             table,
-            "| `{key}` | {default} | {what} | {reached} | {told_by} |"
+            "| `{key}` | {default} | {what} | {reached} | {metric} |"
         );
     }
     table

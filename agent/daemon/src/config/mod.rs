@@ -1,4 +1,5 @@
-//! The configuration: YAML shape first, then meaning; all mistakes reported with their place.
+//! The configuration: first the YAML shape, then its meaning; all mistakes are reported with their
+//! position.
 //!
 //! Nothing is bound, opened or read from the environment here.
 
@@ -31,41 +32,41 @@ pub use ros2probe_model::watch::{
     check_pattern,
 };
 
-/// A larger file is no configuration.
+/// Largest file accepted, in bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Everything the agent is told, checked.
+/// The checked configuration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Config {
-    /// What to measure, in file order.
+    /// Topics to measure, in file order.
     pub watches: Vec<Watch>,
     /// Caps of the agent's tables.
     pub limits: Limits,
-    /// Where packets come from.
+    /// Sources of packets.
     pub capture: CaptureSettings,
     /// The metrics surface.
     pub metrics: MetricsSettings,
     /// The control API.
     pub api: ApiSettings,
-    /// How long figures of measured topics are kept for charts; zero = not at all.
+    /// Time for which figures of measured topics are kept for charts; zero = none.
     pub history: Duration,
-    /// What is pushed to an OpenTelemetry receiver.
+    /// Exports to an OpenTelemetry receiver.
     pub otlp: OtlpSettings,
-    /// What the agent records.
+    /// Recordings of the agent.
     pub recordings: RecordingSettings,
-    /// How long a topic without endpoints is still reported.
+    /// Time for which a topic without endpoints is still reported.
     pub topic_grace: Duration,
-    /// Where what discovery knows is kept for the next start.
+    /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Least severe level that is logged.
     pub log: Level,
 }
 
-/// How far a client of the control API may go; each level has those before it.
+/// Rights of a client of the control API; each level includes those before it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Access {
-    /// Graph, figures, events, and which topics are watched.
+    /// Read the graph, figures, events, and the watched topics.
     Read,
     /// Also add and remove watches, and follow messages without their bytes.
     #[default]
@@ -96,88 +97,87 @@ impl std::fmt::Display for Access {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum PageChoice {
-    /// To browsers, beside the API.
+    /// Serve the page beside the API.
     #[default]
     On,
-    /// Not at all.
+    /// Do not serve it.
     Off,
 }
 
-/// Where state is kept.
+/// Directory of the saved state.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum StateChoice {
-    /// Where the service manager says (`$STATE_DIRECTORY`), else the default place if it can be
-    /// used.
+    /// The service manager's directory (`$STATE_DIRECTORY`), else the default one if it is usable.
     #[default]
     Auto,
-    /// Nowhere.
+    /// No state is saved.
     Off,
-    /// Here.
+    /// This directory.
     At(PathBuf),
 }
 
-/// The metrics surface.
+/// The metrics listener and its content.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MetricsSettings {
-    /// Where to listen; `None` = nowhere.
+    /// Address to listen on; `None` = off.
     pub listen: Option<SocketAddr>,
-    /// Histograms of watched topics.
+    /// Whether watched topics have histograms.
     pub histograms: bool,
-    /// Series per writer.
+    /// Whether watched topics have series per writer.
     pub per_writer: bool,
-    /// Says who may scrape and how it is encrypted.
+    /// File with permitted users and TLS settings.
     pub web_config: Option<PathBuf>,
 }
 
 /// The control API.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ApiSettings {
-    /// Where to listen; `None` = nowhere.
+    /// Address to listen on; `None` = off.
     pub listen: Option<SocketAddr>,
-    /// Which unix socket to listen on besides.
+    /// Additional unix socket.
     pub socket: SocketChoice,
-    /// What loopback clients without a token may do.
+    /// Rights of loopback clients without a token.
     pub loopback: Access,
-    /// Holds the bearer token that clients on the network address must send.
+    /// File with the bearer token that clients on the network address must send.
     pub token_file: Option<PathBuf>,
     /// Whether the page is served at `listen`.
     pub page: PageChoice,
 }
 
-/// Which unix socket.
+/// Unix socket of the control API.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum SocketChoice {
-    /// Where the service manager says (`$RUNTIME_DIRECTORY`), else the default place if its
-    /// directory is there.
+    /// In the service manager's directory (`$RUNTIME_DIRECTORY`), else in the default one if it
+    /// exists.
     #[default]
     Auto,
-    /// None.
+    /// No socket.
     Off,
-    /// This one.
+    /// At this path.
     At(PathBuf),
 }
 
-/// What the agent records into bags.
+/// Recordings of the agent.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct RecordingSettings {
-    /// Where bags are written.
+    /// Directory of the bags.
     pub directory: StateChoice,
-    /// The last seconds of topics, kept in memory.
+    /// Topics whose last seconds are kept in memory.
     pub snapshots: Vec<SnapshotSettings>,
-    /// What bags may take of the disk.
+    /// Limits of disk usage.
     pub limits: RecordingLimits,
 }
 
-/// What bags may take of the disk.
+/// Limits of the bags' disk usage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RecordingLimits {
-    /// Bytes of each; `None` = any.
+    /// Bytes per bag; `None` = no limit.
     pub max_bytes: Option<u64>,
-    /// Bytes of all in the directory; `None` = any.
+    /// Bytes of all bags in the directory; `None` = no limit.
     pub max_total_bytes: Option<u64>,
-    /// Of the file system stays free: the larger one of these percent and those bytes.
+    /// Percent of the file system that stays free; `reserve_bytes` applies if it is larger.
     pub reserve_percent: u8,
-    /// Likewise.
+    /// Bytes of the file system that stay free.
     pub reserve_bytes: u64,
 }
 
@@ -193,7 +193,7 @@ impl Default for RecordingLimits {
 }
 
 impl RecordingSettings {
-    /// Bags go into the state directory, wherever that is.
+    /// Returns settings with the bags in the state directory.
     #[must_use]
     pub fn is_in(&self, state: &StateChoice) -> bool {
         self.directory == StateChoice::Auto && *state != StateChoice::Off
@@ -203,32 +203,32 @@ impl RecordingSettings {
 /// The last seconds of some topics.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SnapshotSettings {
-    /// Names its bags.
+    /// Prefix of its bags' names.
     pub name: String,
-    /// Names and globs.
+    /// Names and globs of topics.
     pub topics: Vec<String>,
-    /// Their domain.
+    /// Domain of the topics.
     pub domain_id: u32,
-    /// Nothing older is kept.
+    /// Time span to keep.
     pub span: Duration,
-    /// Nor more bytes.
+    /// Maximum memory in bytes.
     pub max_bytes: usize,
-    /// Written when an expectation is violated.
+    /// Whether it is written when an expectation is violated.
     pub on_violation: bool,
 }
 
-/// What is pushed to an OpenTelemetry receiver; `None` = the standard variable decides, or a default.
+/// Exports to an OpenTelemetry receiver; `None` = the standard variable, or a default.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct OtlpSettings {
-    /// Where to.
+    /// Address of the receiver.
     pub endpoint: Endpoint,
-    /// How often metrics are.
+    /// Interval between exports of metrics.
     pub interval: Option<Duration>,
-    /// How long an answer may take.
+    /// Timeout for an answer.
     pub timeout: Option<Duration>,
-    /// Sent with each request.
+    /// Headers of each request.
     pub headers: BTreeMap<String, String>,
-    /// A file with further ones.
+    /// File with further headers.
     pub headers_file: Option<PathBuf>,
     /// Whether requests are compressed.
     pub compression: Option<Compression>,
@@ -236,76 +236,76 @@ pub struct OtlpSettings {
     pub metrics: Option<bool>,
     /// Whether events are exported.
     pub events: Option<bool>,
-    /// Whether spans of the watches that ask for them are exported.
+    /// Whether spans are exported, for watches with `trace`.
     pub traces: Option<bool>,
-    /// What the robot is called.
+    /// Name of the robot.
     pub robot: Option<String>,
-    /// Further attributes of the resource.
+    /// Additional attributes of the resource.
     pub attributes: BTreeMap<String, String>,
 }
 
-/// Where an OpenTelemetry receiver is.
+/// Address of an OpenTelemetry receiver.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Endpoint {
-    /// Where the standard variables say; nowhere when they are silent.
+    /// The address in the standard variables; nothing is exported without one.
     #[default]
     Environment,
-    /// Nowhere.
+    /// Nothing is exported.
     Off,
-    /// Here.
+    /// This URL.
     At(String),
 }
 
-/// How requests are compressed.
+/// Compression of requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Compression {
-    /// Not at all.
+    /// No compression.
     None,
-    /// A fifth of the size or less, for some processor time.
+    /// gzip: a fifth of the size or less, for some CPU time.
     Gzip,
 }
 
-/// How much is logged.
+/// Level of the log.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// Failures.
+    /// Only failures.
     Error,
-    /// And what will hurt soon.
+    /// Also impending failures.
     Warn,
-    /// And changes of state.
+    /// Also changes of state.
     #[default]
     Info,
-    /// And why.
+    /// Also their causes.
     Debug,
-    /// And everything else.
+    /// Everything.
     Trace,
 }
 
-/// Why there is no configuration.
+/// Why the configuration cannot be loaded.
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     /// The file cannot be read.
     #[error("cannot read the configuration {}", path.display())]
     Read {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why not.
+        /// Cause of the failure.
         source: io::Error,
     },
-    /// Nobody writes that much by hand.
+    /// The file is too large.
     #[error("the configuration {} is larger than 1 MiB", path.display())]
     TooLarge {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// It says what it must not; one line for each mistake.
+    /// The file has mistakes; one line per mistake.
     #[error("{}", mistakes.report(&path.display().to_string()))]
     Invalid {
-        /// Which file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong.
+        /// All mistakes.
         mistakes: Mistakes,
     },
 }
@@ -314,7 +314,7 @@ impl Config {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// When it cannot be read or has mistakes; then all of them.
+    /// Fails if the file cannot be read or has mistakes, and returns all of them.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
         let bytes = crate::file::read(path, MAX_BYTES).map_err(|source| ConfigError::Read {
             path: path.into(),
@@ -329,15 +329,15 @@ impl Config {
         })
     }
 
-    /// Checks the bytes of a file.
+    /// Checks the content of a file.
     ///
     /// # Errors
-    /// All mistakes, in file order.
+    /// Returns all mistakes, in file order.
     pub fn parse(bytes: &[u8]) -> Result<Self, Mistakes> {
         meaning::parse(bytes)
     }
 
-    /// Keys whose change in `new` takes effect only after a restart.
+    /// Returns the keys whose change in `new` takes effect only after a restart.
     #[must_use]
     pub fn needs_restart(&self, new: &Self) -> Vec<&'static str> {
         [
@@ -363,14 +363,14 @@ impl Config {
         .collect()
     }
 
-    /// The JSON schema of the file.
+    /// Returns the JSON schema of the file.
     #[must_use]
     pub fn schema() -> serde_json::Value {
         schemars::schema_for!(shape::ConfigShape).to_value()
     }
 }
 
-/// What an empty file means.
+/// The configuration of an empty file.
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -429,7 +429,7 @@ impl Level {
     }
 }
 
-/// What is not written in the file.
+/// Defaults of missing keys.
 mod defaults {
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;

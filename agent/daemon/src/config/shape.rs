@@ -1,7 +1,7 @@
-//! The shape of the YAML file: what `config/ros2probe.schema.json` is generated from.
+//! The shape of the YAML file, from which `config/ros2probe.schema.json` is generated.
 //!
-//! Sections may be left empty (`watch:` with everything below it commented out). Ranges written
-//! here are enforced while reading; what needs more than one value is checked in `meaning`.
+//! Sections may be empty (`watch:` with everything below it commented out). Ranges declared here
+//! are enforced during parsing; `meaning` checks conditions on several values.
 
 use std::collections::BTreeMap;
 
@@ -13,43 +13,43 @@ use super::{
     Access, Compression, ExactChoice, Level, PageChoice, Retain, ShmMode, SourceChoice, defaults,
 };
 
-/// Configuration of the ros2probe agent. Every key may be left out.
+/// Configuration of the ros2probe agent. Every key is optional.
 #[derive(Debug, Default, Deserialize, JsonSchema)]
 #[schemars(title = "ros2probe configuration")]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct ConfigShape {
-    /// The form of this file; 1 when left out. An rp that does not know it refuses the file.
+    /// Version of this file's format; default 1. rp rejects versions that it does not support.
     #[schemars(range(min = 1, max = 1))]
     pub(super) version: Option<u32>,
     /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
-    /// expectations. Nothing listed: the graph alone is reported. Applied on reload.
+    /// expectations. With an empty list, only the graph is reported. Applied on reload.
     pub(super) watch: Option<Vec<WatchShape>>,
-    /// Caps of the agent's tables; what exceeds them is counted in `ros2probe_limit_reached_total`.
+    /// Caps of the agent's tables; `ros2probe_limit_reached_total` counts entries beyond them.
     pub(super) limits: Option<LimitsShape>,
-    /// Where packets are taken from and how much memory is used for it.
+    /// Sources of packets, and the memory for them.
     pub(super) capture: Option<CaptureShape>,
-    /// The metrics listener and what it shows.
+    /// The metrics listener and its content.
     pub(super) metrics: Option<MetricsShape>,
-    /// The control API: watches that are added and removed while the agent runs.
+    /// The control API, for example to add and remove watches at run time.
     pub(super) api: Option<ApiShape>,
-    /// What the page in the browser shows.
+    /// Content of the web page.
     pub(super) page: Option<PageShape>,
-    /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. What is not
-    /// written here the standard `OTEL_*` variables decide.
+    /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. The standard
+    /// `OTEL_*` variables replace missing keys.
     pub(super) otlp: Option<OtlpShape>,
-    /// Bags that the agent writes: on request (`POST /recordings`), and of the last seconds before
+    /// Bags written by the agent: on request (`POST /recordings`), and of the last seconds before
     /// an incident.
     pub(super) recordings: Option<RecordingsShape>,
-    /// How long a topic without endpoints is still reported, in seconds.
+    /// Time for which a topic without endpoints is still reported, in seconds.
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
     pub(super) topic_grace_s: u64,
-    /// Where the agent keeps what discovery knows, so that a restart on a running robot loses no
-    /// name: an absolute path to a directory, `off`, or `auto`: `$STATE_DIRECTORY` as the service
-    /// manager sets it, else /var/lib/ros2probe if it is there and can be written.
+    /// Directory of the saved discovery state, so that a restart on a running robot loses no name:
+    /// an absolute path, `off`, or `auto`: `$STATE_DIRECTORY` as set by the service manager, else
+    /// /var/lib/ros2probe if it exists and is writable.
     #[serde(default = "defaults::state_directory")]
     pub(super) state_directory: String,
-    /// Least severe log level that is written to standard error. Applied on reload.
+    /// Least severe log level on standard error. Applied on reload.
     #[serde(default)]
     pub(super) log: Level,
 }
@@ -60,78 +60,78 @@ pub(super) struct ConfigShape {
 pub(super) enum WatchShape {
     /// A topic name or glob.
     Pattern(String),
-    /// A topic name or glob with what should hold.
+    /// A topic name or glob with expectations.
     Entry(Box<WatchEntryShape>),
 }
 
-/// One watched topic or glob and what should hold for each topic it covers.
+/// A watched topic or glob, and the expectations for each topic that it matches.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields)]
 pub(super) struct WatchEntryShape {
     /// ROS name or glob: `*` stands for any part of one name token, `**` for any tokens.
     pub(super) topic: String,
-    /// Only in this domain; every domain when left out.
+    /// Only in this domain; default: every domain.
     #[schemars(range(min = 0, max = 232))]
     pub(super) domain: Option<u32>,
-    /// Series per delivery of each covered topic (what each writer sends where, what each
-    /// subscriber received), besides those per topic.
+    /// Series per delivery of each matching topic (messages of each writer by destination, messages
+    /// received by each subscriber), in addition to those per topic.
     #[serde(default)]
     pub(super) per_subscriber: bool,
-    /// The part of each covered topic's messages of which spans are exported (`otlp`), 0 to 1: when
-    /// a message was on the wire, and when each reliable reader acknowledged it.
+    /// Fraction of each matching topic's messages for which spans are exported (`otlp`), 0 to 1:
+    /// the time on the wire, and the acknowledgements of each reliable reader.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) trace: Option<f64>,
-    /// `last`: the last message of each covered transient-local writer is kept in memory, so that
-    /// a recording that begins later has it (`/tf_static`). Captures the covered topics.
+    /// `last`: keep the last message of each matching transient-local writer in memory, for
+    /// recordings that start later (`/tf_static`). Captures the matching topics.
     #[serde(default)]
     pub(super) retain: RetainShape,
-    /// At least this many messages a second.
+    /// Minimum rate, in messages per second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) min_rate_hz: Option<f64>,
-    /// At most this many messages a second.
+    /// Maximum rate, in messages per second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) max_rate_hz: Option<f64>,
-    /// At most this part of the messages may be lost, 0 to 1.
+    /// Maximum fraction of lost messages, 0 to 1.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) max_loss_ratio: Option<f64>,
-    /// Longest time from the writer's timestamp to the wire, in milliseconds.
+    /// Maximum time from the writer's timestamp to the wire, in milliseconds.
     #[schemars(range(min = 0.0, max = 3_600_000.0))]
     pub(super) max_latency_ms: Option<f64>,
-    /// Longest time without a message, in seconds.
+    /// Maximum time without a message, in seconds.
     #[schemars(range(min = 0.001, max = 604_800.0))]
     pub(super) max_silence_s: Option<f64>,
 }
 
-/// What is kept of a topic's messages for recordings that begin later.
+/// Messages of a topic kept for recordings that start later.
 #[derive(Clone, Copy, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[schemars(rename = "Retain")]
 #[serde(rename_all = "lowercase")]
 pub(super) enum RetainShape {
-    /// Nothing.
+    /// None.
     #[default]
     None,
-    /// The last one of each writer that keeps its own for late joiners (transient local).
+    /// The last message of each transient-local writer.
     Last,
 }
 
-/// Where packets are taken from.
+/// Sources of packets.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct CaptureShape {
-    /// At the sockets of this host, or on the wire.
+    /// At the sockets of this host, or on its interfaces.
     pub(super) source: SourceChoice,
-    /// Only the sockets of this cgroup (v2) and those below it, by absolute path; every socket of
-    /// the host when left out. Not with `source: wire`.
+    /// Only the sockets of this cgroup (v2) and those below it, by absolute path; default: every
+    /// socket of the host. Not with `source: wire`.
     pub(super) cgroup: Option<String>,
-    /// Interfaces (names or globs) whose wire is looked at besides the host's sockets, for traffic
+    /// Interfaces (names or globs) that are observed in addition to the host's sockets, for traffic
     /// that no local socket receives: a mirror port, a gateway. Not with `source: wire`.
     pub(super) mirror_interfaces: Option<Vec<String>>,
-    /// Which interfaces are looked at on the wire. Naming any rules out `source: host`.
+    /// Interfaces that are observed with `source: wire`. Any entry excludes `source: host`.
     pub(super) interfaces: Option<InterfacesShape>,
-    /// Further network namespaces to look into on the wire, by path (`/run/netns/robot`). Needs
-    /// CAP_SYS_ADMIN. The host's sockets are seen in all of them.
+    /// Further network namespaces for `source: wire`, by path (`/run/netns/robot`). Needs
+    /// CAP_SYS_ADMIN. `source: host` covers all of them.
     pub(super) network_namespaces: Option<Vec<String>>,
     /// Packet ring of each network namespace, in bytes.
     #[schemars(range(min = 262_144, max = 1_073_741_824))]
@@ -139,28 +139,27 @@ pub(super) struct CaptureShape {
     /// Ring for measurement records from the kernel filter, in bytes.
     #[schemars(range(min = 65_536, max = 1_073_741_824))]
     pub(super) record_ring_bytes: usize,
-    /// Messages between processes of one host that go through Fast DDS's shared memory.
+    /// Messages in Fast DDS's shared memory between processes of one host.
     pub(super) shm: Option<ShmShape>,
 }
 
-/// How shared memory is looked at: only ever read, at intervals.
+/// Settings of shared memory, which is only ever read.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct ShmShape {
-    /// `auto`: where there is any; `off`: never.
+    /// `auto`: read it if it exists; `off`: never.
     pub(super) mode: ShmMode,
-    /// `uprobe`: see every message, by a breakpoint that the kernel puts into the code of all
-    /// processes that use Fast DDS; where that is not possible, shared memory is read as usual.
-    /// `auto`: the same, only while samples of a topic that goes through shared memory are recorded,
-    /// echoed, retained or measured by a command.
+    /// `uprobe`: read every message, by a kernel breakpoint in all processes that use Fast DDS; if
+    /// that is impossible, shared memory is sampled. `auto`: the same, but only while messages of a
+    /// topic in shared memory are recorded, echoed, retained or measured by a command.
     pub(super) exact: ExactChoice,
-    /// Share of one CPU that looking may cost, in percent, but for moments in which participants
-    /// meet. With less, fewer of the messages are seen; they are counted all the same.
+    /// Share of one CPU for polling, in percent; briefly exceeded while participants discover each
+    /// other. With less, fewer messages are read, but all are counted.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) cpu_percent: f64,
-    /// The same while samples of a topic that goes through shared memory are recorded, echoed,
-    /// retained or measured by a command: then every message is wanted, and looks are many.
+    /// The same while messages of a topic in shared memory are recorded, echoed, retained or
+    /// measured by a command, which needs frequent polls.
     #[schemars(range(min = 0.1, max = 100))]
     pub(super) reading_cpu_percent: f64,
 }
@@ -170,9 +169,9 @@ pub(super) struct ShmShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct InterfacesShape {
-    /// Look at these alone; all when empty.
+    /// Observe only these; default: all.
     pub(super) include: Option<Vec<String>>,
-    /// Never look at these.
+    /// Never observe these.
     pub(super) exclude: Option<Vec<String>>,
 }
 
@@ -181,15 +180,15 @@ pub(super) struct InterfacesShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct MetricsShape {
-    /// `address:port` to serve `/metrics`, `/healthz` and `/readyz` on, or `off`.
+    /// `address:port` of `/metrics`, `/healthz` and `/readyz`, or `off`.
     pub(super) listen: String,
-    /// Histograms of inter-arrival time, latency and where it arises, of watched topics. Applied
+    /// Histograms of inter-arrival time and of latency with its parts, for watched topics. Applied
     /// on reload.
     pub(super) histograms: bool,
-    /// Series per writer of watched topics, besides those per topic. Applied on reload.
+    /// Series per writer of watched topics, in addition to those per topic. Applied on reload.
     pub(super) per_writer: bool,
-    /// File that says who may scrape and with which certificate the listener proves who it is, of
-    /// the form of exporter-toolkit's web.yml: `basic_auth_users` and `tls_server_config`.
+    /// File with the permitted users and the certificate of the listener, in the format of
+    /// exporter-toolkit's web.yml: `basic_auth_users` and `tls_server_config`.
     pub(super) web_config: Option<String>,
 }
 
@@ -201,28 +200,27 @@ pub(super) struct ApiShape {
     /// IP address and port to listen on, or `off`. Any address but a loopback one needs
     /// `token_file`.
     pub(super) listen: String,
-    /// Unix socket to listen on besides, for members of its group: a path, `off`, or `auto`:
-    /// api.sock in `$RUNTIME_DIRECTORY` as the service manager sets it, else in /run/ros2probe if
-    /// that is there.
+    /// Additional unix socket, for members of its group: a path, `off`, or `auto`: api.sock in
+    /// `$RUNTIME_DIRECTORY` as set by the service manager, else in /run/ros2probe if that exists.
     pub(super) socket: String,
-    /// What clients of a loopback `listen` may do without a token, be they any user of this host:
-    /// `read` graph, figures and events; `watch`: also add watches; `all`: also message payloads,
-    /// recordings, snapshots and reloads. The unix socket and a token always grant all.
+    /// Rights without a token of clients of a loopback `listen`, which may be any user of this
+    /// host. `read`: graph, figures and events; `watch`: also add watches; `all`: also message
+    /// payloads, recordings, snapshots and reloads. The unix socket and a token always grant all.
     pub(super) loopback: Access,
-    /// File with the bearer token that clients of `listen` must send, as the service manager's
-    /// LoadCredential= provides it.
+    /// File with the bearer token that clients of `listen` must send, for example from the service
+    /// manager's LoadCredential=.
     pub(super) token_file: Option<String>,
-    /// Whether `listen` also serves the page for browsers, at `/`.
+    /// Whether `listen` also serves the web page, at `/`.
     pub(super) page: PageChoice,
 }
 
-/// The page in the browser; `api.page` switches it off.
+/// The web page; `api.page` disables it.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct PageShape {
-    /// How many seconds of figures are kept of each measured topic, for charts; 0 = none. They
-    /// take at most 6 MiB: more than 436 topics have fewer seconds.
+    /// Seconds of figures kept per measured topic, for charts; 0 = none. They use at most 6 MiB:
+    /// with more than 436 topics, fewer seconds are kept.
     #[schemars(range(min = 0, max = 3_600))]
     pub(super) history_s: u32,
 }
@@ -256,26 +254,27 @@ impl Default for ApiShape {
     }
 }
 
-/// Bags that the agent writes.
+/// Bags written by the agent.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct RecordingsShape {
-    /// Where: an absolute path to a directory, `off`, or `auto`: `recordings` in the state directory.
+    /// Directory of the bags: an absolute path, `off`, or `auto`: `recordings` in the state
+    /// directory.
     pub(super) directory: String,
-    /// How large a recording may become, in bytes; it ends there with the reason. Any size when left out.
+    /// Maximum size of a recording in bytes; it then ends with the reason. Default: no limit.
     #[schemars(range(min = 65_536))]
     pub(super) max_bytes: Option<u64>,
-    /// How much all bags in the directory may take, in bytes; recordings end there. Any amount when left out.
+    /// Maximum size of all bags in the directory in bytes; recordings then end. Default: no limit.
     #[schemars(range(min = 65_536))]
     pub(super) max_total_bytes: Option<u64>,
-    /// How much of the file system stays free, in percent: recordings end there.
+    /// Share of the file system that stays free, in percent: recordings end before.
     #[schemars(range(min = 0, max = 99))]
     pub(super) reserve_percent: u8,
-    /// Likewise in bytes; the larger one counts.
+    /// The same in bytes; the larger one applies.
     #[schemars(range(min = 0, max = 1_099_511_627_776_u64))]
     pub(super) reserve_bytes: u64,
-    /// Topics of which the last seconds are kept in memory, and written when something happens.
+    /// Topics whose last seconds are kept in memory, and written on an incident.
     pub(super) snapshots: Option<Vec<SnapshotShape>>,
 }
 
@@ -284,24 +283,24 @@ pub(super) struct RecordingsShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields)]
 pub(super) struct SnapshotShape {
-    /// Names its bags.
+    /// Prefix of its bags' names.
     #[schemars(regex(pattern = r"^[A-Za-z0-9_-]{1,64}$"))]
     pub(super) name: String,
     /// ROS names or globs.
     pub(super) topics: Vec<String>,
-    /// Of this domain.
+    /// Domain of the topics.
     #[schemars(range(min = 0, max = 232))]
     #[serde(default)]
     pub(super) domain: u32,
-    /// How many seconds are kept.
+    /// Seconds to keep.
     #[schemars(range(min = 1, max = 600))]
     #[serde(default = "defaults::snapshot_seconds")]
     pub(super) seconds: u64,
-    /// How much memory that may take; what does not fit is counted.
+    /// Maximum memory in bytes; messages that do not fit are counted.
     #[schemars(range(min = 65_536, max = 4_294_967_296_u64))]
     #[serde(default = "defaults::snapshot_bytes")]
     pub(super) max_bytes: usize,
-    /// Whether it is written when an expectation of a watch is violated.
+    /// Whether to write it when an expectation of a watch is violated.
     #[serde(default = "defaults::on_violation")]
     pub(super) on_violation: bool,
 }
@@ -325,19 +324,19 @@ impl Default for RecordingsShape {
 #[schemars(inline)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct OtlpShape {
-    /// URL of the receiver, as `http://collector:4317`, or `off`. When left out,
-    /// `OTEL_EXPORTER_OTLP_ENDPOINT` decides (and those of single signals); nothing is exported
-    /// when it is not set either.
+    /// URL of the receiver, e.g. `http://collector:4317`, or `off`. By default
+    /// `OTEL_EXPORTER_OTLP_ENDPOINT` applies (and those of single signals); without it nothing is
+    /// exported.
     pub(super) endpoint: Option<String>,
-    /// How often metrics are exported, in seconds; 15 when nobody says.
+    /// Interval between exports of metrics, in seconds; default 15.
     #[schemars(range(min = 1, max = 3_600))]
     pub(super) interval_s: Option<u64>,
-    /// How long the receiver may take to answer, in seconds; 10 when nobody says.
+    /// Timeout for the receiver's answer, in seconds; default 10.
     #[schemars(range(min = 1, max = 300))]
     pub(super) timeout_s: Option<u64>,
-    /// Sent with each request: names and values. Secrets belong into headers_file.
+    /// Headers of each request: names and values. Put secrets into headers_file.
     pub(super) headers: Option<BTreeMap<String, String>>,
-    /// A file with one `name: value` a line, by absolute path.
+    /// Absolute path of a file with one `name: value` per line.
     pub(super) headers_file: Option<String>,
     /// `none`, or `gzip` for slow links.
     pub(super) compression: Option<Compression>,
@@ -345,11 +344,11 @@ pub(super) struct OtlpShape {
     pub(super) metrics: Option<bool>,
     /// Whether events are exported, as log records.
     pub(super) events: Option<bool>,
-    /// Whether spans are exported, of the watches with `trace`.
+    /// Whether spans are exported, for watches with `trace`.
     pub(super) traces: Option<bool>,
-    /// What this robot is called: the attribute `robot.name` of all that is exported.
+    /// Name of this robot: the attribute `robot.name` of all exports.
     pub(super) robot: Option<String>,
-    /// Further attributes of the resource, names and values.
+    /// Additional attributes of the resource, names and values.
     pub(super) attributes: Option<BTreeMap<String, String>>,
 }
 

@@ -5,7 +5,10 @@
 //! for its announcements, and says goodbye. At most [`session::MOST_PACKETS`] packets each; nobody
 //! else hears of it, it has no user endpoint, and nothing of it stays.
 
+pub mod announcements;
+mod announcer;
 pub mod message;
+pub mod participants;
 pub mod session;
 
 use std::fs::File;
@@ -13,7 +16,8 @@ use std::io::{self, Read as _};
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, SocketAddrV4, UdpSocket};
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::{GuidPrefix, Timestamp};
+pub use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::Timestamp;
 
 use self::message::{LocalParticipant, VENDOR};
 use self::session::{Outgoing, Session, Target};

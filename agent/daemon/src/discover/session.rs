@@ -5,18 +5,19 @@
 //! goodbye. HEARTBEATs are never answered one by one: Fast DDS sends several while it repeats
 //! itself, and each answer would make it begin anew.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::net::SocketAddrV4;
 use std::ops::RangeInclusive;
 
 use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
-use ros2probe_wire::record::{Body, Gap, Sample};
+use ros2probe_wire::record::{Body, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
+use super::announcer::{Announcer, MOST_ANNOUNCEMENTS};
 use super::message::{
     LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
     SUBSCRIPTIONS_READER,
@@ -37,8 +38,6 @@ const TIMEOUT: u64 = 300 * MILLISECOND;
 const NODES_TIMEOUT: u64 = 500 * MILLISECOND;
 /// The whole conversation.
 const LIMIT: u64 = 3_000 * MILLISECOND;
-/// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
-const MOST_ANNOUNCEMENTS: u64 = 4096;
 /// Samples waited for that come in fragments.
 const MOST_PARTIAL: usize = 8;
 /// User writers whose HEARTBEAT is remembered until it is known which one tells of nodes.
@@ -103,27 +102,14 @@ pub struct Session {
     over: bool,
 }
 
-/// A writer of announcements, and what came of it.
-#[derive(Debug)]
-struct Announcer {
-    writer: EntityId,
-    reader: EntityId,
-    role: Role,
-    /// First and last number, by HEARTBEAT.
-    there: Option<RangeInclusive<u64>>,
-    came: BTreeSet<u64>,
-    /// Asked for last.
-    wanted: BTreeSet<u64>,
-}
-
 #[derive(Debug)]
 enum Nodes {
     /// Not asked for, since when.
     Open { since: Option<Timestamp> },
     /// Asked for.
-    FilterOptions(Timestamp),
+    Requested(Timestamp),
     /// This is the list.
-    Told(Vec<NodeEntities>),
+    Listed(Vec<NodeEntities>),
     /// It cannot be had.
     Missing,
 }
@@ -259,7 +245,7 @@ impl Session {
     #[must_use]
     pub fn nodes(&self) -> Option<&[NodeEntities]> {
         match &self.nodes {
-            Nodes::Told(nodes) => Some(nodes),
+            Nodes::Listed(nodes) => Some(nodes),
             _ => None,
         }
     }
@@ -305,7 +291,7 @@ impl Session {
                 let number = sample.sequence_number();
                 let came = match &announcer {
                     Some(announcer) => announcer.came.contains(&number),
-                    None => matches!(self.nodes, Nodes::Told(_)),
+                    None => matches!(self.nodes, Nodes::Listed(_)),
                 };
                 if came || announcer.is_none() && Some(entity) != self.nodes_writer() {
                     return;
@@ -382,7 +368,7 @@ impl Session {
         if let Ok(entities) = ParticipantEntities::parse(payload.bytes())
             && entities.participant.prefix == self.target.prefix
         {
-            self.nodes = Nodes::Told(entities.nodes);
+            self.nodes = Nodes::Listed(entities.nodes);
         }
     }
 
@@ -444,7 +430,7 @@ impl Session {
             return;
         }
         let message = self.message().ask(NODES_READER, writer, last, [last], 1);
-        self.nodes = Nodes::FilterOptions(now);
+        self.nodes = Nodes::Requested(now);
         self.send(self.to_user("node request", message), outgoing);
     }
 
@@ -508,8 +494,8 @@ impl Session {
             return true;
         }
         match &mut self.nodes {
-            Nodes::Told(_) | Nodes::Missing => true,
-            Nodes::FilterOptions(asked) => since(*asked, now) >= NODES_TIMEOUT,
+            Nodes::Listed(_) | Nodes::Missing => true,
+            Nodes::Requested(asked) => since(*asked, now) >= NODES_TIMEOUT,
             Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_TIMEOUT,
         }
     }
@@ -574,61 +560,6 @@ impl SamplePayload<'_> {
             Self::Borrowed(payload) => *payload,
             Self::Joined(bytes) => Payload::Data(bytes),
         }
-    }
-}
-
-impl Announcer {
-    const fn of(role: Role) -> Self {
-        let (writer, reader) = match role {
-            Role::Writer => (EntityId::SEDP_PUBLICATIONS_WRITER, PUBLICATIONS_READER),
-            Role::Reader => (EntityId::SEDP_SUBSCRIPTIONS_WRITER, SUBSCRIPTIONS_READER),
-        };
-        Self {
-            writer,
-            reader,
-            role,
-            there: None,
-            came: BTreeSet::new(),
-            wanted: BTreeSet::new(),
-        }
-    }
-
-    /// Numbers that are there and have not come, lowest first.
-    fn missing(&self) -> impl Iterator<Item = u64> + '_ {
-        let (first, last) = match &self.there {
-            Some(range) => (*range.start(), *range.end()),
-            None => (1, 0),
-        };
-        let first = first.max(1);
-        let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
-        (first..=last).filter(|number| !self.came.contains(number))
-    }
-
-    /// The next numbers to ask for, as many as one request holds.
-    fn want(&mut self) -> BTreeSet<u64> {
-        let first = self.missing().next().unwrap_or(0);
-        let wanted: BTreeSet<_> = self
-            .missing()
-            .take_while(|number| number - first < MOST_NUMBERS)
-            .collect();
-        self.wanted.clone_from(&wanted);
-        wanted
-    }
-
-    /// Whether all that was asked for has come.
-    fn has_come(&self) -> bool {
-        self.wanted.is_subset(&self.came)
-    }
-
-    /// A GAP: these will never come.
-    fn skip(&mut self, gap: Gap<'_>) {
-        let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
-        let listed: BTreeSet<u64> = list.iter().collect();
-        let skipped: Vec<u64> = self
-            .missing()
-            .filter(|number| irrelevant.contains(number) || listed.contains(number))
-            .collect();
-        self.came.extend(skipped);
     }
 }
 

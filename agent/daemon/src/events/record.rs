@@ -226,7 +226,7 @@ impl Occurrence {
     }
 
     /// Attributes by name, in any order; `None` = not known.
-    fn values(&self, at: Timestamp) -> Vec<(&'static str, Option<Value>)> {
+    fn values(&self, at: Timestamp) -> Values {
         match self {
             Self::Robot(kind) => robot(kind, at),
             Self::Agent(event) => agent(event),
@@ -250,13 +250,9 @@ impl Occurrence {
     }
 }
 
-fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> {
-    use churn::Event::{Cascaded, Disposed, Expired};
-    let cause = |change: &churn::Event| {
-        let went = matches!(change, Disposed | Expired | Cascaded);
-        ("cause", went.then(|| text(change.label())))
-    };
-    let domain = |domain_id: &DomainId| ("domain_id", number(domain_id.0));
+type Values = Vec<(&'static str, Option<Value>)>;
+
+fn robot(kind: &EventKind, at: Timestamp) -> Values {
     match kind {
         EventKind::Participant {
             change,
@@ -266,7 +262,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             host,
             process,
         } => vec![
-            domain(domain_id),
+            domain(*domain_id),
             ("participant", written(guid)),
             ("vendor", written(vendor)),
             ("host", host.as_deref().map(text)),
@@ -286,13 +282,11 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
                 Role::Writer => "writer",
                 Role::Reader => "reader",
             };
+            let kind = naming.as_ref().map(|naming| text(naming.kind.label()));
             vec![
-                domain(domain_id),
+                domain(*domain_id),
                 ("topic", Some(text(&series(naming.as_ref(), topic)))),
-                (
-                    "kind",
-                    naming.as_ref().map(|naming| text(naming.kind.label())),
-                ),
+                ("kind", kind),
                 ("role", Some(text(role))),
                 ("endpoint", written(guid)),
                 ("message_type", Some(text(message_type))),
@@ -305,34 +299,12 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             participant,
             name,
         } => vec![
-            domain(domain_id),
+            domain(*domain_id),
             ("ros_node", Some(text(name))),
             ("participant", written(participant)),
             cause(change),
         ],
-        EventKind::Loss(LossBurst {
-            writer,
-            topic,
-            node,
-            count,
-            first,
-            last,
-        }) => {
-            let name = |topic: &str| text(&series(naming(topic).as_ref(), topic));
-            let topic = topic.as_ref();
-            vec![
-                (
-                    "domain_id",
-                    topic.and_then(|(domain_id, _)| number(*domain_id)),
-                ),
-                ("topic", topic.map(|(_, topic)| name(topic))),
-                ("writer", written(writer)),
-                ("ros_node", node.as_deref().map(text)),
-                ("count", number(*count)),
-                ("first_sequence_number", number(*first)),
-                ("last_sequence_number", number(*last)),
-            ]
-        }
+        EventKind::Loss(loss) => self::loss(loss),
         EventKind::Expectation {
             domain_id,
             topic,
@@ -341,7 +313,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
             to,
             violations,
         } => vec![
-            domain(domain_id),
+            domain(*domain_id),
             ("topic", Some(text(topic))),
             ("watch", Some(text(watch))),
             ("from", from.map(|from| text(from.label()))),
@@ -356,7 +328,7 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
         } => {
             let ago = last_message.map(|last| Value::Real(seconds(at, last)));
             vec![
-                domain(domain_id),
+                domain(*domain_id),
                 ("topic", Some(text(topic))),
                 ("watch", Some(text(watch))),
                 ("last_message_seconds_ago", ago),
@@ -366,7 +338,35 @@ fn robot(kind: &EventKind, at: Timestamp) -> Vec<(&'static str, Option<Value>)> 
     }
 }
 
-fn finding(finding: &Diagnosis) -> Vec<(&'static str, Option<Value>)> {
+fn domain(domain_id: DomainId) -> (&'static str, Option<Value>) {
+    ("domain_id", number(domain_id.0))
+}
+
+/// How an entity went, if it did.
+fn cause(change: &churn::Event) -> (&'static str, Option<Value>) {
+    use churn::Event::{Cascaded, Disposed, Expired};
+    let went = matches!(change, Disposed | Expired | Cascaded);
+    ("cause", went.then(|| text(change.label())))
+}
+
+fn loss(loss: &LossBurst) -> Values {
+    let name = |topic: &str| text(&series(naming(topic).as_ref(), topic));
+    let topic = loss.topic.as_ref();
+    vec![
+        (
+            "domain_id",
+            topic.and_then(|(domain_id, _)| number(*domain_id)),
+        ),
+        ("topic", topic.map(|(_, topic)| name(topic))),
+        ("writer", written(&loss.writer)),
+        ("ros_node", loss.node.as_deref().map(text)),
+        ("count", number(loss.count)),
+        ("first_sequence_number", number(loss.first)),
+        ("last_sequence_number", number(loss.last)),
+    ]
+}
+
+fn finding(finding: &Diagnosis) -> Values {
     let mut values = Vec::new();
     if !matches!(finding, Diagnosis::QosIncompatible { .. }) {
         values.push(("diagnosis", Some(text(finding.kind()))));
@@ -426,7 +426,7 @@ fn finding(finding: &Diagnosis) -> Vec<(&'static str, Option<Value>)> {
     values
 }
 
-fn agent(event: &AgentEvent) -> Vec<(&'static str, Option<Value>)> {
+fn agent(event: &AgentEvent) -> Values {
     match event {
         AgentEvent::Started { source } => vec![
             ("version", Some(text(env!("CARGO_PKG_VERSION")))),

@@ -134,7 +134,7 @@ pub(super) const PARTICIPANT_LOST: Definition = Definition::new(
     "ros2.participant.lost",
     Severity::Warn,
     PARTICIPANT_GONE,
-    "A participant left: its lease expired, or (INFO) it said goodbye, cause disposed.",
+    "A participant left: its lease expired, or (INFO) it disposed of itself.",
 )
 .relief(Severity::Info);
 pub(super) const ENDPOINT_DISCOVERED: Definition = Definition::new(
@@ -153,7 +153,7 @@ pub(super) const ENDPOINT_LOST: Definition = Definition::new(
     "ros2.endpoint.lost",
     Severity::Info,
     ENDPOINT_GONE,
-    "A writer or reader went: it was disposed of, or cascaded with its participant.",
+    "A writer or reader left: it was disposed of, or its participant left.",
 );
 pub(super) const NODE_DISCOVERED: Definition = Definition::new(
     "ros2.node.discovered",
@@ -165,7 +165,7 @@ pub(super) const NODE_LOST: Definition = Definition::new(
     "ros2.node.lost",
     Severity::Info,
     &["domain_id", "ros_node", "participant", "cause"],
-    "A ROS node went: it was disposed of, or cascaded with its participant.",
+    "A ROS node left: it was disposed of, or its participant left.",
 );
 pub(super) const MESSAGE_LOST: Definition = Definition::new(
     "ros2.message.lost",
@@ -179,13 +179,13 @@ pub(super) const MESSAGE_LOST: Definition = Definition::new(
         "first_sequence_number",
         "last_sequence_number",
     ],
-    "Messages of a measured writer were settled as lost; one event for all of a second.",
+    "Messages of a measured writer were lost; one event per second.",
 );
 pub(super) const EXPECTATION_CHANGED: Definition = Definition::new(
     "ros2.topic.expectation_changed",
     Severity::Warn,
     &["domain_id", "topic", "watch", "from", "to", "violations"],
-    "A watched topic stands otherwise than before with its expectations; INFO when it is ok now.",
+    "The state of a watched topic changed; INFO if it is ok now.",
 )
 .relief(Severity::Info);
 pub(super) const TOPIC_SILENT: Definition = Definition::new(
@@ -198,13 +198,13 @@ pub(super) const QOS_INCOMPATIBLE: Definition = Definition::new(
     "ros2.qos.incompatible",
     Severity::Warn,
     QOS,
-    "A publisher and a subscriber of one topic do not talk because of these policies.",
+    "A publisher and a subscriber of one topic cannot communicate because of these policies.",
 );
 pub(super) const QOS_RESOLVED: Definition = Definition::new(
     "ros2.qos.resolved",
     Severity::Info,
     QOS,
-    "They match now, or one of them is gone.",
+    "Publisher and subscriber match now, or one of them left.",
 );
 pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     "ros2.graph.diagnosed",
@@ -218,7 +218,7 @@ pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
     "ros2.graph.resolved",
     Severity::Info,
     FINDING,
-    "The fault is gone; the attributes describe how it was.",
+    "The fault is gone; the attributes describe it.",
 );
 
 pub(super) const STARTED: Definition = Definition::new(
@@ -238,7 +238,7 @@ pub(super) const CAPTURE_BLIND: Definition = Definition::new(
     "ros2probe.capture.blind",
     Severity::Error,
     &["reason"],
-    "The agent does not see the robot any more, as /readyz answers.",
+    "The agent no longer sees the robot: /readyz answers 503.",
 );
 pub(super) const CAPTURE_SEEING: Definition = Definition::new(
     "ros2probe.capture.seeing",
@@ -250,13 +250,13 @@ pub(super) const CONFIG_RELOADED: Definition = Definition::new(
     "ros2probe.config.reloaded",
     Severity::Info,
     &["watches"],
-    "A configuration was taken over.",
+    "The agent applied a new configuration.",
 );
 pub(super) const CONFIG_REFUSED: Definition = Definition::new(
     "ros2probe.config.reload_failed",
     Severity::Error,
     &["error"],
-    "A configuration was refused; the previous one stays in force.",
+    "The agent rejected a new configuration; the previous one stays in force.",
 );
 pub(super) const RECORDING_STARTED: Definition = Definition::new(
     "ros2probe.recording.started",
@@ -294,7 +294,7 @@ pub(super) const SUPPRESSED: Definition = Definition::new(
     "ros2probe.events.suppressed",
     Severity::Warn,
     &["event", "count"],
-    "Too many events of one name or group in a second; the rest are only counted.",
+    "Too many events of one name or group in a second; the others are only counted.",
 );
 
 /// All of them.

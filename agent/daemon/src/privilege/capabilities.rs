@@ -37,7 +37,7 @@ pub struct Missing {
 
 /// Why privileges could not be given up.
 #[derive(Debug, thiserror::Error)]
-#[error("cannot give up privileges")]
+#[error("cannot drop privileges")]
 pub struct DropError(#[from] Errno);
 
 /// The calling thread has no capability in any set that would give it one, and can gain none: what

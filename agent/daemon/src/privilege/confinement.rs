@@ -72,7 +72,7 @@ pub enum ConfineError {
     #[error("cannot set no_new_privs")]
     Gain(#[source] io::Error),
     /// The filter is not to be had for this machine.
-    #[error("no filter of system calls can be made")]
+    #[error("cannot build the system call filter")]
     Filter(#[source] FilterError),
 }
 

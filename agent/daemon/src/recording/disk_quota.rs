@@ -29,10 +29,10 @@ pub struct DiskQuota {
 enum QuotaExceeded {
     #[error("the recording would be larger than {0} bytes (recordings.max_bytes)")]
     Bag(u64),
-    #[error("all recordings take {used} bytes, of {limit} they may (recordings.max_total_bytes)")]
+    #[error("all recordings use {used} of {limit} bytes (recordings.max_total_bytes)")]
     Total { used: u64, limit: u64 },
     #[error(
-        "{free} bytes of the file system are free, of which {reserve} stay free \
+        "the file system has {free} free bytes, and {reserve} must stay free \
          (recordings.reserve_percent, recordings.reserve_bytes)"
     )]
     Reserve { free: u64, reserve: u64 },

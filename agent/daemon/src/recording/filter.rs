@@ -6,11 +6,10 @@
 use std::collections::HashSet;
 
 use regex::bytes::Regex;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use ros2probe_api::path::encoded;
+use ros2probe_api::recordings::FilterOptions;
 
 use crate::subscriptions::{Choice, ChoiceError, Selection};
-use ros2probe_api::path::encoded;
 
 /// The end of the name of a service's event topic.
 const SERVICE_EVENT: &str = "/_service_event";
@@ -19,39 +18,6 @@ const EVERY_SERVICE_EVENT: &str = "/_service_event$";
 const MAX_NAMES: usize = 1024;
 /// Characters of a regular expression.
 const MAX_EXPRESSION: usize = 1024;
-
-/// What was asked for; empty asks for nothing.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-#[schema(as = RecordedTopics)]
-pub struct FilterOptions {
-    /// These topics, by ROS name.
-    pub topics: Vec<String>,
-    /// Every topic.
-    pub all_topics: bool,
-    /// Topics of these types, `pkg/msg/Type`.
-    pub topic_types: Vec<String>,
-    /// These services, by name: their event topics.
-    pub services: Vec<String>,
-    /// Every service's event topic.
-    pub all_services: bool,
-    /// Topics and services whose name contains this regular expression.
-    pub regex: Option<String>,
-    /// None whose name contains this regular expression.
-    pub exclude_regex: Option<String>,
-    /// Not these topics.
-    pub exclude_topics: Vec<String>,
-    /// No topics of these types.
-    pub exclude_topic_types: Vec<String>,
-    /// Not these services.
-    pub exclude_services: Vec<String>,
-    /// Also topics with a token that begins with `_`.
-    pub include_hidden_topics: bool,
-    /// Also topics that nobody publishes: declared in the bag, without a message.
-    pub include_unpublished_topics: bool,
-    /// Not topics that nobody subscribes to.
-    pub ignore_leaf_topics: bool,
-}
 
 /// One topic of the graph, as far as the choice looks at it.
 #[derive(Clone, Copy, Debug)]
@@ -79,13 +45,13 @@ pub struct Filter {
 #[derive(Debug, thiserror::Error)]
 pub enum FilterError {
     /// No topic can ever match.
-    #[error("name topics, or ask for all of them or those that match a regular expression")]
+    #[error("name topics, or request all of them or those that match a regular expression")]
     Nothing,
     /// Too long a list.
     #[error("more than {MAX_NAMES} names")]
     TooMany,
     /// A name without its leading slash, or a wrong one.
-    #[error("`{0}` is no topic or service name: it must begin with `/`")]
+    #[error("`{0}` is not a topic or service name: it must begin with `/`")]
     Name(String),
     /// A regular expression that cannot be used.
     #[error("the regular expression `{expression}` cannot be used: {reason}")]
@@ -95,17 +61,6 @@ pub enum FilterError {
         /// What is wrong with it.
         reason: String,
     },
-}
-
-impl FilterOptions {
-    /// Every topic, as `-a` of Humble.
-    #[must_use]
-    pub fn everything() -> Self {
-        Self {
-            all_topics: true,
-            ..Self::default()
-        }
-    }
 }
 
 impl Filter {

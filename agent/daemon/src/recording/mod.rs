@@ -17,14 +17,13 @@ mod snapshot;
 
 pub use disk_quota::DiskQuota;
 pub use figures::{RecordingFigures, SnapshotFigures};
-pub use filter::{Candidate, Filter, FilterError, FilterOptions};
+pub use filter::{Candidate, Filter, FilterError};
 pub use graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic, by_name};
 pub use recorder::{Finished, Recorder, Sources};
-pub use report::{MissingRun, OtherDomain, Report, TopicReport, UnknownWriters, unobserved_lines};
+pub use report::{shortfalls, unobserved_lines};
 pub use sample_ring::SampleRing;
 pub use service::{
-    Components, Recording, RecordingOptions, RecordingState, Recordings, Refusal, Status,
-    default_name, schema,
+    Components, Recording, RecordingOptions, Recordings, Refusal, Status, default_name, schema,
 };
 pub use session::{Activity, Command, record};
 pub use snapshot::{Snapshots, WrittenBag};

@@ -4,7 +4,9 @@
 //! stream, and time comes with what it is fed. The first error of the storage ends it; what was
 //! taken before is in the bag, and what is not is counted.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+mod unrecorded;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::qos::Qos;
@@ -12,12 +14,14 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::disk_quota::DiskQuota;
-use super::filter::{Candidate, Filter, FilterOptions};
+use super::filter::{Candidate, Filter};
 use super::graph::{DiscoveredTopic, GraphSnapshot, PublishedTopic};
-use super::report::{NO_SUBSCRIBER, OtherDomain, Report};
+use super::report::{add_missed, add_paused, add_written, custom_data, take_back};
 use super::sample_ring::SampleRing;
 use crate::subscriptions::line::qos;
 use crate::subscriptions::{Item, Topic};
+use ros2probe_api::recording_report::{NO_SUBSCRIBER, Report};
+use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
@@ -312,7 +316,7 @@ impl<'a> Recorder<'a> {
                     return Ok(());
                 }
                 if self.place(&missed.topic)?.is_some() {
-                    self.report.missed(missed);
+                    add_missed(&mut self.report, missed);
                 }
                 Ok(())
             }
@@ -342,9 +346,9 @@ impl<'a> Recorder<'a> {
         // Before the report goes into the bag.
         self.writer.settle();
         for (topic, messages, bytes) in self.writer.unwritten() {
-            self.report.unwritten(topic, messages, bytes);
+            take_back(&mut self.report, topic, messages, bytes);
         }
-        let custom_data = self.report.custom_data();
+        let custom_data = custom_data(&self.report);
         let closed = self.writer.close_with(custom_data, compress);
         let (summary, close_error) = match closed {
             Ok(summary) => (Some(summary), None),
@@ -364,7 +368,7 @@ impl<'a> Recorder<'a> {
         let topic = &*sample.topic;
         if self.paused {
             if self.accepts(&topic.name) {
-                self.report.paused(&topic.name);
+                add_paused(&mut self.report, &topic.name);
             }
             return Ok(());
         }
@@ -384,7 +388,7 @@ impl<'a> Recorder<'a> {
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
             .write(id, sample.time, sent, sample.sequence_number, payload)?;
-        self.report.written(&topic.name, payload.len());
+        add_written(&mut self.report, &topic.name, payload.len());
         if sample.sampled && !self.sampled.contains(&*topic.name) {
             self.sampled.insert(topic.name.to_string());
         }
@@ -529,63 +533,6 @@ impl<'a> Recorder<'a> {
         }
         taken.description.publishers = taken.offered.values().cloned().collect();
         self.writer.topic(taken.description.clone()).map(drop)
-    }
-
-    /// Publishers that keep samples for late joiners, of which the first ones are not in the bag.
-    fn note_what_was_sent_before(&mut self, graph: &GraphSnapshot) {
-        let mut names: Vec<String> = Vec::new();
-        for topic in graph
-            .topics
-            .iter()
-            .filter(|topic| topic.domain_id == self.domain_id)
-        {
-            let Some(TopicDecision::Recorded(taken)) = self.topics.get(&topic.name) else {
-                continue;
-            };
-            let begun: HashSet<String> = taken
-                .first
-                .iter()
-                .filter(|(_, first)| **first <= 1)
-                .map(|(writer, _)| writer.to_string())
-                .collect();
-            if topic
-                .durable_publishers
-                .iter()
-                .any(|keeper| !begun.contains(keeper))
-            {
-                names.push(topic.name.clone());
-            }
-        }
-        names.sort();
-        self.report.sent_before = names;
-    }
-
-    /// What would have been taken, had it been seen, announced, or in this domain.
-    fn note_what_was_not_observed(&mut self, graph: GraphSnapshot) {
-        let mut domains: BTreeMap<u32, OtherDomain> = BTreeMap::new();
-        self.report.unobserved = self.unobserved(&graph);
-        for topic in graph.topics {
-            if topic.domain_id == self.domain_id || !self.takes(&topic) {
-                continue;
-            }
-            let domain = domains.entry(topic.domain_id).or_default();
-            domain.domain_id = topic.domain_id;
-            domain.topics += 1;
-            if let Some(messages) = topic.messages {
-                let before = self.before.topics.get(&(topic.domain_id, topic.name));
-                let new = messages.saturating_sub(before.copied().unwrap_or(0));
-                *domain.messages.get_or_insert(0) += new;
-            }
-        }
-        self.report.other_domains = domains.into_values().collect();
-        for (writer, messages) in graph.unknown_writers {
-            let before = self.before.unknown_writers.get(&writer);
-            let new = messages.saturating_sub(before.copied().unwrap_or(0));
-            if new > 0 {
-                self.report.unknown_writers.writers += 1;
-                self.report.unknown_writers.messages += new;
-            }
-        }
     }
 }
 

@@ -1,13 +1,11 @@
-//! What a recording has and what it has not: counted for each topic, with the numbers of what is
-//! missing. It stands in the bag's metadata and in the answer of whoever ends the recording.
-//!
-//! `missing` counts messages of topics of the bag. What belongs to no topic, or never passes where it
-//! can be observed, is listed beside it.
+//! Counts what a recording has and what it lacks, and puts that into words. The report itself is an
+//! answer of the API and part of the bag's metadata.
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
+use ros2probe_api::recording_report::{
+    MissingRun, NO_SUBSCRIBER, OtherDomain, Report, UnknownWriters,
+};
 
 use crate::subscriptions::{Missed, MissedReason};
 
@@ -15,8 +13,6 @@ use crate::subscriptions::{Missed, MissedReason};
 const RUNS: usize = 256;
 /// Topics that are named in one line.
 const NAMES: usize = 8;
-/// Nobody subscribes: the one reason in [`Report::unobserved`] by which nothing is missing.
-pub(super) const NO_SUBSCRIBER: &str = "no_subscriber";
 /// Reasons why no message of a published topic was seen, and what people read.
 const UNOBSERVED: [(&str, &str); 5] = [
     (
@@ -41,258 +37,133 @@ const UNOBSERVED: [(&str, &str); 5] = [
     ),
 ];
 /// Under this name in the bag's custom data.
-pub const CUSTOM_DATA: &str = "ros2probe";
+pub(super) const CUSTOM_DATA: &str = "ros2probe";
 
-/// What became of what was to be recorded.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[schema(as = RecordingReport)]
-pub struct Report {
-    /// Messages in the bag.
-    pub messages: u64,
-    /// Bytes of those messages.
-    pub bytes: u64,
-    /// Messages that were sent and are not in the bag.
-    pub missing: u64,
-    /// By topic.
-    pub topics: BTreeMap<String, TopicReport>,
-    /// Which messages are missing, by writer and sequence number: the first ones.
-    pub missing_runs: Vec<MissingRun>,
-    /// Further runs that are counted but not named.
-    pub missing_runs_unnamed: u64,
-    /// Topics that late joiners are given samples of, which were sent before the recording began and
-    /// are not in the bag.
-    pub sent_before: Vec<String>,
-    /// Topics that are left out because they have several types; a bag holds one.
-    pub left_out: Vec<String>,
-    /// Published topics without a message in the bag, where the reason is known: `no_subscriber`, or
-    /// how all messages pass: `shared_memory`, `data_sharing`, `same_process`, `iceoryx`.
-    #[serde(default)]
-    pub unobserved: BTreeMap<String, String>,
-    /// Writers that sent and were never announced.
-    #[serde(default)]
-    pub unknown_writers: UnknownWriters,
-    /// Topics that the choice would take, in other domains.
-    #[serde(default)]
-    pub other_domains: Vec<OtherDomain>,
-    /// Which limit ended it, if one did.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub limit_reached: Option<String>,
+/// A message is in the bag.
+pub(super) fn add_written(report: &mut Report, topic: &str, bytes: usize) {
+    let bytes = bytes as u64;
+    report.messages += 1;
+    report.bytes += bytes;
+    let topic = report.topic(topic);
+    topic.messages += 1;
+    topic.bytes += bytes;
 }
 
-/// Writers whose topics are unknown.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[schema(as = RecordingUnknownWriters)]
-pub struct UnknownWriters {
-    /// How many sent.
-    pub writers: u64,
-    /// Messages they sent while it was recorded.
-    pub messages: u64,
+/// A message came while the recording was paused.
+pub(super) fn add_paused(report: &mut Report, topic: &str) {
+    report.topic(topic).paused += 1;
 }
 
-/// What passed in a domain that is not recorded.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[schema(as = RecordingOtherDomain)]
-pub struct OtherDomain {
-    /// Which one.
-    pub domain_id: u32,
-    /// Published topics.
-    pub topics: u64,
-    /// Their messages while it was recorded; null where none of them is measured.
-    pub messages: Option<u64>,
-}
-
-/// What became of one topic's messages.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[schema(as = TopicReport)]
-pub struct TopicReport {
-    /// In the bag.
-    pub messages: u64,
-    /// Bytes of those.
-    pub bytes: u64,
-    /// Never complete on the wire: fragments were lost.
-    pub incomplete: u64,
-    /// Lost on the way: nothing of them was seen.
-    #[serde(default)]
-    pub lost: u64,
-    /// Came before their writer was announced, and not again.
-    #[serde(default)]
-    pub unannounced: u64,
-    /// On the wire, but lost on the way to the agent.
-    pub not_captured: u64,
-    /// Dropped because the storage was too slow.
-    pub dropped: u64,
-    /// Taken, and lost because the storage took no more.
-    pub unwritten: u64,
-    /// Came while the recording was paused.
-    pub paused: u64,
-}
-
-/// Consecutive samples of one writer that are missing for one reason.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[schema(as = MissingRun)]
-pub struct MissingRun {
-    /// Topic.
-    pub topic: String,
-    /// GUID of the writer.
-    pub writer: String,
-    /// Number of the first.
-    pub first_sequence_number: u64,
-    /// Number of the last.
-    pub last_sequence_number: u64,
-    /// How many of those in between.
-    pub samples: u64,
-    /// `incomplete`, `lost`, `unannounced`, `not_captured` or `dropped`.
-    pub reason: String,
-}
-
-impl Report {
-    /// A message is in the bag.
-    pub(super) fn written(&mut self, topic: &str, bytes: usize) {
-        let bytes = bytes as u64;
-        self.messages += 1;
-        self.bytes += bytes;
-        let topic = self.topic(topic);
-        topic.messages += 1;
-        topic.bytes += bytes;
+/// Messages will never be in the bag.
+pub(super) fn add_missed(report: &mut Report, missed: &Missed) {
+    report.missing += missed.samples;
+    let topic = report.topic(&missed.topic.name);
+    let (count, reason) = match missed.reason {
+        MissedReason::Incomplete => (&mut topic.incomplete, "incomplete"),
+        MissedReason::Lost => (&mut topic.lost, "lost"),
+        MissedReason::Unannounced => (&mut topic.unannounced, "unannounced"),
+        MissedReason::NotCaptured => (&mut topic.not_captured, "not_captured"),
+        MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
+    };
+    *count += missed.samples;
+    if report.missing_runs.len() >= RUNS {
+        report.missing_runs_unnamed += 1;
+        return;
     }
+    report.missing_runs.push(MissingRun {
+        topic: missed.topic.name.to_string(),
+        writer: missed.writer.to_string(),
+        first_sequence_number: missed.first,
+        last_sequence_number: missed.last,
+        samples: missed.samples,
+        reason: reason.to_owned(),
+    });
+}
 
-    /// A message came while the recording was paused.
-    pub(super) fn paused(&mut self, topic: &str) {
-        self.topic(topic).paused += 1;
-    }
+/// Messages that were taken for written are not in the bag after all.
+pub(super) fn take_back(report: &mut Report, topic: &str, messages: u64, bytes: u64) {
+    report.messages = report.messages.saturating_sub(messages);
+    report.bytes = report.bytes.saturating_sub(bytes);
+    report.missing += messages;
+    let topic = report.topic(topic);
+    topic.messages = topic.messages.saturating_sub(messages);
+    topic.bytes = topic.bytes.saturating_sub(bytes);
+    topic.unwritten += messages;
+}
 
-    /// Messages will never be in the bag.
-    pub(super) fn missed(&mut self, missed: &Missed) {
-        self.missing += missed.samples;
-        let topic = self.topic(&missed.topic.name);
-        let (count, reason) = match missed.reason {
-            MissedReason::Incomplete => (&mut topic.incomplete, "incomplete"),
-            MissedReason::Lost => (&mut topic.lost, "lost"),
-            MissedReason::Unannounced => (&mut topic.unannounced, "unannounced"),
-            MissedReason::NotCaptured => (&mut topic.not_captured, "not_captured"),
-            MissedReason::QueueFull => (&mut topic.dropped, "dropped"),
-        };
-        *count += missed.samples;
-        if self.missing_runs.len() >= RUNS {
-            self.missing_runs_unnamed += 1;
-            return;
+/// For a bag's metadata: one line of JSON.
+pub(super) fn custom_data(report: &Report) -> BTreeMap<String, String> {
+    // Numbers and strings: nothing that could fail.
+    let text = serde_json::to_string(report).unwrap_or_default();
+    BTreeMap::from([(CUSTOM_DATA.to_owned(), text)])
+}
+
+/// For people: what is missing, a line for each topic; nothing where nothing is.
+#[must_use]
+pub fn shortfalls(report: &Report) -> Vec<String> {
+    let mut lines = Vec::new();
+    for (name, topic) in &report.topics {
+        let counts = [
+            (topic.incomplete, "incomplete on the wire"),
+            (topic.lost, "lost on the way"),
+            (topic.not_captured, "could not be captured"),
+            (topic.dropped, "dropped, the storage was too slow"),
+            (topic.unwritten, "not written, the storage was full"),
+            (topic.unannounced, "sent before their writer was announced"),
+        ];
+        let counts = counts.into_iter().filter(|(count, _)| *count > 0);
+        let missing: u64 = counts.clone().map(|(count, _)| count).sum();
+        if missing > 0 {
+            let recorded = topic.messages;
+            let all = recorded + missing;
+            let counts: Vec<String> = counts
+                .map(|(count, what)| format!("{count} {what}"))
+                .collect();
+            let counts = counts.join(", ");
+            lines.push(format!(
+                "{name}: {recorded} of {all} messages recorded; {counts}"
+            ));
         }
-        self.missing_runs.push(MissingRun {
-            topic: missed.topic.name.to_string(),
-            writer: missed.writer.to_string(),
-            first_sequence_number: missed.first,
-            last_sequence_number: missed.last,
-            samples: missed.samples,
-            reason: reason.to_owned(),
+    }
+    for name in &report.sent_before {
+        lines.push(format!(
+            "{name} is transient local: messages sent before recording started are missing \
+             (see `retain: last`)"
+        ));
+    }
+    for name in &report.left_out {
+        lines.push(format!(
+            "{name}: other types than the first are not recorded"
+        ));
+    }
+    lines.extend(unobserved_lines(&report.unobserved));
+    let UnknownWriters { writers, messages } = report.unknown_writers;
+    if writers > 0 {
+        lines.push(format!(
+            "not recorded: {} of {} whose announcement was missed",
+            counted(messages, "message"),
+            counted(writers, "unknown writer")
+        ));
+    }
+    for domain in &report.other_domains {
+        let OtherDomain {
+            domain_id,
+            topics,
+            messages,
+        } = domain;
+        let messages = messages.map_or_else(String::new, |count| {
+            format!(" with {}", counted(count, "message"))
         });
+        let topics = counted(*topics, "topic");
+        lines.push(format!(
+            "not recorded: {topics} of domain {domain_id}{messages} (`--domain {domain_id}`)"
+        ));
     }
-
-    /// Messages that were taken for written are not in the bag after all.
-    pub(super) fn unwritten(&mut self, topic: &str, messages: u64, bytes: u64) {
-        self.messages = self.messages.saturating_sub(messages);
-        self.bytes = self.bytes.saturating_sub(bytes);
-        self.missing += messages;
-        let topic = self.topic(topic);
-        topic.messages = topic.messages.saturating_sub(messages);
-        topic.bytes = topic.bytes.saturating_sub(bytes);
-        topic.unwritten += messages;
+    if let Some(limit) = &report.limit_reached {
+        lines.push(format!("ended by a limit: {limit}"));
     }
-
-    /// The topic is in the bag, if only by its name.
-    pub(super) fn topic(&mut self, name: &str) -> &mut TopicReport {
-        if !self.topics.contains_key(name) {
-            self.topics.insert(name.to_owned(), TopicReport::default());
-        }
-        self.topics.entry(name.to_owned()).or_default()
-    }
-
-    /// For a bag's metadata: one line of JSON.
-    #[must_use]
-    pub fn custom_data(&self) -> BTreeMap<String, String> {
-        // Numbers and strings: nothing that could fail.
-        let text = serde_json::to_string(self).unwrap_or_default();
-        BTreeMap::from([(CUSTOM_DATA.to_owned(), text)])
-    }
-
-    /// Whether everything that was sent is in the bag, as far as that is known. Topics without a
-    /// subscriber are: their publishers send nothing.
-    #[must_use]
-    pub fn is_complete(&self) -> bool {
-        self.missing == 0
-            && self.left_out.is_empty()
-            && self.unknown_writers.writers == 0
-            && self.other_domains.is_empty()
-            && self.unobserved.values().all(|why| why == NO_SUBSCRIBER)
-    }
-
-    /// For people: what is missing, a line for each topic; nothing where nothing is.
-    #[must_use]
-    pub fn shortfalls(&self) -> Vec<String> {
-        let mut lines = Vec::new();
-        for (name, topic) in &self.topics {
-            let counts = [
-                (topic.incomplete, "incomplete on the wire"),
-                (topic.lost, "lost on the way"),
-                (topic.not_captured, "could not be captured"),
-                (topic.dropped, "dropped, the storage was too slow"),
-                (topic.unwritten, "not written, the storage was full"),
-                (topic.unannounced, "sent before their writer was announced"),
-            ];
-            let counts = counts.into_iter().filter(|(count, _)| *count > 0);
-            let missing: u64 = counts.clone().map(|(count, _)| count).sum();
-            if missing > 0 {
-                let recorded = topic.messages;
-                let all = recorded + missing;
-                let counts: Vec<String> = counts
-                    .map(|(count, what)| format!("{count} {what}"))
-                    .collect();
-                let counts = counts.join(", ");
-                lines.push(format!(
-                    "{name}: {recorded} of {all} messages recorded; {counts}"
-                ));
-            }
-        }
-        for name in &self.sent_before {
-            lines.push(format!(
-                "{name} is transient local: messages sent before recording started are missing \
-                 (see `retain: last`)"
-            ));
-        }
-        for name in &self.left_out {
-            lines.push(format!(
-                "{name}: other types than the first are not recorded"
-            ));
-        }
-        lines.extend(unobserved_lines(&self.unobserved));
-        let UnknownWriters { writers, messages } = self.unknown_writers;
-        if writers > 0 {
-            lines.push(format!(
-                "not recorded: {} of {} whose announcement was missed",
-                counted(messages, "message"),
-                counted(writers, "unknown writer")
-            ));
-        }
-        for domain in &self.other_domains {
-            let OtherDomain {
-                domain_id,
-                topics,
-                messages,
-            } = domain;
-            let messages = messages.map_or_else(String::new, |count| {
-                format!(" with {}", counted(count, "message"))
-            });
-            let topics = counted(*topics, "topic");
-            lines.push(format!(
-                "not recorded: {topics} of domain {domain_id}{messages} (`--domain {domain_id}`)"
-            ));
-        }
-        if let Some(limit) = &self.limit_reached {
-            lines.push(format!("ended by a limit: {limit}"));
-        }
-        lines
-    }
+    lines
 }
-
 /// For people: why nothing of these topics is seen, a line for each reason.
 #[must_use]
 pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
@@ -355,9 +226,9 @@ mod tests {
     #[test]
     fn what_is_missing_is_counted_by_reason_and_named_with_its_numbers() {
         let mut report = Report::default();
-        report.written("/points", 100);
-        report.missed(&missed(2, 3, MissedReason::Incomplete));
-        report.missed(&missed(9, 1, MissedReason::QueueFull));
+        add_written(&mut report, "/points", 100);
+        add_missed(&mut report, &missed(2, 3, MissedReason::Incomplete));
+        add_missed(&mut report, &missed(9, 1, MissedReason::QueueFull));
         assert_eq!((report.messages, report.missing), (1, 4));
         let topic = &report.topics["/points"];
         assert_eq!((topic.incomplete, topic.dropped), (3, 1));
@@ -367,7 +238,7 @@ mod tests {
             (2, 4)
         );
         assert_eq!(
-            report.shortfalls(),
+            shortfalls(&report),
             [
                 "/points: 1 of 5 messages recorded; 3 incomplete on the wire, 1 dropped, \
               the storage was too slow"
@@ -379,7 +250,10 @@ mod tests {
     fn a_long_list_of_runs_is_cut_and_counted() {
         let mut report = Report::default();
         for first in 0..RUNS as u64 + 5 {
-            report.missed(&missed(first * 2 + 1, 1, MissedReason::Incomplete));
+            add_missed(
+                &mut report,
+                &missed(first * 2 + 1, 1, MissedReason::Incomplete),
+            );
         }
         assert_eq!(report.missing_runs.len(), RUNS);
         assert_eq!(
@@ -391,12 +265,12 @@ mod tests {
     #[test]
     fn what_the_storage_refused_counts_as_missing() {
         let mut report = Report::default();
-        report.written("/points", 100);
-        report.written("/points", 100);
-        report.unwritten("/points", 1, 100);
+        add_written(&mut report, "/points", 100);
+        add_written(&mut report, "/points", 100);
+        take_back(&mut report, "/points", 1, 100);
         assert_eq!((report.messages, report.bytes, report.missing), (1, 100, 1));
-        assert!(report.shortfalls()[0].ends_with("1 not written, the storage was full"));
-        let json = &report.custom_data()[CUSTOM_DATA];
+        assert!(shortfalls(&report)[0].ends_with("1 not written, the storage was full"));
+        let json = &custom_data(&report)[CUSTOM_DATA];
         assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
     }
 
@@ -418,7 +292,7 @@ mod tests {
             messages: Some(12),
         }];
         assert_eq!(
-            report.shortfalls(),
+            shortfalls(&report),
             [
                 "/imu: no message recorded; publisher and subscriber share one process; nothing \
                  crosses the network",

@@ -13,10 +13,9 @@ use jiff::Zoned;
 use tokio::sync::Notify;
 
 use super::disk_quota::DiskQuota;
-use super::filter::{Filter, FilterError, FilterOptions};
+use super::filter::{Filter, FilterError};
 use super::graph::{DiscoveredTopic, GraphSnapshot};
 use super::recorder::{Finished, Recorder, Sources};
-use super::report::Report;
 use super::session::{self, Activity, Command};
 use crate::config::{Limit, RecordingLimits};
 use crate::events::{AgentEvent, EventLog};
@@ -27,7 +26,9 @@ use crate::subscriptions::{
     ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
     Subscriptions,
 };
-use ros2probe_bag::{Options, Schema, Writer};
+use ros2probe_api::recording_report::Report;
+use ros2probe_api::recordings::{FilterOptions, RecordingState};
+use ros2probe_bag::{Error, Options, Schema, Writer};
 use ros2probe_capture::system::give_back_memory;
 use ros2probe_message::Library;
 use ros2probe_wire::DomainId;
@@ -129,18 +130,6 @@ pub struct Status {
     pub error: Option<String>,
 }
 
-/// What a recording is doing.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum RecordingState {
-    /// Taking what comes.
-    #[default]
-    Recording,
-    /// Letting it go by.
-    Paused,
-    /// The bag is complete.
-    Ended,
-}
-
 /// Why nothing is recorded.
 #[derive(Debug, thiserror::Error)]
 pub enum Refusal {
@@ -151,13 +140,16 @@ pub enum Refusal {
     )]
     NoDirectory,
     /// No name of a directory.
-    #[error("`{0}` is no name: letters, digits, `_`, `-` and `.`, not first a `.`")]
+    #[error(
+        "`{0}` is not a valid name: use letters, digits, `_`, `-` and `.`, not starting with \
+             `.`"
+    )]
     Name(String),
     /// There is one of that name.
-    #[error("there is a recording `{0}` already")]
+    #[error("a recording named `{0}` already exists")]
     Exists(String),
     /// As many as may are under way.
-    #[error("{0} recordings are under way, which is the limit (limits.recordings)")]
+    #[error("{0} recordings are running, which is the limit (limits.recordings)")]
     TooMany(usize),
     /// The topics.
     #[error(transparent)]
@@ -231,22 +223,8 @@ impl Recordings {
         let mut recorder =
             Recorder::new(writer, filter, wanted.domain_id, before, sources).within(quota);
         recorder.pause(wanted.paused);
-        let known = self.latest.state();
-        let covered = known.known().topics.iter().filter(|topic| {
-            let (kind, hidden) = (topic.kind, topic.hidden);
-            topic.domain_id == DomainId(wanted.domain_id)
-                && subscription
-                    .selection()
-                    .covers(kind, &topic.name, &topic.dds_name, hidden)
-        });
-        // Messages come of no more than are measured; whoever announces thousands fills no bag.
-        let covered = covered.take(self.caps.caps().topics);
-        let covered = covered.filter_map(|topic| {
-            let message_type = topic.message_types.first()?;
-            Some((topic.name.as_str(), message_type.as_str()))
-        });
-        let declared = recorder.declare(covered);
-        declared.map_err(|error| refusal(&name, error))?;
+        self.declare(&mut recorder, &subscription, wanted.domain_id)
+            .map_err(|error| refusal(&name, error))?;
         let (give, commands) = channel();
         let recording = Arc::new(Recording {
             name,
@@ -262,20 +240,49 @@ impl Recordings {
         self.events.record(AgentEvent::RecordingStarted {
             recording: recording.name.clone(),
         });
-        let worker = Arc::clone(&recording);
+        let thread = self.spawn(&recording, recorder, (subscription, place), commands)?;
+        *locked(&recording.thread) = Some(thread);
+        list.push(Arc::clone(&recording));
+        forget_ended(&mut list);
+        Ok(recording)
+    }
+
+    /// Declares the known topics that the subscription covers, as many as are measured: a robot that
+    /// announces thousands fills no bag.
+    fn declare(
+        &self,
+        recorder: &mut Recorder<'_>,
+        subscription: &Subscription,
+        domain_id: u32,
+    ) -> Result<(), Error> {
+        let state = self.latest.state();
+        let covered = state.known().topics.iter().filter(|topic| {
+            let (kind, hidden) = (topic.kind, topic.hidden);
+            topic.domain_id == DomainId(domain_id)
+                && subscription
+                    .selection()
+                    .covers(kind, &topic.name, &topic.dds_name, hidden)
+        });
+        let covered = covered.take(self.caps.caps().topics);
+        recorder.declare(covered.filter_map(|topic| {
+            let message_type = topic.message_types.first()?;
+            Some((topic.name.as_str(), message_type.as_str()))
+        }))
+    }
+
+    /// Starts the thread of a recording; removes the bag, which is empty, if that fails.
+    fn spawn(
+        &self,
+        recording: &Arc<Recording>,
+        recorder: Recorder<'static>,
+        source: (Subscription, Slot),
+        commands: Receiver<Command>,
+    ) -> Result<JoinHandle<()>, Refusal> {
+        let worker = Arc::clone(recording);
         let (events, figures) = (Arc::clone(&self.events), Arc::clone(&self.figures));
-        let work = move || {
-            worker.work(
-                recorder,
-                (subscription, place),
-                &commands,
-                &events,
-                &figures,
-            );
-        };
+        let work = move || worker.work(recorder, source, &commands, &events, &figures);
         let thread = std::thread::Builder::new().name("recording".to_owned());
-        let thread = thread.spawn(work).map_err(|error| {
-            // The bag was made just now, and nothing is in it.
+        thread.spawn(work).map_err(|error| {
             let _ = std::fs::remove_dir_all(&recording.directory);
             let reason = format!("no thread for it: {error}");
             self.events.record(AgentEvent::RecordingEnded {
@@ -285,11 +292,7 @@ impl Recordings {
                 reason: Some(reason.clone()),
             });
             Refusal::Storage { reason }
-        })?;
-        *locked(&recording.thread) = Some(thread);
-        list.push(Arc::clone(&recording));
-        forget_ended(&mut list);
-        Ok(recording)
+        })
     }
 
     /// All of them, as they began.

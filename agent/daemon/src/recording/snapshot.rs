@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::filter::{Filter, FilterOptions};
+use super::filter::Filter;
 use super::graph::GraphSnapshot;
 use super::recorder::Recorder;
 use super::sample_ring::SampleRing;
@@ -24,6 +24,7 @@ use crate::events::AgentEvent;
 use crate::events::Value;
 use crate::recording::SnapshotFigures;
 use crate::subscriptions::{Item, Selection, Subscription};
+use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{Options, Writer};
 
 /// How long orders and events wait at most.

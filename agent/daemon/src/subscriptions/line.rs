@@ -80,8 +80,7 @@ pub fn offered(offered: &Offered) -> samples::Offered {
 }
 
 /// What a writer announced, as discovery has it.
-#[must_use]
-pub fn announced(offered: &samples::Offered) -> Offered {
+pub(super) fn announced(offered: &samples::Offered) -> Offered {
     Offered {
         type_hash: offered.type_hash.as_deref().and_then(TypeHash::parse),
         qos: Arc::new(qos(&offered.qos)),

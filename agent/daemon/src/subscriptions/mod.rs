@@ -8,6 +8,7 @@
 mod backlog;
 mod channel;
 pub mod line;
+pub mod line_reader;
 mod retained;
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
@@ -28,6 +29,7 @@ use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
 use ros2probe_model::selection::SampleRequest;
 
 pub use ros2probe_model::dispatch::{Missed, MissedReason, Topic};
+pub use ros2probe_model::header::begins_with_header;
 pub use ros2probe_model::selection::{Choice, ChoiceError, Depth, Selection};
 
 /// Regular expressions of all subscriptions together.

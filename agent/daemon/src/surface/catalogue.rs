@@ -166,17 +166,17 @@ pub(super) const PARTICIPANT_INFO: Metric = Metric::info(
 pub(super) const TOPICS: Metric = Metric::gauge(
     "ros2_topics",
     &["domain_id", "kind"],
-    "DDS topics with at least one endpoint, by what ROS uses them for.",
+    "DDS topics with at least one endpoint, by their role in ROS.",
 );
 pub(super) const DISCOVERY_EVENTS: Metric = Metric::counter(
     "ros2_discovery_events_total",
     &["domain_id", "entity", "event"],
-    "Participants, writers, readers and nodes that appeared, changed or went, and how.",
+    "Participants, writers, readers and nodes that appeared, changed or left, by event.",
 );
 pub(super) const UNKNOWN_WRITERS: Metric = Metric::gauge(
     "ros2_unknown_writers",
     &[],
-    "Writers that send although their announcement was not seen.",
+    "Active writers whose announcement was not seen.",
 );
 pub(super) const UNKNOWN_WRITER_MESSAGES: Metric = Metric::counter(
     "ros2_unknown_writer_messages_total",
@@ -187,7 +187,7 @@ pub(super) const UNKNOWN_WRITER_MESSAGES: Metric = Metric::counter(
 pub(super) const UNKNOWN_WRITER_RATE: Metric = Metric::gauge(
     "ros2_unknown_writer_rate_hertz",
     UNKNOWN,
-    "Messages a second of unknown writers over the agent's last window, for people.",
+    "Messages per second of unknown writers in the agent's last window; for display.",
 )
 .unit("hertz")
 .experimental();
@@ -221,7 +221,7 @@ pub(super) const TOPIC_SUBSCRIPTIONS: Metric =
 pub(super) const TOPIC_MESSAGES: Metric = Metric::counter(
     "ros2_topic_messages_total",
     TOPIC,
-    "Messages seen whole, each counted once, in however many copies.",
+    "Messages seen whole, each counted once regardless of copies.",
 );
 pub(super) const TOPIC_BYTES: Metric = Metric::counter(
     "ros2_topic_bytes_total",
@@ -258,13 +258,14 @@ pub(super) const TOPIC_LAST_MESSAGE: Metric = Metric::gauge(
 pub(super) const TOPIC_RATE: Metric = Metric::gauge(
     "ros2_topic_rate_hertz",
     TOPIC,
-    "Messages a second over the agent's last window, for people; rules use rate() of the counter.",
+    "Messages per second in the agent's last window; for display. Rules should use rate() of the \
+     counter.",
 )
 .unit("hertz");
 pub(super) const TOPIC_BANDWIDTH: Metric = Metric::gauge(
     "ros2_topic_bandwidth_bytes_per_second",
     TOPIC,
-    "Payload bytes a second over the same window, for people.",
+    "Payload bytes per second in the same window; for display.",
 );
 pub(super) const TOPIC_INTERARRIVAL: Metric = Metric::histogram(
     "ros2_topic_interarrival_seconds",
@@ -275,43 +276,45 @@ pub(super) const TOPIC_INTERARRIVAL: Metric = Metric::histogram(
 pub(super) const TOPIC_LATENCY: Metric = Metric::histogram(
     "ros2_topic_latency_seconds",
     TOPIC,
-    "From the writer's timestamp to the capture; across hosts it needs synchronised clocks.",
+    "Time from the writer's timestamp to the capture; across hosts it requires synchronised \
+     clocks.",
 )
 .unit("seconds");
 pub(super) const TOPIC_HEADER_LATENCY: Metric = Metric::histogram(
     "ros2_topic_header_latency_seconds",
     TOPIC,
-    "From the message's Header.stamp to the capture; across hosts it needs synchronised clocks.",
+    "Time from the message's Header.stamp to the capture; across hosts it requires synchronised \
+     clocks.",
 )
 .unit("seconds");
 pub(super) const TOPIC_NEGATIVE_LATENCY: Metric = Metric::counter(
     "ros2_topic_negative_latency_messages_total",
     TOPIC,
-    "Messages stamped after their capture: clocks are apart. They are in no latency histogram.",
+    "Messages stamped after their capture because clocks differ; not in latency histograms.",
 );
 pub(super) const TOPIC_IMPLAUSIBLE_LATENCY: Metric = Metric::counter(
     "ros2_topic_implausible_latency_messages_total",
     TOPIC,
-    "Messages stamped more than an hour before or after their capture: the sender's clock was never \
-     set, or the timestamp is forged. They are in no latency histogram.",
+    "Messages stamped more than an hour before or after their capture: the sender's clock is not \
+     set, or the timestamp is forged. Not in latency histograms.",
 );
 pub(super) const TOPIC_DOUBTED_JUMPS: Metric = Metric::counter(
     "ros2_topic_doubted_sequence_jumps_total",
     TOPIC,
-    "Jumps of a writer's sequence numbers, ahead by more than 64 or back, that one datagram does not \
-     prove: its writer restarted, the agent missed messages, or the datagram is forged.",
+    "Jumps of a writer's sequence numbers, backwards or by more than 64, that a single datagram \
+     cannot confirm: the writer restarted, the agent missed messages, or the datagram is forged.",
 );
 
 pub(super) const TOPIC_SAMPLED: Metric = Metric::counter(
     "ros2_topic_sampled_messages_total",
     TOPIC,
-    "Messages counted by the span of sequence numbers, because the topic is sampled in shared \
-     memory; not every one was seen, and none is reported lost.",
+    "Messages counted from sequence numbers because the topic is sampled in shared memory; \
+     unseen messages are not reported as lost.",
 );
 pub(super) const TOPIC_SAMPLED_SEEN: Metric = Metric::counter(
     "ros2_topic_sampled_seen_messages_total",
     TOPIC,
-    "Sampled messages that were seen; intervals and latencies are of these.",
+    "Sampled messages that were seen; intervals and latencies cover only these.",
 );
 pub(super) const TOPIC_SAMPLED_UNCERTAIN: Metric = Metric::counter(
     "ros2_topic_sampled_uncertain_total",
@@ -322,33 +325,36 @@ pub(super) const TOPIC_SAMPLED_UNCERTAIN: Metric = Metric::counter(
 pub(super) const TOPIC_COVERAGE: Metric = Metric::gauge(
     "ros2_topic_sampled_coverage_ratio",
     TOPIC,
-    "Seen of sampled messages since the start, for people; rules divide the counters.",
+    "Fraction of sampled messages that were seen since the start; for display. Rules should \
+     divide the counters.",
 )
 .unit("ratio");
 pub(super) const TOPIC_PAIRS: Metric = Metric::gauge(
     "ros2_topic_pairs",
     &["domain_id", "topic", "passage"],
-    "Pairs of writer and reader by how messages pass between them, as both announce: network, shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are not seen).",
+    "Pairs of writer and reader by the path of their messages, as both announce it: network, \
+     shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are not \
+     visible).",
 );
 
 // Writers, on request.
 pub(super) const WRITER_MESSAGES: Metric = Metric::counter(
     "ros2_writer_messages_total",
     WRITER,
-    "As for the topic, of one writer.",
+    "Messages of one writer seen whole.",
 )
 .experimental();
 pub(super) const WRITER_BYTES: Metric = Metric::counter(
     "ros2_writer_bytes_total",
     WRITER,
-    "As for the topic, of one writer.",
+    "Payload bytes of those messages.",
 )
 .unit("bytes")
 .experimental();
 pub(super) const WRITER_LOST: Metric = Metric::counter(
     "ros2_writer_lost_messages_total",
     WRITER,
-    "As for the topic, of one writer.",
+    "Messages of one writer that were sent but never seen whole.",
 )
 .experimental();
 
@@ -356,12 +362,13 @@ pub(super) const WRITER_LOST: Metric = Metric::counter(
 pub(super) const WATCH_STATE: Metric = Metric::gauge(
     "ros2_watch_state",
     &["domain_id", "topic", "watch", "state"],
-    "1 for the state a watched topic is in: ok, violated, silent, not_published or no_subscriber.",
+    "1 for the current state of a watched topic: ok, violated, silent, not_published or \
+     no_subscriber.",
 );
 pub(super) const WATCH_VIOLATED: Metric = Metric::gauge(
     "ros2_watch_expectation_violated",
     &["domain_id", "topic", "watch", "expectation"],
-    "1 while a configured expectation is broken, after hysteresis.",
+    "1 while a configured expectation is violated, after hysteresis.",
 );
 
 /// All of them, in the order of the page.

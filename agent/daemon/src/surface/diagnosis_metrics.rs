@@ -41,36 +41,7 @@ pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::
             family.sample(&labels, *count)
         })
     })?;
-    let per_topic: [(&'static Metric, Count); 4] = [
-        (&metric::TOPIC_CONFLICTING_TYPES, |each| match each {
-            Diagnosis::TypeConflict { types, .. } => types.len(),
-            _ => 0,
-        }),
-        (&metric::TOPIC_CONFLICTING_TYPE_HASHES, |each| match each {
-            Diagnosis::TypeHashConflict { hashes, .. } => hashes.len(),
-            _ => 0,
-        }),
-        (&metric::UNHEARD_PUBLISHERS, |each| {
-            usize::from(matches!(each, Diagnosis::UnheardPublisher { .. }))
-        }),
-        (&metric::UNFED_SUBSCRIPTIONS, |each| {
-            usize::from(matches!(each, Diagnosis::UnfedSubscriber { .. }))
-        }),
-    ];
-    for (metric, count) in per_topic {
-        let mut counts = PerTopic::new();
-        for each in &found.list {
-            if let (Some(topic), count @ 1..) = (each.topic(), count(each)) {
-                *counts.entry(series(topic)).or_default() += count;
-            }
-        }
-        sink.family(metric, |family| {
-            counts.iter().try_for_each(|((domain_id, topic), count)| {
-                let labels = [Label::Number((*domain_id).into()), Label::Text(topic)];
-                family.sample(&labels, *count)
-            })
-        })?;
-    }
+    per_topic(sink, &found.list)?;
     sink.family(&metric::DUPLICATE_NODES, |family| {
         found.list.iter().try_for_each(|each| match each {
             Diagnosis::DuplicateNode {
@@ -97,6 +68,41 @@ pub(super) fn diagnoses(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::
             _ => Ok(()),
         })
     })
+}
+
+/// How many of something each topic has.
+fn per_topic(sink: &mut MetricSink<'_>, list: &[Diagnosis]) -> fmt::Result {
+    let metrics: [(&'static Metric, Count); 4] = [
+        (&metric::TOPIC_CONFLICTING_TYPES, |each| match each {
+            Diagnosis::TypeConflict { types, .. } => types.len(),
+            _ => 0,
+        }),
+        (&metric::TOPIC_CONFLICTING_TYPE_HASHES, |each| match each {
+            Diagnosis::TypeHashConflict { hashes, .. } => hashes.len(),
+            _ => 0,
+        }),
+        (&metric::UNHEARD_PUBLISHERS, |each| {
+            usize::from(matches!(each, Diagnosis::UnheardPublisher { .. }))
+        }),
+        (&metric::UNFED_SUBSCRIPTIONS, |each| {
+            usize::from(matches!(each, Diagnosis::UnfedSubscriber { .. }))
+        }),
+    ];
+    for (metric, count) in metrics {
+        let mut counts = PerTopic::new();
+        for each in list {
+            if let (Some(topic), count @ 1..) = (each.topic(), count(each)) {
+                *counts.entry(series(topic)).or_default() += count;
+            }
+        }
+        sink.family(metric, |family| {
+            counts.iter().try_for_each(|((domain_id, topic), count)| {
+                let labels = [Label::Number((*domain_id).into()), Label::Text(topic)];
+                family.sample(&labels, *count)
+            })
+        })?;
+    }
+    Ok(())
 }
 
 fn series(topic: &TopicKey) -> (DomainId, Cow<'_, str>) {

@@ -193,6 +193,11 @@ pub(super) fn graph(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Resu
             family.sample(&labels, churn.count)
         })
     })?;
+    unknown_writers(sink, snapshot)
+}
+
+/// Writers whose announcement was missed.
+fn unknown_writers(sink: &mut MetricSink<'_>, snapshot: &Snapshot) -> fmt::Result {
     sink.single(&metric::UNKNOWN_WRITERS, snapshot.unknown_writers.len())?;
     let unknown = || snapshot.unknown_writers.iter().take(MAX_UNKNOWN_WRITERS);
     sink.family(&metric::UNKNOWN_WRITER_MESSAGES, |family| {
@@ -333,6 +338,15 @@ pub(super) fn topics(
         })?;
     }
     sampled(sink, rows)?;
+    histograms(sink, rows, settings)
+}
+
+/// Distributions of intervals and latencies.
+fn histograms(
+    sink: &mut MetricSink<'_>,
+    rows: &[TopicRow<'_>],
+    settings: &Settings,
+) -> fmt::Result {
     let histograms: [(&Metric, Values); 3] = [
         (&metric::TOPIC_INTERARRIVAL, |measured| {
             &measured.interarrival

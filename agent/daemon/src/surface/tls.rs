@@ -38,7 +38,7 @@ pub enum TlsError {
         source: io::Error,
     },
     /// A file holds something else.
-    #[error("{} (`tls_server_config`) is not as it should be", path.display())]
+    #[error("{} (`tls_server_config`) is invalid", path.display())]
     Pem {
         /// Which.
         path: PathBuf,

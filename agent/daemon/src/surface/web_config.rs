@@ -59,8 +59,8 @@ pub enum WebConfigError {
     },
     /// Encryption is no part of this program.
     #[error(
-        "{} (`metrics.web_config`) asks for TLS, which this `rp` was built without: build it with \
-         `--features tls`, or let a proxy encrypt", path.display()
+        "{} (`metrics.web_config`) requires TLS, which this build lacks: build `rp` with \
+         `--features tls`, or encrypt with a proxy", path.display()
     )]
     WithoutTls {
         /// Which.

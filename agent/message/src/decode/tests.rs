@@ -1,4 +1,4 @@
-//! Payloads by hand: alignment, lengths, encodings, and what is refused.
+//! Hand-written payloads: alignment, lengths, encodings, and rejected input.
 
 use super::*;
 use crate::python;
@@ -32,11 +32,11 @@ fn xcdr1_aligns_to_eight_and_xcdr2_to_four() {
         \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     let shown = "a.msg.B(inner=[a.msg.Inner(small=5, middle=9, large=1.5, name='x')], last=7)";
     assert_eq!(text(NESTED, xcdr1), shown);
-    // The sequence's size stands before its length.
+    // The sequence's size precedes its length.
     let plain = b"\0\x07\0\0\x1a\0\0\0\x01\0\0\0\x05\0\0\0\x09\0\0\0\0\0\0\0\0\0\xf8\x3f\
         \x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     assert_eq!(text(NESTED, plain), shown);
-    // Each structure has its size, too.
+    // Each structure is preceded by its size, too.
     let delimited = b"\0\x09\0\0\x2c\0\0\0\x1e\0\0\0\x01\0\0\0\x16\0\0\0\x05\0\0\0\x09\0\0\0\
         \0\0\0\0\0\0\xf8\x3f\x02\0\0\0x\0\0\0\x07\0\0\0\0\0\0\0";
     assert_eq!(text(NESTED, delimited), shown);
@@ -74,15 +74,15 @@ fn what_cannot_be_read_is_refused_by_name() {
     let refused = |id: u8| read("uint8 a", &[0, id, 0, 0, 1]).unwrap_err().to_string();
     assert_eq!(
         refused(3),
-        "a parameter list (PL_CDR) (encapsulation 0x0003) is not read"
+        "a parameter list (PL_CDR) (encapsulation 0x0003) is not supported"
     );
     assert_eq!(
         refused(11),
-        "a parameter list (PL_CDR2) (encapsulation 0x000b) is not read"
+        "a parameter list (PL_CDR2) (encapsulation 0x000b) is not supported"
     );
     assert_eq!(
         refused(0x20),
-        "an unknown encoding (encapsulation 0x0020) is not read"
+        "an unknown encoding (encapsulation 0x0020) is not supported"
     );
     assert_eq!(
         read("uint8 a", &[0, 1, 0]),
@@ -107,7 +107,7 @@ fn a_length_beyond_the_payload_is_refused_before_anything_is_made_of_it() {
             "{schema}: {error}"
         );
     }
-    // Nothing has no octet: an empty message takes one.
+    // An element without octets cannot exist: an empty message takes one octet.
     let empty = "Empty[] a\n
 ================================================================================
 MSG: a/Empty\n";
@@ -176,7 +176,7 @@ fn what_is_strange_is_shown_and_counted() {
     let odd = |payload: &[u8]| read("uint8 a", payload).unwrap().1.trailing;
     assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4]), 0);
     assert_eq!(odd(&[0, 1, 0, 0, 1, 2, 3, 4, 5]), 4);
-    // A string without its NUL, and one that says it has not even that.
+    // A string without its NUL, and one whose length excludes even that.
     assert_eq!(
         text("string a", b"\0\x01\0\0\x02\0\0\0ab"),
         "a.msg.B(a='ab')"

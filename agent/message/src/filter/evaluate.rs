@@ -1,5 +1,5 @@
-//! An expression's value for a message, as Python would have it. What raises an exception there is
-//! an error here, in the same words where they are short.
+//! Evaluates an expression for a message as Python does. An exception in Python is an error here,
+//! with the same text if that is short.
 
 use std::borrow::Cow;
 use std::cmp::Ordering;
@@ -8,12 +8,12 @@ use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 use crate::python;
 use crate::value::{Array, Items, Message, Scalar, Value};
 
-/// What `m` is.
+/// The value of `m`.
 #[derive(Debug, Clone, Copy)]
 pub enum Subject<'a> {
     /// The whole message.
     Message(&'a Message<'a>),
-    /// A part of it, which `--field` selected.
+    /// The part of it selected by `--field`.
     Value(&'a Value<'a>),
     /// The payload, with `--raw`.
     Bytes(&'a [u8]),
@@ -28,7 +28,7 @@ pub(super) fn passes(node: &Node, subject: Subject<'_>) -> Result<bool, FilterEr
     Ok(evaluate(node, &object)?.is_true())
 }
 
-/// A value on the way.
+/// An intermediate value.
 #[derive(Debug, Clone)]
 enum Object<'a> {
     None,
@@ -91,7 +91,7 @@ impl<'a> Object<'a> {
         }
     }
 
-    /// Truth values are numbers, too.
+    /// Returns the value as a number; booleans are numbers, too.
     fn number(&self) -> Option<Number> {
         match self {
             Self::Bool(value) => Some(Number::Int(i128::from(*value))),
@@ -101,7 +101,7 @@ impl<'a> Object<'a> {
         }
     }
 
-    /// The elements, where there are any to walk.
+    /// Returns the elements, if the value is iterable.
     fn elements(&self) -> Option<Vec<Self>> {
         Some(match self {
             Self::List(items) => items.clone(),
@@ -301,7 +301,7 @@ fn binary<'a>(
     if let (Number::Int(one), Number::Int(other)) = (one, other) {
         let remainder = |one: i128, other: i128| {
             let remainder = one.wrapping_rem(other);
-            // Its sign is the divisor's, so the sum of both is nearer to 0 than either.
+            // The result has the divisor's sign, so the sum of both is nearer to 0 than either.
             let differs = remainder != 0 && (remainder < 0) != (other < 0);
             if differs {
                 remainder + other
@@ -312,7 +312,7 @@ fn binary<'a>(
         let floor = |one: i128, other: i128| {
             let quotient = one.checked_div(other)?;
             let rest = one.wrapping_rem(other);
-            // With a rest, the divisor is at least 2, and there is room below the quotient.
+            // With a remainder, the divisor is at least 2, so the quotient has room below.
             let below = rest != 0 && (rest < 0) != (other < 0);
             Some(quotient - i128::from(below))
         };

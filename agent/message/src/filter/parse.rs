@@ -1,12 +1,12 @@
-//! From words to an expression, by Python's precedence.
+//! Parses tokens into an expression, with Python's precedence.
 
 use super::tokens::{Token, TokenKind};
 use super::{Comparison, FilterError, Function, Kind, Method, Node, Operator};
 
-/// How deep parentheses, lists and signs may be nested.
+/// Deepest nesting of parentheses, lists and signs.
 const MAX_DEPTH: usize = 32;
 
-/// The expression that all words are.
+/// Parses all tokens as one expression.
 pub(super) fn expression(tokens: &[Token]) -> Result<Node, FilterError> {
     let mut parser = Parser {
         tokens,
@@ -220,7 +220,7 @@ impl<'a> Parser<'a> {
 
     fn postfix(&mut self) -> Result<Node, FilterError> {
         let mut node = self.atom()?;
-        // Each step is a level of the value, too.
+        // Each step is also a level of the value.
         let mut steps = 0;
         loop {
             let column = self.column();
@@ -264,7 +264,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Expressions up to the closing sign.
+    /// Parses expressions up to the closing token.
     fn list(&mut self, end: &str) -> Result<Vec<Node>, FilterError> {
         let mut nodes = Vec::new();
         loop {
@@ -303,7 +303,7 @@ impl<'a> Parser<'a> {
         Ok(Node { column, kind })
     }
 
-    /// What stands in parentheses; with a comma it is a list.
+    /// Parses the content of parentheses; with a comma it is a list.
     fn parenthesis(&mut self, column: usize) -> Result<Node, FilterError> {
         if self.sign(")") {
             return Ok(Node {

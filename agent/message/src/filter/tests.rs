@@ -55,7 +55,7 @@ fn expressions_mean_what_they_mean_in_python() {
             "m.n // 2 == -2 and m.n % 2 == 1 and m.n / 2 == -1.5 and 7.5 // 2 == 3",
             true,
         ),
-        // The smallest number there is here.
+        // The smallest number that the filter supports.
         (
             "-(2 ** 126) * 2 % 3 == 1 and -(2 ** 126) * 2 // 3 < -(2 ** 125)",
             true,

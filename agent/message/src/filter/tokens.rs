@@ -1,8 +1,8 @@
-//! An expression's words: names, numbers, strings and signs, each with its column.
+//! Tokens of an expression: names, numbers, strings and operators, each with its column.
 
 use super::FilterError;
 
-/// One word.
+/// One token.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Token {
     pub column: usize,
@@ -19,13 +19,13 @@ pub(super) enum TokenKind {
     End,
 }
 
-/// Longest first: `<=` is not `<` and `=`.
+/// Longest first: `<=` must not be read as `<` and `=`.
 const SIGNS: [&str; 22] = [
     "**", "//", "<=", ">=", "==", "!=", "<", ">", "+", "-", "*", "/", "%", "(", ")", "[", "]", ",",
     ".", "=", ":", "{",
 ];
 
-/// All words, the end being the last.
+/// Returns all tokens, the last of which marks the end.
 pub(super) fn tokens(text: &str) -> Result<Vec<Token>, FilterError> {
     let mut reader = Reader {
         rest: text,

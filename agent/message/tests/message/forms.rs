@@ -1,4 +1,4 @@
-//! Strings, floats and arrays with what Python prints of them.
+//! Strings, floats and arrays with Python's output for them.
 
 use std::borrow::Cow;
 use std::fs::File;
@@ -49,7 +49,7 @@ pub fn read() -> Vec<Form> {
 }
 
 impl Form {
-    /// Which kind it is, and what prints otherwise here.
+    /// Returns the number of forms, and those that are printed differently here.
     pub fn differences(&self) -> (usize, Vec<String>) {
         match self {
             Self::Text {

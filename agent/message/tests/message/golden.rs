@@ -1,4 +1,4 @@
-//! The golden cases: payloads that real middleware wrote, and what `ros2 topic echo` printed.
+//! The golden cases: payloads written by real middleware, and the output of `ros2 topic echo`.
 
 use std::fmt;
 use std::fs::File;
@@ -20,7 +20,7 @@ pub struct Case {
     pub message_type: String,
     pub label: String,
     pub payload: Vec<u8>,
-    /// Both as `echo` prints it and with `--full-length`.
+    /// Output of `echo`, and with `--full-length`.
     pub yaml_echo: String,
     pub yaml_full: String,
     pub csv: String,
@@ -75,7 +75,7 @@ pub fn bytes(hex: &str) -> Vec<u8> {
         .collect()
 }
 
-/// Those of `test_msgs` are here; all others come with the program.
+/// Returns a library with the types of `test_msgs` in the test data; the others are embedded.
 pub fn library() -> Library {
     Library::new(Sources {
         directories: vec![data().join("definitions")],
@@ -88,7 +88,7 @@ pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// What rosbags makes of lines of types and payloads.
+/// Returns rosbags' output for lines of types and payloads.
 pub fn rosbags(lines: &str) -> String {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = here.join("../../target/tools/bags/bin/python");

@@ -1,7 +1,8 @@
-//! A robot whose graph never stands still, and the truth about it: who is there, who went and how.
+//! A robot whose graph changes constantly, and the truth about it: which entities exist, and which
+//! left in what way.
 //!
-//! Participants say what DDS implementations say, at a bounded rate. What the sender knows is exact:
-//! a lease that it could not renew in time is one that ran out.
+//! Participants send what DDS implementations send, at a bounded rate. The sender's knowledge is
+//! exact: a lease that it could not renew in time is one that expired.
 
 mod member;
 
@@ -14,13 +15,14 @@ use super::storm::Dice;
 use super::{Carrier, PARTICIPANT, SPDP_WRITER};
 use member::{Member, announcer, entity, guid, role};
 
-/// Datagrams a second, at most.
+/// Most datagrams per second.
 const PACE: f64 = 2500.0;
-/// Whoever could not speak for this part of its lease is given up: what comes later might be too late.
+/// A participant that could not send for this part of its lease is given up: a later renewal might
+/// be too late.
 const LATE: f64 = 0.8;
-/// An observer tells the end of a lease within this.
+/// Time within which an observer notices the end of a lease.
 const GREY: Duration = Duration::from_millis(2500);
-/// Participants that stay, each with so many topics that carry messages.
+/// Permanent participants, and the number of measured topics of each.
 const STAYING: usize = 20;
 const MEASURED: usize = 10;
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
@@ -29,33 +31,33 @@ const ENTITIES_TOPIC: &str = "ros_discovery_info";
 const ENTITIES_TYPE: &str = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
 const TYPE: &str = "sensor_msgs::msg::dds_::PointCloud2_";
 
-/// How much goes on.
+/// Size and rate of change of the crowd.
 #[derive(Clone, Copy, Debug)]
 pub struct Scale {
-    /// Most participants that an observer may believe in at a time.
+    /// Most participants that an observer may consider alive at a time.
     pub participants: usize,
-    /// How long one lives, on average.
+    /// Mean lifetime of a participant.
     pub life: Duration,
-    /// Endpoints that come or go, a second.
+    /// Endpoints created or deleted per second.
     pub endpoint_changes: f64,
-    /// Messages a second of all measured topics.
+    /// Messages per second on all measured topics.
     pub messages: f64,
-    /// Leases in seconds, each with how many of a hundred participants have it.
+    /// Leases in seconds, each with the percentage of participants that have it.
     pub leases: &'static [(u64, u64)],
 }
 
-/// Who is there.
+/// The entities that exist.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Graph {
-    /// GUIDs.
+    /// GUIDs of participants.
     pub participants: BTreeSet<String>,
-    /// DDS topic, role and GUID.
+    /// DDS topic, role and GUID of endpoints.
     pub endpoints: BTreeSet<(String, &'static str, String)>,
-    /// Participant and name.
+    /// Participant and name of nodes.
     pub nodes: BTreeSet<(String, String)>,
 }
 
-/// What happened, by entity and event.
+/// Number of events, by entity and event.
 pub type Tally = BTreeMap<(&'static str, &'static str), u64>;
 
 pub struct Crowd<C> {
@@ -64,12 +66,12 @@ pub struct Crowd<C> {
     scale: Scale,
     target: usize,
     members: Vec<Member>,
-    /// Those that went without a word, until their leases end.
+    /// Participants that left without a disposal, until their leases end.
     silent: Vec<Member>,
     tally: Tally,
-    /// Messages of each measured topic.
+    /// Number of messages on each measured topic.
     messages: Vec<u32>,
-    /// What was said last of those that went since [`Crowd::forget`].
+    /// Last messages of participants that left since [`Crowd::forget`].
     farewells: Vec<Vec<u8>>,
     born: u32,
     due: Instant,
@@ -99,12 +101,12 @@ impl<C: Carrier> Crowd<C> {
         }
     }
 
-    /// How many there should be from now on.
+    /// Sets the target number of participants.
     pub fn aim(&mut self, participants: usize) {
         self.target = participants.clamp(STAYING, self.scale.participants);
     }
 
-    /// Lives for so long.
+    /// Changes the graph for this long.
     pub fn live(&mut self, span: Duration) -> Result<()> {
         let end = Instant::now() + span;
         while Instant::now() < end {
@@ -113,7 +115,7 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// Nobody comes or goes for so long, and nothing is sent but signs of life.
+    /// Keeps the graph unchanged for this long, and sends only renewals of leases.
     pub fn rest(&mut self, span: Duration) -> Result<()> {
         let end = Instant::now() + span;
         while Instant::now() < end {
@@ -122,13 +124,13 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// Whether an observer may be of two minds about somebody for the moment.
+    /// Returns whether an observer may currently be right either way about some participant.
     pub fn is_grey(&self) -> bool {
         let now = Instant::now();
         self.silent.iter().any(|member| member.ends() < now + GREY)
     }
 
-    /// As it is now.
+    /// Returns the current graph.
     pub fn graph(&self) -> Graph {
         let mut graph = Graph::default();
         for member in self.members.iter().chain(&self.silent) {
@@ -145,28 +147,28 @@ impl<C: Carrier> Crowd<C> {
         graph
     }
 
-    /// All that happened.
+    /// Returns the number of all events so far.
     pub fn tally(&self) -> &Tally {
         &self.tally
     }
 
-    /// How many messages each measured topic has carried.
+    /// Iterates over the measured topics with their number of messages.
     pub fn messages(&self) -> impl Iterator<Item = (String, u32)> {
         let counts = self.messages.iter().enumerate();
         counts.map(|(index, count)| (format!("/measured/topic_{index}"), *count))
     }
 
-    /// How many participants there are, with those that nobody knows to be gone.
+    /// Returns the number of participants, including those whose lease has not yet expired.
     pub fn size(&self) -> usize {
         self.members.len() + self.silent.len()
     }
 
-    /// How many there have been.
+    /// Returns the number of participants ever created.
     pub fn born(&self) -> u32 {
         self.born
     }
 
-    /// Says again all that still holds, for an observer that could not listen.
+    /// Repeats every valid announcement, for an observer that missed some.
     pub fn repeat(&mut self) -> Result<()> {
         for farewell in self.farewells.clone() {
             self.send(&farewell)?;
@@ -181,7 +183,7 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// An observer knows all that was said so far.
+    /// Forgets past messages: the observer has seen them.
     pub fn forget(&mut self) {
         self.farewells.clear();
     }
@@ -230,7 +232,7 @@ impl<C: Carrier> Crowd<C> {
         whole as u64
     }
 
-    /// Leases that have ended.
+    /// Removes participants whose leases have ended.
     fn bury(&mut self) {
         let now = Instant::now();
         let (silenced, members) = std::mem::take(&mut self.members)
@@ -250,7 +252,7 @@ impl<C: Carrier> Crowd<C> {
     fn renew(&mut self) -> Result<()> {
         for index in 0..self.members.len() {
             let member = &self.members[index];
-            // Held up while it renewed others, this may be too late for some.
+            // After a delay while others were renewed, this may be too late for some.
             if member.seen.elapsed() > member.lease / 3 && !member.is_late() {
                 let message = member.announcement();
                 self.send(&message)?;
@@ -309,12 +311,12 @@ impl<C: Carrier> Crowd<C> {
         Ok(())
     }
 
-    /// One that does not stay ends, in one of many ways.
+    /// Ends a participant that is not permanent, in one of several ways.
     fn death(&mut self) -> Result<()> {
         match self.dice.pick(10) {
             0..4 => self.dispose(),
             4..8 => self.silence().map(drop),
-            // The same node again, in another process, before anybody knows that the first is gone.
+            // The same node again in another process, before the first one's lease has ended.
             _ => match self.silence()? {
                 Some(node) if self.size() < self.scale.participants => self.birth(node),
                 _ => Ok(()),
@@ -375,12 +377,12 @@ impl<C: Carrier> Crowd<C> {
             }
         };
         self.send(&message)?;
-        // Whoever speaks is alive.
+        // Any message asserts liveliness.
         self.members[index].seen = Instant::now();
         Ok(())
     }
 
-    /// The next message of the next measured topic.
+    /// Sends the next message on the next measured topic.
     fn message(&mut self) -> Result<()> {
         const SIZES: [usize; 5] = [120, 320, 644, 1300, 6000];
         let index = self.next_topic;
@@ -442,7 +444,7 @@ impl<C: Carrier> Crowd<C> {
         100
     }
 
-    /// Somebody's topic; one in twenty is nobody's and new.
+    /// Returns a topic of another participant, or one time in twenty a new one.
     fn topic(&mut self) -> String {
         if self.dice.pick(20) == 0 {
             return format!("rt/once/topic_{}", self.dice.pick(1 << 40));

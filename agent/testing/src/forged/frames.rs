@@ -1,4 +1,4 @@
-//! Frames and packets put on a link as they are: a packet socket, a tun device, and IP fragments in
+//! Sends raw frames and packets: through a packet socket or a tun device, and as IP fragments in
 //! any order.
 
 use std::fs::File;
@@ -15,10 +15,11 @@ use crate::harness::network::Namespace;
 const IPV4: [u8; 2] = [0x08, 0x00];
 const UDP: u8 = 17;
 
-/// Changes the IP packets of a datagram before they are sent.
+/// Reorders or changes the IP packets of a datagram before they are sent.
 pub type Shuffle = fn(&mut Vec<Vec<u8>>);
 
-/// Puts Ethernet frames on an interface of a host, also fragments in an order no kernel sends.
+/// Sends Ethernet frames on an interface of a host, including fragments in an order that no kernel
+/// sends.
 pub struct Wire {
     socket: File,
     from: [u8; 4],
@@ -64,7 +65,7 @@ impl Carrier for Wire {
     }
 }
 
-/// A tun device: what is written to it arrives at its host as IP packets without a link layer.
+/// A tun device: bytes written to it arrive at its host as IP packets without a link layer.
 pub struct Tun {
     device: File,
     from: [u8; 4],
@@ -90,10 +91,10 @@ impl Carrier for Tun {
     }
 }
 
-/// A UDP payload as IPv4 packets that leave room for tags.
+/// Returns a UDP payload as IPv4 packets that leave room for tags.
 fn fragments(payload: &[u8], from: [u8; 4], to: [u8; 4], port: u16) -> Vec<Vec<u8>> {
     const STEP: usize = 1464;
-    // As a host does, not to be mistaken for a repetition.
+    // Unique, as for a real host, so that no datagram looks like a duplicate.
     static IDENTIFICATION: AtomicU16 = AtomicU16::new(0);
     let identification = IDENTIFICATION.fetch_add(1, Ordering::Relaxed);
     let length = u16::try_from(payload.len() + 8).unwrap_or(u16::MAX);
@@ -120,7 +121,7 @@ fn fragments(payload: &[u8], from: [u8; 4], to: [u8; 4], port: u16) -> Vec<Vec<u
     packets
 }
 
-/// RFC 1071.
+/// Computes the checksum of RFC 1071.
 fn checksum(header: &[u8]) -> u16 {
     let words = header.chunks_exact(2);
     let sum: u32 = words
@@ -140,7 +141,7 @@ fn packet_socket(interface: &str) -> io::Result<OwnedFd> {
     if index == 0 || descriptor < 0 {
         return Err(io::Error::last_os_error());
     }
-    // SAFETY: a descriptor that was just made and that nobody else has.
+    // SAFETY: a new descriptor without another owner.
     let socket = unsafe { OwnedFd::from_raw_fd(descriptor) };
     let address = libc::sockaddr_ll {
         sll_family: libc::AF_PACKET as libc::c_ushort,
@@ -167,7 +168,7 @@ fn tun_device(name: &str) -> io::Result<File> {
         .read(true)
         .write(true)
         .open("/dev/net/tun")?;
-    // struct ifreq: 16 bytes of name, flags, and room for the rest.
+    // struct ifreq: 16 bytes of name, flags, and padding.
     let mut request = [0_u8; 40];
     request[..name.len()].copy_from_slice(name.as_bytes());
     request[16..18].copy_from_slice(&(IFF_TUN | IFF_NO_PI).to_ne_bytes());

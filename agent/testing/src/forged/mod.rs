@@ -1,5 +1,5 @@
-//! RTPS of the tests' own making: for links on which no DDS implementation can be made to talk, and
-//! for what none would ever say.
+//! Hand-made RTPS traffic: for links on which no DDS implementation can run, and for messages that
+//! none would send.
 
 pub mod crowd;
 pub mod frames;
@@ -14,19 +14,19 @@ use ros2probe_capture::netns;
 
 use crate::harness::network::Namespace;
 
-/// Where participants of domain 0 listen for each other.
+/// Discovery port of participants in domain 0.
 pub const DISCOVERY_PORT: u16 = 7400;
 
 const SPDP_WRITER: [u8; 4] = [0, 1, 0, 0xc2];
 const PUBLICATIONS_WRITER: [u8; 4] = [0, 0, 3, 0xc2];
 const SUBSCRIPTIONS_WRITER: [u8; 4] = [0, 0, 4, 0xc2];
 const PARTICIPANT: [u8; 4] = [0, 0, 1, 0xc1];
-/// Of `ros_discovery_info`; user topics follow.
+/// Writer of `ros_discovery_info`; user topics follow.
 const ENTITIES_WRITER: [u8; 4] = [0, 0, 1, 3];
 pub const SAMPLES_WRITER: [u8; 4] = [0, 0, 2, 3];
 pub const FINITE_LEASE_SECONDS: u32 = 12;
 
-/// A participant with one node and one writer that only ever sends.
+/// A participant with one node and one writer that only sends.
 pub struct Talker {
     pub prefix: [u8; 12],
     topic: String,
@@ -44,7 +44,7 @@ impl Talker {
         }
     }
 
-    /// SPDP, SEDP and `ros_discovery_info`, each in a message of its own.
+    /// Returns SPDP, SEDP and `ros_discovery_info`, each in a separate message.
     pub fn introduction(&self, node: &str) -> [Vec<u8>; 4] {
         let entities_topic = "ros_discovery_info";
         let entities_type = "rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_";
@@ -57,12 +57,12 @@ impl Talker {
         ]
     }
 
-    /// SPDP.
+    /// Returns an SPDP message.
     pub fn participant(&self) -> Vec<u8> {
         self.participant_at(&[])
     }
 
-    /// SPDP with locators (RTPS 2.5, 9.4.2.10).
+    /// Returns an SPDP message with locators (RTPS 2.5, 9.4.2.10).
     pub fn participant_at(&self, locators: &[[u8; 24]]) -> Vec<u8> {
         let mut list = Parameters::new();
         list.add(0x15, &[2, 3, 0, 0]);
@@ -77,7 +77,7 @@ impl Talker {
         self.message(SPDP_WRITER, 1, &list.finish())
     }
 
-    /// SEDP of a best-effort, volatile writer.
+    /// Returns the SEDP message of a best-effort, volatile writer.
     pub fn publication(
         &self,
         writer: [u8; 4],
@@ -88,7 +88,7 @@ impl Talker {
         self.endpoint(PUBLICATIONS_WRITER, writer, dds_topic, dds_type, number)
     }
 
-    /// SEDP of a reader.
+    /// Returns the SEDP message of a reader.
     pub fn subscription(
         &self,
         reader: [u8; 4],
@@ -99,12 +99,12 @@ impl Talker {
         self.endpoint(SUBSCRIPTIONS_WRITER, reader, dds_topic, dds_type, number)
     }
 
-    /// Number of the last sample.
+    /// Returns the number of the last sample.
     pub fn sent(&self) -> u32 {
         self.sent
     }
 
-    /// The next sample, `size` bytes with its encapsulation header.
+    /// Returns the next sample of `size` bytes, including its encapsulation header.
     pub fn sample(&mut self, size: usize) -> Vec<u8> {
         self.sent += 1;
         let mut payload = vec![0, 1, 0, 0];
@@ -112,14 +112,14 @@ impl Talker {
         self.message(SAMPLES_WRITER, self.sent, &payload)
     }
 
-    /// A message with one DATA.
+    /// Returns a message with one DATA.
     pub fn message(&self, writer: [u8; 4], number: u32, payload: &[u8]) -> Vec<u8> {
         let mut bytes = self.header();
         data(&mut bytes, writer, number, payload);
         bytes
     }
 
-    /// The head of a message.
+    /// Returns the header of a message.
     pub fn header(&self) -> Vec<u8> {
         [&b"RTPS\x02\x03\x01\x0f"[..], &self.prefix].concat()
     }
@@ -140,7 +140,7 @@ impl Talker {
         self.message(from, number, &list.finish())
     }
 
-    /// `ros_discovery_info` with 16-byte gids: one node that has the writer of samples.
+    /// Returns `ros_discovery_info` with 16-byte gids: one node with the writer of samples.
     pub fn entities(&self, node: &str) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 0];
         bytes.extend_from_slice(&self.prefix);
@@ -157,12 +157,12 @@ impl Talker {
     }
 }
 
-/// Something that can carry UDP payloads to where the agent is.
+/// Carries UDP payloads to the observed host.
 pub trait Carrier {
     fn carry(&mut self, payload: &[u8]) -> Result<()>;
 }
 
-/// A UDP socket in a host's network, and whom it talks to.
+/// A UDP socket in a host's network, and its destination.
 pub struct Sender {
     pub socket: UdpSocket,
     to: SocketAddr,
@@ -176,7 +176,7 @@ impl Sender {
         Ok(Sender { socket, to })
     }
 
-    /// From one IPv4 host to another's discovery port.
+    /// Sends from one IPv4 host to another's discovery port.
     pub fn between(host: &Namespace, other: &Namespace) -> Result<Sender> {
         Sender::new(
             host,
@@ -217,7 +217,7 @@ pub fn talk(
     Ok(())
 }
 
-/// Where a host's network can be entered.
+/// Returns the path of a host's network namespace.
 pub fn path(host: &Namespace) -> PathBuf {
     PathBuf::from("/run/netns").join(host.name())
 }
@@ -259,7 +259,7 @@ impl Parameters {
     }
 }
 
-/// A CDR string, filled up to four bytes.
+/// Returns a CDR string, padded to four bytes.
 fn text_of(text: &str) -> Vec<u8> {
     let length = u32::try_from(text.len() + 1).unwrap_or(u32::MAX);
     let mut bytes = length.to_le_bytes().to_vec();

@@ -1,4 +1,4 @@
-//! Everything that somebody on the network can make up, as fast as one thread can send it.
+//! Arbitrary forged traffic, as fast as one thread can send it.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -8,11 +8,11 @@ use anyhow::{Result, anyhow};
 
 use super::{Carrier, SAMPLES_WRITER, Talker, data, introduce};
 
-/// Different datagrams of a storm; their GUIDs do not repeat.
+/// Different datagrams of a storm; each is sent under changing GUIDs.
 const MOULDS: usize = 3000;
 const PREFIX: std::ops::Range<usize> = 8..20;
 
-/// Runs until it is ended.
+/// Sends until [`Storm::end`].
 pub struct Storm {
     stop: Arc<AtomicBool>,
     sent: Arc<AtomicU64>,
@@ -20,7 +20,7 @@ pub struct Storm {
 }
 
 impl Storm {
-    /// Sends what `forge` makes, each time under a GUID prefix that was never there before.
+    /// Sends datagrams made by `forge`, each time with a new GUID prefix.
     pub fn start(carrier: impl Carrier + Send + 'static, forge: fn(&mut Dice) -> Vec<u8>) -> Storm {
         let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
         let moulds: Vec<Mould> = (0..MOULDS).map(|_| Mould::new(forge(&mut dice))).collect();
@@ -31,7 +31,7 @@ impl Storm {
         })
     }
 
-    /// Sends the samples of one announced writer as fast as it can.
+    /// Sends the samples of one announced writer as fast as possible.
     pub fn of_samples(mut carrier: impl Carrier + Send + 'static, topic: &str) -> Result<Storm> {
         const NUMBER: std::ops::Range<usize> = 40..44;
         let mut talker = Talker::new(1, topic);
@@ -45,8 +45,7 @@ impl Storm {
         }))
     }
 
-    /// Announces `participants` with `endpoints` each, every one on a topic of its own, again and
-    /// again.
+    /// Announces `participants` with `endpoints` each, every one on a separate topic, repeatedly.
     pub fn of_a_crowd(
         carrier: impl Carrier + Send + 'static,
         participants: u32,
@@ -75,7 +74,7 @@ impl Storm {
         })
     }
 
-    /// Announces the same participants again and again, each time at other addresses.
+    /// Announces the same participants repeatedly, each time at other addresses.
     pub fn of_addresses(carrier: impl Carrier + Send + 'static) -> Storm {
         const UDP_V4: u8 = 1;
         let mut dice = Dice::new(7);
@@ -94,8 +93,8 @@ impl Storm {
         })
     }
 
-    /// Announces writers of messages with much in them: half of them whole, of 50 kB, the others of
-    /// 4 MB, of which one part in a hundred comes.
+    /// Announces writers of large messages: half of them send whole messages of 50 kB, the others 1
+    /// % of the fragments of 4 MB messages.
     pub fn of_large_samples(mut carrier: impl Carrier + Send + 'static) -> Result<Storm> {
         const WRITERS: u32 = 32;
         let mut talkers = Vec::new();
@@ -119,7 +118,7 @@ impl Storm {
             body.extend_from_slice(&SAMPLES_WRITER);
             body.extend_from_slice(&[0; 4]);
             body.extend_from_slice(&talker.sent().to_le_bytes());
-            // Fragment, how many, their size, that of all.
+            // First fragment, number of fragments, their size, size of the sample.
             body.extend_from_slice(&1_u32.to_le_bytes());
             body.extend_from_slice(&1_u16.to_le_bytes());
             body.extend_from_slice(&40_000_u16.to_le_bytes());
@@ -140,7 +139,7 @@ impl Storm {
             let mut bytes = Vec::new();
             while !stopped.load(Ordering::Relaxed) {
                 next(&mut bytes);
-                // A full queue on the way is no reason to stop.
+                // A full queue on the path is no reason to stop.
                 let _ = carrier.carry(&bytes);
                 counter.fetch_add(1, Ordering::Relaxed);
             }
@@ -148,7 +147,7 @@ impl Storm {
         Storm { stop, sent, thread }
     }
 
-    /// Ends it; the datagrams sent.
+    /// Stops; returns the number of datagrams sent.
     pub fn end(self) -> Result<u64> {
         self.stop.store(true, Ordering::Relaxed);
         self.thread.join().map_err(|_| anyhow!("the storm died"))?;
@@ -156,7 +155,7 @@ impl Storm {
     }
 }
 
-/// A datagram and where in it the GUID prefix of its sender stands.
+/// A datagram and the offset of its sender's GUID prefix.
 struct Mould {
     bytes: Vec<u8>,
     places: Vec<usize>,
@@ -180,11 +179,11 @@ impl Mould {
     }
 }
 
-/// Repeatable random numbers (xorshift64).
+/// Reproducible random numbers (xorshift64).
 pub struct Dice(u64);
 
 impl Dice {
-    /// The same seed, the same numbers; not zero.
+    /// Creates a generator; the same seed gives the same numbers. The seed must not be zero.
     pub fn new(seed: u64) -> Dice {
         Dice(seed)
     }
@@ -196,12 +195,12 @@ impl Dice {
         self.0
     }
 
-    /// 0 to `sides` - 1.
+    /// Returns a number from 0 to `sides` - 1.
     pub fn pick(&mut self, sides: u64) -> u64 {
         self.roll() % sides
     }
 
-    /// One of these extremes, or anything.
+    /// Returns an extreme value or a random one.
     fn number(&mut self) -> u64 {
         match self.pick(8) {
             0 => 0,
@@ -220,7 +219,7 @@ impl Dice {
     }
 }
 
-/// A datagram with nothing true in it.
+/// Returns a datagram with invented content.
 pub fn forgery(dice: &mut Dice) -> Vec<u8> {
     let talker = stranger(dice);
     match dice.pick(10) {
@@ -241,7 +240,7 @@ pub fn forgery(dice: &mut Dice) -> Vec<u8> {
     }
 }
 
-/// A participant that announces a writer and a reader at once, in one datagram.
+/// Returns a datagram in which a participant announces itself, a writer and a reader.
 fn participant_and_endpoints(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     let mut bytes = talker.participant();
     let topic = format!("rt/{}", name(dice));
@@ -258,7 +257,7 @@ fn participant_and_endpoints(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     bytes
 }
 
-/// What breaks a page of metrics if it gets there as it is.
+/// Returns a name that would break a metrics page if it were not escaped.
 fn name(dice: &mut Dice) -> String {
     match dice.pick(24) {
         0 => "quote\"}\n# HELP injected 1\ninjected{a=\"b\"} 1\n".to_owned(),
@@ -270,7 +269,7 @@ fn name(dice: &mut Dice) -> String {
     }
 }
 
-/// DATA_FRAG that claims any size, up to 4 GB.
+/// Returns a DATA_FRAG that claims any size, up to 4 GB.
 fn fragment(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     let mut bytes = talker.header();
     let number = dice.number();
@@ -286,7 +285,7 @@ fn fragment(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     bytes
 }
 
-/// GAP or ACKNACK with a set of up to 256 bits, or more.
+/// Returns a GAP or ACKNACK with a set of up to 256 bits, or more.
 fn sequence_set(dice: &mut Dice, talker: &Talker, id: u8) -> Vec<u8> {
     let mut bytes = talker.header();
     let mut body = vec![0, 0, 0, 0, 0, 0, 2, 3];
@@ -315,7 +314,7 @@ fn heartbeat(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     bytes
 }
 
-/// Submessages, parameters and strings that are longer or shorter than they say.
+/// Returns submessages, parameters and strings whose length fields are wrong.
 fn lying_length(dice: &mut Dice, talker: &Talker) -> Vec<u8> {
     let mut bytes = match dice.pick(3) {
         0 => talker.participant(),
@@ -345,7 +344,7 @@ fn submessage(bytes: &mut Vec<u8>, id: u8, body: &[u8]) {
     bytes.extend_from_slice(body);
 }
 
-/// A participant of a GUID that nobody has.
+/// Returns a participant with a random GUID.
 fn stranger(dice: &mut Dice) -> Talker {
     let mut talker = Talker::new(0, "/forged");
     let random = [dice.roll().to_ne_bytes(), dice.roll().to_ne_bytes()].concat();

@@ -1,4 +1,4 @@
-//! The agent under test, and what it exports.
+//! The agent under test, and its metrics.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -13,21 +13,22 @@ use super::network::Namespace;
 use super::process::Process;
 use super::soak::dropped;
 
-/// The metrics listener's built-in address: every host is its own, so the port is free.
+/// The default address of the metrics listener: every host has its own network, so the port is
+/// free.
 pub const METRICS: &str = "http://127.0.0.1:17400";
 
-/// What a test of packet sockets adds to its configuration.
+/// Configuration for tests of packet sockets.
 pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 
-/// How long the page may take to show what has been sent, on a busy machine.
+/// Longest wait until the metrics show what was sent, on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(30);
-/// How long the kernel may take to verify the programs there.
+/// Longest wait for the kernel to verify the programs there.
 const START: Duration = Duration::from_secs(60);
-/// A gap of a best-effort stream is settled a second after it opened, and some more.
+/// Longer than the second after which a gap of a best-effort stream is settled.
 const STILL: Duration = Duration::from_millis(1800);
-/// As long as that where the agent says that it lost records or frames: some may never be counted.
+/// Wait if the agent reports lost records or frames: some messages may never be counted.
 const STILL_WITHOUT_SOME: Duration = Duration::from_secs(6);
-/// The page of an agent that had its turn on the CPU.
+/// Largest age, in seconds, of the facts of an agent that received CPU time.
 const FRESH: f64 = 0.4;
 
 /// `rp run` on a host.
@@ -36,10 +37,10 @@ pub struct Agent<'a> {
     pub host: &'a Namespace,
 }
 
-/// One answer of `/metrics`.
+/// The text of one `/metrics` page.
 pub struct Scrape(pub String);
 
-/// What a test of the host's sockets adds to its configuration.
+/// Returns the configuration for tests of the host's sockets.
 pub fn at_the_sockets_of(host: &Namespace) -> String {
     let cgroup = host.cgroup().display();
     format!("capture: {{source: host, cgroup: {cgroup}}}\n")
@@ -55,7 +56,7 @@ impl<'a> Agent<'a> {
         Agent::start_with(host, program, configuration, Stdio::inherit())
     }
 
-    /// As [`Agent::start`], with what the agent logs in a file.
+    /// Starts the agent as [`Agent::start`] does, with its log in a file.
     pub fn start_logging(
         host: &'a Namespace,
         program: impl AsRef<OsStr>,
@@ -104,7 +105,7 @@ impl<'a> Agent<'a> {
         Ok(Scrape(self.request("/metrics")?))
     }
 
-    /// A scrape that shows what was asked for.
+    /// Scrapes until `shows` accepts the page, and returns it.
     pub fn scrape_until(&self, what: &str, shows: impl Fn(&Scrape) -> bool) -> Result<Scrape> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -119,8 +120,8 @@ impl<'a> Agent<'a> {
         }
     }
 
-    /// A scrape once the agent has counted so many messages of a topic, or had time to, and nothing
-    /// it counts of that topic changes any more.
+    /// Scrapes until the agent has counted this many messages of a topic, or a timeout expires, and
+    /// its counters of that topic no longer change.
     pub fn settled_scrape(&self, topic: &str, messages: u64) -> Result<Scrape> {
         let label = [("topic", topic)];
         let deadline = Instant::now() + PATIENCE;
@@ -148,24 +149,24 @@ impl<'a> Agent<'a> {
         }
     }
 
-    /// GETs a path from inside the host; anything but success is an error.
+    /// GETs a path from inside the host; fails unless the status is a success.
     pub fn request(&self, path: &str) -> Result<String> {
         get(self.host, &format!("{METRICS}{path}"))
     }
 }
 
 impl Scrape {
-    /// The value of the sample of `name` that has all of these labels.
+    /// Returns the value of the sample of `name` with all of these labels.
     pub fn value(&self, name: &str, labels: &[(&str, &str)]) -> Option<f64> {
         self.samples(name, labels).next()
     }
 
-    /// The sum over all samples of `name` that have these labels.
+    /// Returns the sum over all samples of `name` with these labels.
     pub fn sum(&self, name: &str, labels: &[(&str, &str)]) -> f64 {
         self.samples(name, labels).sum()
     }
 
-    /// The values that a label takes over the samples of `name`.
+    /// Returns the values of a label over the samples of `name`.
     pub fn labels_of(&self, name: &str, label: &str) -> BTreeSet<String> {
         let start = format!("{label}=\"");
         let values = self.0.lines().filter_map(|line| {
@@ -176,7 +177,7 @@ impl Scrape {
         values.collect()
     }
 
-    /// Every counter above zero that could explain a difference.
+    /// Returns every counter above zero that could explain a difference.
     pub fn doubts(&self) -> String {
         let telling = [
             "lost",
@@ -195,7 +196,7 @@ impl Scrape {
         lines.collect::<Vec<_>>().join("; ")
     }
 
-    /// What counts messages of a topic, with the values.
+    /// Returns the counters of a topic's messages, with their values.
     fn counters(&self, topic: &str) -> Vec<String> {
         let topic = format!("topic=\"{topic}\"");
         let counters = self.0.lines().filter(|line| {
@@ -223,7 +224,7 @@ impl Scrape {
     }
 }
 
-/// Whether `label="value"` stands in a label set at the start or after a comma.
+/// Returns whether `label="value"` occurs in a label set at the start or after a comma.
 fn has_label(labels: &str, pair: &str) -> bool {
     labels
         .match_indices(pair)

@@ -1,5 +1,5 @@
-//! The kernel's BPF programs as anybody may ask for them: which are attached to a control group,
-//! which a process holds, which still exist. And one of somebody else's.
+//! The kernel's BPF programs, queried independently of the agent: those attached to a control
+//! group, those held by a process, those that still exist. Also attaches a foreign program.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -27,7 +27,7 @@ pub enum Direction {
     Egress = 1,
 }
 
-/// What the kernel holds for a process that asked for it, by its number.
+/// A BPF object held by a process, by id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Object {
     Program(u32),
@@ -35,17 +35,17 @@ pub enum Object {
     Link(u32),
 }
 
-/// How a stranger's program tolerates others.
+/// Whether a foreign program tolerates others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Manners {
-    /// As everybody should.
+    /// Others may attach.
     BesideOthers,
-    /// Nobody else may attach.
+    /// Others cannot attach.
     Alone,
 }
 
-/// Somebody else's program on a control group: it lets everything pass. It stays attached until the
-/// group is removed.
+/// Attaches a foreign program that lets everything pass to a control group. It stays attached until
+/// the group is removed.
 pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) -> Result<()> {
     // r0 = 1; exit
     let instructions: [u64; 2] = [0x0000_0001_0000_00b7, 0x95];
@@ -73,7 +73,7 @@ pub fn attach_stranger(cgroup: &Path, direction: Direction, manners: Manners) ->
     Ok(())
 }
 
-/// How many programs are attached to a control group itself.
+/// Returns the number of programs attached to a control group itself.
 pub fn attached(cgroup: &Path, direction: Direction) -> Result<u32> {
     let directory = File::open(cgroup)?;
     let mut query = ProgramsToFind {
@@ -85,11 +85,11 @@ pub fn attached(cgroup: &Path, direction: Direction) -> Result<u32> {
     Ok(query.program_count)
 }
 
-/// Ids of the programs that a process holds.
+/// Returns the ids of the programs held by a process.
 pub fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
     let mut programs = BTreeSet::new();
     for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
-        // A descriptor may be closed meanwhile.
+        // A descriptor may be closed between listing and reading.
         let text = fs::read_to_string(entry?.path()).unwrap_or_default();
         let ids = text
             .lines()
@@ -99,11 +99,11 @@ pub fn programs_of(process: u32) -> Result<BTreeSet<u32>> {
     Ok(programs)
 }
 
-/// All objects that a process holds.
+/// Returns all objects held by a process.
 pub fn objects_of(process: u32) -> Result<BTreeSet<Object>> {
     let mut objects = BTreeSet::new();
     for entry in fs::read_dir(format!("/proc/{process}/fdinfo"))? {
-        // A descriptor may be closed meanwhile.
+        // A descriptor may be closed between listing and reading.
         let text = fs::read_to_string(entry?.path()).unwrap_or_default();
         objects.extend(text.lines().filter_map(|line| {
             let (name, id) = line.split_once(':')?;
@@ -119,7 +119,7 @@ pub fn objects_of(process: u32) -> Result<BTreeSet<Object>> {
     Ok(objects)
 }
 
-/// The writers and readers that a process named to its kernel programs, with their verdicts.
+/// Returns the writers and readers in the interest maps of a process, with their verdicts.
 pub fn interest_of(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
     for object in objects_of(process)? {
         let Object::Map(id) = object else { continue };
@@ -132,8 +132,8 @@ pub fn interest_of(process: u32) -> Result<BTreeMap<[u32; 4], u32>> {
     bail!("the process {process} has no such map")
 }
 
-/// How often the kernel left out running one of this process's programs because it was running on
-/// that CPU already.
+/// Returns how often the kernel skipped a program of this process because it was already running on
+/// that CPU.
 pub fn skipped_runs() -> Result<u64> {
     let mut skipped = 0;
     for entry in fs::read_dir("/proc/self/fdinfo")? {
@@ -148,12 +148,12 @@ pub fn skipped_runs() -> Result<u64> {
     Ok(skipped)
 }
 
-/// Whether anything still holds a program.
+/// Returns whether the program still exists.
 pub fn exists(program: u32) -> Result<bool> {
     is_there(Object::Program(program))
 }
 
-/// Whether anything still holds an object.
+/// Returns whether the object still exists.
 pub fn is_there(object: Object) -> Result<bool> {
     let (command, id) = match object {
         Object::Program(id) => (PROG_GET_FD_BY_ID, id),
@@ -174,7 +174,7 @@ pub fn is_there(object: Object) -> Result<bool> {
     }
 }
 
-/// The beginnings of `union bpf_attr`; the kernel takes what is missing for zero.
+/// A prefix of `union bpf_attr`; the kernel treats missing attributes as zero.
 trait Attributes: Copy {}
 
 #[derive(Clone, Copy, Default)]
@@ -234,8 +234,8 @@ fn bpf<A: Attributes>(command: libc::c_int, attributes: &A) -> io::Result<i32> {
 }
 
 fn bpf_mut<A: Attributes>(command: libc::c_int, attributes: &mut A) -> io::Result<i32> {
-    // SAFETY: the attributes are plain words of the size given, laid out as `union bpf_attr` is, and
-    // what they point to outlives the call.
+    // SAFETY: the attributes are plain words of the size passed, laid out like `union bpf_attr`,
+    // and the memory to which they point outlives the call.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,
@@ -251,6 +251,6 @@ fn bpf_mut<A: Attributes>(command: libc::c_int, attributes: &mut A) -> io::Resul
 }
 
 fn descriptor(number: i32) -> OwnedFd {
-    // SAFETY: the kernel has just opened it for this process, and nothing else knows it.
+    // SAFETY: a new descriptor without another owner.
     unsafe { OwnedFd::from_raw_fd(number) }
 }

@@ -1,5 +1,5 @@
-//! What crossed a host's cable, as tcpdump saw it: the judge of what the agent says, and of whether
-//! it sent anything itself.
+//! tcpdump's recording of a host's link: the reference for the agent's reports, and for whether the
+//! agent sent anything itself.
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use anyhow::{Context as _, Result, bail};
 use super::network::{INTERFACE, Namespace};
 use super::process::Process;
 
-/// tcpdump takes frames out of the kernel's buffer this often, and not at its end.
+/// Interval at which tcpdump reads the kernel's buffer; it does not read it at its end.
 pub const SETTLE: Duration = Duration::from_millis(1200);
 /// 64 MiB: more than a second of point clouds.
 const BUFFER_KILOBYTES: &str = "65536";
@@ -45,8 +45,8 @@ impl Capture {
         Ok(capture)
     }
 
-    /// Ends the recording. The file has all but what happened in the last [`SETTLE`]; a judge that
-    /// missed frames before is an error.
+    /// Ends the recording. The file lacks only the last [`SETTLE`]. Fails if tcpdump dropped frames
+    /// before.
     pub fn finish(mut self) -> Result<PathBuf> {
         self.process.signal("INT")?;
         let status = self

@@ -1,5 +1,5 @@
-//! The cgroup of a host: what its processes open is told apart from other tests' sockets, which the
-//! agent's host source would see as well.
+//! The cgroup of a host: separates its sockets from those of other tests, which the agent's host
+//! source would see as well.
 
 use std::fs::{self, File};
 use std::io;
@@ -12,7 +12,7 @@ use anyhow::{Context as _, Result};
 
 use super::remove_leftovers;
 
-/// How long killed processes may take to leave.
+/// Longest wait for killed processes to leave.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Held while this process is in one of its tests' cgroups.
@@ -29,7 +29,7 @@ impl Cgroup {
         Ok(Cgroup { path })
     }
 
-    /// One below this, which is removed first.
+    /// Creates a cgroup below this one; it must be removed first.
     pub fn create_below(&self, name: &str) -> Result<Cgroup> {
         let path = self.path.join(name);
         fs::create_dir(&path).with_context(|| format!("cannot create {}", path.display()))?;
@@ -40,15 +40,15 @@ impl Cgroup {
         &self.path
     }
 
-    /// The words that run a command in it.
+    /// Returns the command prefix that runs a program in it.
     pub fn inside(&self) -> Vec<String> {
         let enter = r#"echo 0 >"$0/cgroup.procs" && exec "$@""#;
         let path = self.path.display().to_string();
         vec!["sh".to_owned(), "-c".to_owned(), enter.to_owned(), path]
     }
 
-    /// Runs `make` with this process in it and moves back: sockets belong where they were created.
-    /// Tests of one process take turns.
+    /// Runs `make` with this process in it and moves back: a socket belongs to the cgroup in which
+    /// it was created. Tests of one process take turns.
     pub fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
         let turn = MOVED.lock();
         let own = fs::read_to_string("/proc/self/cgroup").context("cannot read /proc")?;
@@ -65,7 +65,7 @@ impl Cgroup {
 impl Drop for Cgroup {
     fn drop(&mut self) {
         let deadline = Instant::now() + PATIENCE;
-        // Linux 5.14 and newer; elsewhere its processes have been ended one by one.
+        // Linux 5.14 and newer; on older kernels its processes have been ended one by one.
         let _ = fs::write(self.path.join("cgroup.kill"), "1");
         while let Err(error) = fs::remove_dir(&self.path) {
             if Instant::now() > deadline {
@@ -77,13 +77,13 @@ impl Drop for Cgroup {
     }
 }
 
-/// Moves this process.
+/// Moves this process to a cgroup.
 fn enter(cgroup: &Path) -> Result<()> {
     fs::write(cgroup.join("cgroup.procs"), "0")
         .with_context(|| format!("cannot move to {}", cgroup.display()))
 }
 
-/// Where the v2 hierarchy is mounted.
+/// Returns the mount point of the v2 hierarchy.
 pub fn hierarchy() -> Result<PathBuf> {
     let mounts = fs::read_to_string("/proc/self/mounts").context("cannot read the mounts")?;
     let path = mounts.lines().find_map(|line| {
@@ -94,7 +94,7 @@ pub fn hierarchy() -> Result<PathBuf> {
     path.context("no cgroup2 is mounted: `mount -t cgroup2 none /sys/fs/cgroup/unified`")
 }
 
-/// How many programs see the datagrams that its sockets receive and send, besides those attached
+/// Returns the number of programs attached for received and sent datagrams, without those attached
 /// further up.
 pub fn attached(cgroup: &Path) -> Result<[u32; 2]> {
     /// The part of `union bpf_attr` for BPF_PROG_QUERY (linux/bpf.h).
@@ -119,7 +119,7 @@ pub fn attached(cgroup: &Path) -> Result<[u32; 2]> {
             attach_type,
             ..Query::default()
         };
-        // SAFETY: the attribute's size is given; without room for ids the kernel writes none.
+        // SAFETY: the attribute's size is passed; without room for ids the kernel writes none.
         let result = unsafe {
             libc::syscall(
                 libc::SYS_bpf,
@@ -136,7 +136,7 @@ pub fn attached(cgroup: &Path) -> Result<[u32; 2]> {
     Ok(counts)
 }
 
-/// Removes those of processes that were killed before they could.
+/// Removes the cgroups of processes that were killed before they could.
 pub fn sweep() {
     if let Ok(hierarchy) = hierarchy() {
         remove_leftovers(&hierarchy, |name| {

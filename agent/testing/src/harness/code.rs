@@ -1,4 +1,4 @@
-//! The code of a running process, beside that of its file: what somebody put in between shows.
+//! Compares the code of a running process with its file, which shows breakpoints.
 
 use std::fs::{self, File};
 use std::io::{BufRead as _, BufReader};
@@ -10,14 +10,14 @@ use ros2probe_capture::uprobe::library;
 
 use super::process::Process;
 
-/// The first instruction's byte where Fast DDS hands messages over.
+/// First byte of the instruction at which Fast DDS passes messages.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct Code {
     pub in_memory: u8,
     pub in_file: u8,
 }
 
-/// That of a process that maps this file.
+/// Reads it in a process that maps this file.
 pub fn at_function(process: &Process, file: &Path) -> Result<Code> {
     let file = fs::canonicalize(file)?;
     let opened = File::open(&file)?;

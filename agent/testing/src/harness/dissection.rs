@@ -1,4 +1,4 @@
-//! What tshark reads in a recording: a judge that shares no code with the agent.
+//! tshark's dissection of a recording: a reference that shares no code with the agent.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -14,7 +14,7 @@ const HEARTBEAT_FRAG: &str = "0x13";
 const DATA: &str = "0x15";
 const DATA_FRAG: &str = "0x16";
 
-/// The columns asked of tshark, in this order.
+/// Columns requested from tshark, in this order.
 const COLUMNS: [&str; 15] = [
     "frame.time_epoch",
     "frame.protocols",
@@ -38,16 +38,16 @@ pub struct Dissection {
     pub frames: Vec<Frame>,
 }
 
-/// One frame. A datagram that came in IP fragments is in the frame of its last one.
+/// One frame. A datagram that arrived in IP fragments is in the frame of its last one.
 pub struct Frame {
     /// Seconds since the Unix epoch.
     pub time: f64,
-    /// Such as `eth:ethertype:ip:udp:rtps`.
+    /// Protocols, such as `eth:ethertype:ip:udp:rtps`.
     pub protocols: String,
     pub ethernet_source: String,
     pub ip_source: String,
     pub source_port: Option<u16>,
-    /// 24 hexadecimal digits of the sender's GUID prefix.
+    /// The sender's GUID prefix, 24 hexadecimal digits.
     pub prefix: String,
     pub submessages: Vec<Submessage>,
 }
@@ -55,7 +55,7 @@ pub struct Frame {
 /// One submessage that names a writer.
 #[derive(Clone, Debug)]
 pub struct Submessage {
-    /// Eight hexadecimal digits.
+    /// The writer's entity id, eight hexadecimal digits.
     pub writer: String,
     pub reader: String,
     pub content: Content,
@@ -64,7 +64,7 @@ pub struct Submessage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Content {
     Data(u64),
-    /// Of a sample that has `of` fragments, those from `first` (counted from 1) on.
+    /// Fragments of a sample that has `of` fragments, starting with `first` (counted from 1).
     Fragments {
         number: u64,
         first: u32,
@@ -74,7 +74,7 @@ pub enum Content {
     Heartbeat {
         last: u64,
     },
-    /// An ACKNACK: a reader asks for some of these again.
+    /// An ACKNACK: a reader requests some of these again.
     Request {
         first: u64,
         end: u64,
@@ -82,19 +82,20 @@ pub enum Content {
     Other,
 }
 
-/// The samples of one writer, as they came.
+/// The received samples of one writer.
 #[derive(Debug, Default)]
 pub struct Samples {
-    /// Writer sequence number and time of each sample that came whole, in that order.
+    /// Writer sequence number and time of each complete sample, in that order.
     pub whole: BTreeMap<u64, f64>,
-    /// Lowest and highest number of which anything came.
+    /// Lowest and highest number of any received sample or fragment.
     pub span: Option<(u64, u64)>,
-    /// Samples whose first DATA was dropped: a later one had come before, or a HEARTBEAT that told
-    /// of them and then a request. What lies before the first DATA of all does not count.
+    /// Samples whose first DATA was dropped: a later one arrived first, or a HEARTBEAT announced
+    /// them and a request followed. Samples before the very first DATA do not count.
     pub retransmitted: u64,
-    /// A HEARTBEAT told of them and nobody asked: RustDDS announces what it is about to send.
+    /// Samples announced by a HEARTBEAT without a request: RustDDS announces samples before it
+    /// sends them.
     pub announced_early: u64,
-    /// DATA submessages beyond the first of each sample.
+    /// Number of DATA submessages beyond the first of each sample.
     pub repeated: u64,
 }
 
@@ -120,7 +121,7 @@ impl Dissection {
         })
     }
 
-    /// The samples of the writer with this GUID (32 hexadecimal digits).
+    /// Returns the samples of the writer with this GUID (32 hexadecimal digits).
     pub fn samples_of(&self, writer: &str) -> Samples {
         let (prefix, entity) = writer.split_at(24);
         let mut samples = Samples::default();
@@ -134,7 +135,7 @@ impl Dissection {
                     continue;
                 }
                 match submessage.content {
-                    // There are two participants, so another one's answer is to this writer.
+                    // Only two participants exist, so the other one's request is for this writer.
                     Content::Request { first, end } if !own => requested.extend(first..end),
                     _ if !own => {}
                     Content::Data(number) => {
@@ -173,14 +174,14 @@ impl Dissection {
 }
 
 impl Samples {
-    /// How many numbers between the first and the last did not come whole.
+    /// Returns how many samples between the first and the last did not arrive completely.
     pub fn missing(&self) -> u64 {
         self.span.map_or(0, |(first, last)| {
             last - first + 1 - self.whole.range(first..=last).count() as u64
         })
     }
 
-    /// The application counts from 0, the writer from 1.
+    /// Returns the application's numbers, which count from 0; the writer's count from 1.
     pub fn application_numbers(&self) -> BTreeSet<u64> {
         self.whole.keys().map(|number| number - 1).collect()
     }
@@ -230,7 +231,7 @@ impl Frame {
         for kind in values(kinds) {
             submessages.extend(cells.submessage(kind)?);
         }
-        // What was not used up was given to the wrong submessage.
+        // Unused values were assigned to the wrong submessage.
         ensure!(
             cells.writers.next().is_none()
                 && cells.numbers.next().is_none()
@@ -250,7 +251,7 @@ impl Frame {
     }
 }
 
-/// What is left of the columns that hold a value for each submessage that has such a field.
+/// The remaining values of columns that have one per submessage with that field.
 struct Cells<'a> {
     writers: Values<'a>,
     readers: Values<'a>,
@@ -265,7 +266,7 @@ struct Cells<'a> {
 type Values<'a> = std::vec::IntoIter<&'a str>;
 
 impl Cells<'_> {
-    /// The next submessage, if its kind names a writer.
+    /// Returns the next submessage, if its kind names a writer.
     fn submessage(&mut self, kind: &str) -> Result<Option<Submessage>> {
         let Some(content) = self.content(kind)? else {
             return Ok(None);

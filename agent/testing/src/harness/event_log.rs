@@ -1,4 +1,4 @@
-//! What a peer says it really sent or received: one JSON object per line.
+//! A peer's log of what it really sent or received: one JSON object per line.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -6,22 +6,22 @@ use std::path::Path;
 use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize;
 
-/// One line. Which fields are there depends on `ev`.
+/// One line. The fields present depend on `ev`.
 #[derive(Clone, Debug, Deserialize)]
 pub struct Event {
-    /// `start`, `endpoint`, `pub`, `pub_failed`, `sub`, `error`, `stop` or `exit`.
+    /// Kind of event: `start`, `endpoint`, `pub`, `pub_failed`, `sub`, `error`, `stop` or `exit`.
     pub ev: String,
     /// Unix time in nanoseconds.
     pub t: u64,
     /// The application's sequence number from 0; the DDS writer counts from 1.
     pub seq: Option<u64>,
-    /// The DDS writer's sequence number, where the stack tells a subscriber.
+    /// The DDS writer's sequence number, if the stack exposes it to a subscriber.
     pub sn: Option<u64>,
-    /// Serialized size with the encapsulation header.
+    /// Serialized size, including the encapsulation header.
     pub len: Option<u64>,
     pub stamp_ns: Option<u64>,
     pub kind: Option<String>,
-    /// Prefix and entity id, 32 hexadecimal digits.
+    /// GUID: prefix and entity id, 32 hexadecimal digits.
     pub guid: Option<String>,
     pub topic: Option<String>,
     pub node: Option<String>,
@@ -40,7 +40,7 @@ impl EventLog {
         Ok(EventLog(events.collect::<Result<_>>()?))
     }
 
-    /// The application's sequence numbers of the events of one kind, in the order they happened.
+    /// Returns the application's sequence numbers of the events of one kind, in order of time.
     pub fn sequences(&self, ev: &str) -> Vec<u64> {
         self.0
             .iter()
@@ -49,7 +49,7 @@ impl EventLog {
             .collect()
     }
 
-    /// The DDS writer's sequence numbers of the events of one kind.
+    /// Returns the DDS writer's sequence numbers of the events of one kind.
     pub fn writer_numbers(&self, ev: &str) -> Result<BTreeSet<u64>> {
         let mut numbers = BTreeSet::new();
         for event in self.0.iter().filter(|event| event.ev == ev) {
@@ -63,8 +63,8 @@ impl EventLog {
         Ok(numbers)
     }
 
-    /// How many samples are missing between the first and the last that this subscriber was given:
-    /// what an observer of the same link can know to be lost.
+    /// Returns the number of samples missing between the first and the last one of this subscriber:
+    /// the losses that an observer of the same link can detect.
     pub fn missing(&self) -> u64 {
         let received: BTreeSet<u64> = self.sequences("sub").into_iter().collect();
         match (received.first(), received.last()) {

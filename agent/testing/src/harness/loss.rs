@@ -1,6 +1,6 @@
 //! Packet loss at a host's outgoing interface, before any packet tap: both ends of the link miss
-//! the same frames, and the sender's socket hooks have seen the datagram. Nothing but the chosen
-//! datagrams is touched.
+//! the same frames, while the sender's socket hooks have seen the datagram. Other datagrams are not
+//! affected.
 
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -11,30 +11,30 @@ use super::network::{INTERFACE, Namespace};
 use super::peer::Stream;
 use super::run;
 
-/// Bytes that UDP and RTPS put around a small serialized sample: 8 + 20 + INFO_TS 12 + DATA 24, and
-/// up to INFO_DST 16 + HEARTBEAT 32 + the 60 of Fast DDS's statistics submessage (0x80).
+/// Bytes that UDP and RTPS add to a small serialized sample: 8 + 20 + INFO_TS 12 + DATA 24, and up
+/// to INFO_DST 16 + HEARTBEAT 32 + the 60 of Fast DDS's statistics submessage (0x80).
 const LEAST_OVERHEAD: usize = 60;
 const MOST_OVERHEAD: usize = 180;
 
-/// Marks doomed datagrams on their way from the socket to the interface.
+/// Marks selected datagrams on their way from the socket to the interface.
 const MARK: u32 = 0x7232;
 
 pub struct Loss<'a> {
     host: &'a Namespace,
-    /// The family of the table that chooses.
+    /// The family of the table that selects.
     chosen_in: &'static str,
 }
 
-/// What is kept back of a doomed datagram.
+/// The dropped part of a selected datagram.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
-    /// All of it.
+    /// The whole datagram.
     Whole,
-    /// All its IP fragments but the first: it dies when the receiver gives up waiting.
+    /// Every IP fragment but the first: the receiver's reassembly times out.
     Trailing,
 }
 
-/// What the rule has met so far.
+/// Counters of the rule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counts {
     pub matched: u64,
@@ -43,8 +43,8 @@ pub struct Counts {
 
 impl<'a> Loss<'a> {
     /// Drops `per_mille` of the datagrams from `host` to `receiver` that carry one unfragmented
-    /// sample of `stream`. They are known by their length and by what they are not: sent to a
-    /// port of discovery. RustDDS multicasts samples, the others send them to each reader.
+    /// sample of `stream`. Selects them by length and by port, excluding discovery. RustDDS
+    /// multicasts samples, the others send them to each reader.
     pub fn of_samples(
         host: &'a Namespace,
         receiver: &Namespace,
@@ -65,9 +65,10 @@ impl<'a> Loss<'a> {
         Loss::of(host, &datagrams, per_mille)
     }
 
-    /// Drops `per_mille` of what an nftables expression such as `meta l4proto udp` matches.
+    /// Drops `per_mille` of the packets that an nftables expression such as `meta l4proto udp`
+    /// matches.
     pub fn of(host: &'a Namespace, matches: &str, per_mille: u16) -> Result<Loss<'a>> {
-        // A limit that is never reached is not accepted.
+        // nftables rejects a limit that is never reached.
         let chance = if per_mille < 1000 {
             format!("numgen random mod 1000 < {per_mille}")
         } else {
@@ -91,9 +92,9 @@ impl<'a> Loss<'a> {
         })
     }
 
-    /// Dooms every `nth` datagram that an nftables expression such as `udp length > 1000` matches,
-    /// as it was sent, before it is cut into IP fragments. The sender's socket is told that all
-    /// went well; the kernel itself does not send what follows a dropped fragment.
+    /// Drops every `nth` datagram that an nftables expression such as `udp length > 1000` matches,
+    /// tested before it is cut into IP fragments. The sender's socket sees a success; the kernel
+    /// itself does not send the fragments after a dropped one.
     pub fn of_datagrams(
         host: &'a Namespace,
         matches: &str,

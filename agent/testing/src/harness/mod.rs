@@ -1,9 +1,9 @@
-//! What the live tests and the demo stand on: hosts made of a network namespace and a cgroup, DDS
-//! peers and the agent started inside them, packet loss, and the logs and metrics they leave behind.
+//! Basis of the live tests and the demo: hosts made of a network namespace and a cgroup, DDS peers
+//! and the agent started inside them, packet loss, and the resulting logs and metrics.
 //!
-//! Everything is named after the process and a counter, so tests run side by side, and everything
-//! goes when its value is dropped, also when a test panics. Where something is missing the harness
-//! fails and says what to install; it never skips.
+//! All names contain the process id and a counter, so tests run in parallel. Dropping a value
+//! removes what it created, even if a test panics. If a tool is missing the harness fails and names
+//! the package to install; it never skips.
 
 pub mod agent;
 pub mod bpf;
@@ -30,7 +30,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 
-/// Tools the harness runs, with the Debian or Ubuntu package that has each.
+/// Tools used by the harness, with the Debian or Ubuntu package of each.
 const TOOLS: [(&str, &str); 8] = [
     ("ip", "iproute2"),
     ("nft", "nftables"),
@@ -42,10 +42,10 @@ const TOOLS: [(&str, &str); 8] = [
     ("tcpdump", "tcpdump"),
 ];
 
-/// What namespaces and cgroups are named with, before the process that made them.
+/// Prefix of the names of namespaces and cgroups, before the process id.
 pub const PREFIX: &str = "r2p";
 
-/// Fails unless this process is root and every tool is there.
+/// Fails unless this process is root and every tool is installed.
 pub fn require() -> Result<()> {
     let status = std::fs::read_to_string("/proc/self/status").context("cannot read /proc")?;
     let effective = status.lines().find_map(|line| line.strip_prefix("Uid:"));
@@ -61,7 +61,7 @@ pub fn require() -> Result<()> {
     Ok(())
 }
 
-/// Looks ten times a second whether it holds, for a minute.
+/// Evaluates `holds` ten times per second until it is true, for at most a minute.
 pub fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result<()> {
     const PATIENCE: Duration = Duration::from_secs(60);
     let deadline = Instant::now() + PATIENCE;
@@ -72,7 +72,7 @@ pub fn wait_until(what: &str, mut holds: impl FnMut() -> Result<bool>) -> Result
     Ok(())
 }
 
-/// Runs a command line made of words without spaces, and fails with what it said.
+/// Runs a command line of words without spaces; fails with its output.
 pub fn run(line: &str) -> Result<String> {
     let mut words = line.split_whitespace();
     let program = words.next().context("an empty command")?;
@@ -89,7 +89,7 @@ pub fn run(line: &str) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Calls `remove` with each name in a directory that a process made which is gone.
+/// Calls `remove` with each name in a directory whose creating process is gone.
 fn remove_leftovers(directory: &Path, remove: impl Fn(&str)) {
     let Ok(entries) = std::fs::read_dir(directory) else {
         return;

@@ -23,11 +23,11 @@ pub struct Namespace {
     cgroup: Cgroup,
 }
 
-/// Two hosts on one cable.
+/// Two hosts joined by one link.
 pub struct Link {
     pub robot: Namespace,
     pub monitor: Namespace,
-    /// That of both hosts, as if one machine ran them as containers.
+    /// Parent of both hosts' cgroups, as if one machine ran them as containers.
     cgroup: Cgroup,
 }
 
@@ -38,7 +38,7 @@ impl Link {
         Link::create(subnet, Cgroup::create(&name_of("link", subnet))?)
     }
 
-    /// As [`Link::new`], below a cgroup that somebody may be looking at already.
+    /// Creates a link as [`Link::new`] does, below a cgroup that may already be observed.
     pub fn below(above: &Cgroup) -> Result<Link> {
         sweep()?;
         let subnet = next_subnet();
@@ -61,19 +61,19 @@ impl Link {
         })
     }
 
-    /// The cgroup that holds those of both hosts.
+    /// Returns the parent of both hosts' cgroups.
     pub fn cgroup(&self) -> &Path {
         self.cgroup.path()
     }
 }
 
 impl Namespace {
-    /// A host whose cable ends nowhere: its nodes talk over loopback only.
+    /// Creates a host without a link: its nodes communicate over loopback only.
     pub fn alone() -> Result<Namespace> {
         sweep()?;
         let host = Namespace::create("robot", next_subnet(), 1, None)?;
-        // An IPv6 address that is confirmed seconds later is a change of the network, for which a
-        // browser ends its requests (ERR_NETWORK_CHANGED).
+        // A browser treats an IPv6 address that is confirmed seconds later as a network change and
+        // aborts its requests (ERR_NETWORK_CHANGED).
         run(&format!(
             "ip netns exec {} sysctl -qw net.ipv6.conf.default.accept_dad=0",
             host.name
@@ -95,32 +95,34 @@ impl Namespace {
         self.address
     }
 
-    /// The cgroup that its processes are in.
+    /// Returns the cgroup of its processes.
     pub fn cgroup(&self) -> &Path {
         self.cgroup.path()
     }
 
-    /// Runs `make` with this process in the host's cgroup: sockets belong where they were created.
+    /// Runs `make` with this process in the host's cgroup: a socket belongs to the cgroup in which
+    /// it was created.
     pub fn hold<T>(&self, make: impl FnOnce() -> T) -> Result<T> {
         self.cgroup.hold(make)
     }
 
-    /// The words that run a command in this host with the host's own `/sys`.
+    /// Returns the command prefix that runs a program in this host with the host's own `/sys`.
     pub fn inside(&self) -> Vec<String> {
         let mut words = self.cgroup.inside();
         words.extend(["ip", "netns", "exec", &self.name].map(str::to_owned));
         words
     }
 
-    /// The words that run a command on this host's network only: `/sys/fs/cgroup` and the rest of
-    /// the file system stay as they are, as for a system service.
+    /// Returns the command prefix that runs a program on this host's network only: `/sys/fs/cgroup`
+    /// and the rest of the file system are unchanged, as for a system service.
     pub fn on_network(&self) -> Vec<String> {
         let mut words = self.cgroup.inside();
         words.extend(self.outside());
         words
     }
 
-    /// The words that run a command on this host's network which is none of its processes.
+    /// Returns the command prefix that runs a program on this host's network but outside of its
+    /// cgroup.
     pub fn outside(&self) -> [String; 2] {
         let network = format!("--net=/run/netns/{}", self.name);
         ["nsenter".to_owned(), network]
@@ -151,7 +153,7 @@ impl Namespace {
         run(&format!(
             "ip -n {name} route add 239.0.0.0/8 dev {interface}"
         ))?;
-        // veth carries unfinished checksums otherwise, which no cable does.
+        // Otherwise veth carries unfinished checksums, which no physical link does.
         run(&format!(
             "ip netns exec {name} ethtool -K {interface} tx off"
         ))?;
@@ -167,7 +169,7 @@ impl Drop for Namespace {
     }
 }
 
-/// Fails where tests cannot run; removes what killed ones left behind.
+/// Fails if tests cannot run here; removes leftovers of killed tests.
 fn sweep() -> Result<()> {
     require()?;
     static SWEPT: Once = Once::new();

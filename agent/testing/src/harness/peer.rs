@@ -11,7 +11,7 @@ use super::event_log::EventLog;
 use super::network::Namespace;
 use super::process::Process;
 
-/// How long discovery may take on a busy machine.
+/// Longest time of discovery on a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,7 +27,7 @@ pub enum Role {
     Subscriber,
 }
 
-/// What the publisher sends or the subscriber expects.
+/// Samples that the publisher sends and the subscriber expects.
 #[derive(Clone, Debug)]
 pub struct Stream {
     pub topic: String,
@@ -42,15 +42,15 @@ pub struct Stream {
     pub logged: bool,
     /// Seconds for which a publisher stays after its last sample, unless it is terminated.
     pub linger: f64,
-    /// After so many samples, and so many more, a publisher waits for [`Peer::go`]; 0 = never.
+    /// Number of samples after which a publisher waits for [`Peer::go`], repeatedly; 0 = never.
     pub stretch: u64,
-    /// How many of the other role a peer waits for.
+    /// Number of peers of the other role for which a peer waits.
     pub peers: usize,
-    /// Bytes of each of the peers' receive buffers, as far as net.core.rmem_max goes.
+    /// Requested bytes of each peer's receive buffer, limited by net.core.rmem_max.
     pub receive_buffer: u32,
-    /// Fast DDS: the transports that it has by itself, shared memory among them.
+    /// Fast DDS: whether it uses its default transports, which include shared memory.
     pub shares_memory: bool,
-    /// Fast DDS: readers read the history of writers of their host.
+    /// Fast DDS: whether readers read the history of writers on their host.
     pub shares_history: bool,
 }
 
@@ -70,7 +70,7 @@ impl Stack {
         }
     }
 
-    /// The library of this name that its program loads, as the dynamic linker finds it.
+    /// Returns the library of this name that its program loads, as the dynamic linker finds it.
     pub fn library(self, name: &str) -> Result<PathBuf> {
         let list = Command::new("ldd").arg(self.program()?).output()?;
         let list = String::from_utf8_lossy(&list.stdout).into_owned();
@@ -103,8 +103,8 @@ impl Stream {
         }
     }
 
-    /// A point cloud of `size` bytes at 20 Hz, best effort. The history is a second long: RustDDS
-    /// drops what it overwrites before a busy CPU has sent it.
+    /// A point cloud of `size` bytes at 20 Hz, best effort. The history holds a second: RustDDS
+    /// drops samples that it overwrites before a busy CPU has sent them.
     pub fn point_cloud(size: usize, count: u64) -> Stream {
         Stream {
             topic: "/points".to_owned(),
@@ -117,8 +117,8 @@ impl Stream {
 }
 
 impl Peer {
-    /// Starts a peer and waits until its endpoints exist. A publisher holds its samples until
-    /// [`Peer::go`].
+    /// Starts a peer and waits until its endpoints exist. A publisher waits for [`Peer::go`] before
+    /// it sends.
     pub fn start(
         host: &Namespace,
         stack: Stack,
@@ -132,7 +132,8 @@ impl Peer {
         Ok(peer)
     }
 
-    /// As [`Peer::start`] without waiting, for peers that begin at the same time.
+    /// Starts a peer as [`Peer::start`] does, without waiting, so that peers can start at the same
+    /// time.
     pub fn launch(
         host: &Namespace,
         stack: Stack,
@@ -143,7 +144,8 @@ impl Peer {
         Peer::launch_behind(&host.inside(), stack, role, stream, nodes)
     }
 
-    /// As [`Peer::launch`] behind words of the caller's, such as a host's and an environment's.
+    /// Starts a peer as [`Peer::launch`] does, behind the caller's command prefix, such as a host's
+    /// with environment variables.
     pub fn launch_behind(
         enter: &[String],
         stack: Stack,
@@ -204,7 +206,7 @@ impl Peer {
         self.process.wait_for("ready", PATIENCE)
     }
 
-    /// Waits until a peer of the other role is known.
+    /// Waits until a peer of the other role is matched.
     pub fn wait_matched(&mut self) -> Result<()> {
         self.process.wait_for("matched", PATIENCE)
     }
@@ -233,7 +235,7 @@ pub fn robot() -> Result<PathBuf> {
     Ok(profile_directory()?.join("examples/robot"))
 }
 
-/// `target/debug` or the like: tests run from its `deps`, examples from its `examples`.
+/// Returns `target/debug` or its equivalent: tests run in its `deps`, examples in its `examples`.
 fn profile_directory() -> Result<PathBuf> {
     let program = std::env::current_exe().context("cannot tell where this program is")?;
     let directory = program
@@ -243,7 +245,7 @@ fn profile_directory() -> Result<PathBuf> {
     Ok(directory.to_owned())
 }
 
-/// A program that `make peers` builds.
+/// Returns a program built by `make peers`.
 pub fn built(name: &str) -> Result<PathBuf> {
     is_there(target_directory()?.join("peers").join(name), "make peers")
 }

@@ -1,5 +1,5 @@
-//! A program running on a host, ended with its value. It also dies with the thread that started it,
-//! so a killed test leaves nothing behind: start it from the thread that keeps it.
+//! A program running on a host, ended when its value is dropped. It also dies with the thread that
+//! started it, so a killed test leaves nothing behind: start it on the thread that keeps the value.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -19,7 +19,7 @@ pub struct Process {
 }
 
 impl Process {
-    /// Runs `program` behind the words of `host` (`Namespace::inside` or `on_network`).
+    /// Runs `program` behind the command prefix of `host` (`Namespace::inside` or `on_network`).
     pub fn start<A: AsRef<OsStr>>(
         host: &[String],
         program: impl AsRef<OsStr>,
@@ -28,7 +28,7 @@ impl Process {
         Process::start_with(host, program, arguments, Stdio::inherit())
     }
 
-    /// As [`Process::start`], with standard error going elsewhere.
+    /// Runs a program as [`Process::start`] does, with standard error redirected.
     pub fn start_with<A: AsRef<OsStr>>(
         host: &[String],
         program: impl AsRef<OsStr>,
@@ -74,7 +74,7 @@ impl Process {
         self.child.id()
     }
 
-    /// The UDP ports that it has bound.
+    /// Returns the UDP ports that it has bound.
     pub fn udp_ports(&self) -> Result<BTreeSet<u16>> {
         let of_process = |name: &str| format!("/proc/{}/{name}", self.pid());
         let mut sockets = BTreeSet::new();
@@ -142,7 +142,7 @@ impl Process {
         }
     }
 
-    /// Asks the program to end in order, and fails if it does not in time.
+    /// Sends SIGTERM to the program, and fails if it does not end in time.
     pub fn terminate(&mut self) -> Result<ExitStatus> {
         if let Some(status) = self.child.try_wait()? {
             return Ok(status);

@@ -1,4 +1,4 @@
-//! A real Prometheus on a host, and what it answers.
+//! A real Prometheus on a host, and its answers.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -13,7 +13,7 @@ use super::process::Process;
 
 pub const INSTALL: &str = "run `make prerequisites` or `apt-get install prometheus`";
 const SERVER: &str = "127.0.0.1:9090";
-/// How long a query may have no answer.
+/// Longest wait for the answer to a query.
 const PATIENCE: Duration = Duration::from_secs(40);
 
 pub struct Prometheus<'a> {
@@ -22,17 +22,17 @@ pub struct Prometheus<'a> {
     _directory: TempDir,
 }
 
-/// What a Prometheus does.
+/// Mode of a Prometheus.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// Keeps, evaluates and answers, and takes what others push.
+    /// Stores, evaluates and answers, and accepts pushed samples.
     Server,
-    /// Scrapes and pushes, and keeps only what it could not deliver.
+    /// Scrapes and pushes, and stores only undelivered samples.
     Agent,
 }
 
 impl<'a> Prometheus<'a> {
-    /// Scrapes these targets (`address:port`) and evaluates these files of rules each second.
+    /// Scrapes these targets (`address:port`) and evaluates these rule files each second.
     pub fn start(
         host: &'a Namespace,
         targets: &[String],
@@ -46,7 +46,7 @@ impl<'a> Prometheus<'a> {
         Prometheus::run(host, Kind::Server, &text)
     }
 
-    /// As a configuration says, on port 9090.
+    /// Runs with this configuration, on port 9090.
     pub fn run(host: &'a Namespace, kind: Kind, text: &str) -> Result<Prometheus<'a>> {
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("prometheus.yml");
@@ -76,7 +76,7 @@ impl<'a> Prometheus<'a> {
         })
     }
 
-    /// Asks until there is an answer; the value of its first sample.
+    /// Queries until an answer exists; returns the value of its first sample.
     pub fn query(&self, expression: &str) -> Result<f64> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -96,7 +96,7 @@ impl<'a> Prometheus<'a> {
         }
     }
 
-    /// Asks until this is the answer.
+    /// Queries until the answer is `wanted`.
     pub fn wait_for(&self, expression: &str, wanted: f64) -> Result<()> {
         let deadline = Instant::now() + PATIENCE;
         loop {
@@ -111,12 +111,12 @@ impl<'a> Prometheus<'a> {
         }
     }
 
-    /// How many series an expression has now.
+    /// Returns the current number of series of an expression.
     pub fn series(&self, expression: &str) -> Result<usize> {
         Ok(self.label_sets(expression)?.len())
     }
 
-    /// The labels of each series that an expression has now.
+    /// Returns the labels of each current series of an expression.
     pub fn label_sets(&self, expression: &str) -> Result<Vec<BTreeMap<String, String>>> {
         let answer = self
             .ask(expression)
@@ -130,7 +130,7 @@ impl<'a> Prometheus<'a> {
         labels.collect()
     }
 
-    /// The times of a series' samples: of its first, for an expression such as `up[30s]`.
+    /// Returns the times of the first series' samples, for an expression such as `up[30s]`.
     pub fn times(&self, expression: &str) -> Result<Vec<f64>> {
         let answer = self.ask(expression)?;
         let samples = answer.pointer("/data/result/0/values");

@@ -1,4 +1,4 @@
-//! A `/dev/shm` of a host's own, as a container has it: a network namespace does not bring one.
+//! A private `/dev/shm` for a host, as containers have: a network namespace does not include one.
 
 use std::time::Duration;
 
@@ -7,13 +7,13 @@ use anyhow::Result;
 use super::network::Namespace;
 use super::process::Process;
 
-/// A mount namespace with an empty `/dev/shm`. It lasts as long as this value.
+/// A mount namespace with an empty `/dev/shm`. Exists as long as this value.
 pub struct SharedMemory {
     keeper: Process,
 }
 
 impl SharedMemory {
-    /// For the processes of `host`; `megabytes` is its size.
+    /// Creates one for the processes of `host`, with a size of `megabytes`.
     pub fn of(host: &Namespace, megabytes: u32) -> Result<SharedMemory> {
         let mount = format!("mount -t tmpfs -o size={megabytes}m,mode=1777 shm /dev/shm");
         let script = format!("{mount} && echo ready && exec cat");
@@ -23,7 +23,7 @@ impl SharedMemory {
         Ok(SharedMemory { keeper })
     }
 
-    /// The words that run a command of `host` with it.
+    /// Returns the command prefix that runs a program of `host` with it.
     pub fn inside(&self, host: &Namespace) -> Vec<String> {
         let mut words = host.on_network();
         let mounts = format!("--mount=/proc/{}/ns/mnt", self.keeper.pid());

@@ -1,8 +1,8 @@
-//! What the kernel itself counts on a host: the judge of where datagrams died.
+//! The kernel's own counters of a host: the reference for where datagrams were lost.
 
 use anyhow::{Context as _, Result};
 
-/// The counters of `/proc/net/snmp` of the network that a process is in.
+/// The counters of `/proc/net/snmp` in the network of a process.
 pub struct Snmp(String);
 
 impl Snmp {
@@ -12,17 +12,17 @@ impl Snmp {
         Ok(Snmp(text))
     }
 
-    /// Datagrams that found no room in a socket's receive buffer.
+    /// Returns datagrams dropped at a full socket buffer.
     pub fn receive_buffer_errors(&self) -> Result<u64> {
         self.value("Udp:", "RcvbufErrors")
     }
 
-    /// Datagrams that reached a socket and were not delivered, for whatever reason.
+    /// Returns datagrams that reached a socket but were not delivered, for any reason.
     pub fn receive_errors(&self) -> Result<u64> {
         self.value("Udp:", "InErrors")
     }
 
-    /// Datagrams that were sent.
+    /// Returns datagrams sent.
     pub fn sent(&self) -> Result<u64> {
         self.value("Udp:", "OutDatagrams")
     }

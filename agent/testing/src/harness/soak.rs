@@ -1,5 +1,5 @@
-//! How long a test goes on, what an agent needed meanwhile, and where that is written down: the same
-//! tests run for seconds in `make test` and for an hour in `make soak`.
+//! Length of endurance tests, the agent's resource usage over time, and its report: the same tests
+//! run for seconds in `make test` and for an hour in `make soak`.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -13,16 +13,16 @@ use super::agent::{METRICS, Scrape, get};
 use super::network::Namespace;
 use super::usage::Usage;
 
-/// Set for the long form.
+/// Set for the long run.
 const SOAK: &str = "ROS2PROBE_SOAK";
-/// How long it takes; an hour where it is not set.
+/// Length of the long run in seconds; an hour if unset.
 const SECONDS: &str = "ROS2PROBE_SOAK_SECONDS";
-/// Another build of `rp` than the tests'.
+/// Path of another build of `rp` than the tests'.
 const PROGRAM: &str = "ROS2PROBE_SOAK_PROGRAM";
-/// Where results go; `target/soak` where it is not set.
+/// Directory of results; `target/soak` if unset.
 const RESULTS: &str = "ROS2PROBE_SOAK_RESULTS";
 
-/// How long the long form takes; `None` in `make test`.
+/// Returns the length of the long run; `None` in `make test`.
 pub fn long() -> Option<Duration> {
     let is_set = std::env::var_os(SOAK).is_some_and(|value| !value.is_empty() && value != "0");
     let seconds = std::env::var(SECONDS)
@@ -31,12 +31,12 @@ pub fn long() -> Option<Duration> {
     is_set.then(|| Duration::from_secs(seconds.unwrap_or(3600)))
 }
 
-/// The agent's program, `built` unless the environment names another.
+/// Returns the agent's program: `built` unless the environment names another.
 pub fn program(built: &str) -> PathBuf {
     std::env::var_os(PROGRAM).map_or_else(|| built.into(), Into::into)
 }
 
-/// The directory of the long form's results.
+/// Returns the directory of the long run's results.
 pub fn results() -> Result<PathBuf> {
     let target = crate::repository("target");
     let target = std::env::var_os("CARGO_TARGET_DIR").map_or(target, Into::into);
@@ -46,7 +46,7 @@ pub fn results() -> Result<PathBuf> {
     Ok(directory)
 }
 
-/// What an agent needed at a moment.
+/// Resource usage of an agent at one time.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Need {
     pub seconds: f64,
@@ -56,11 +56,11 @@ pub struct Need {
     pub cpu: f64,
     pub descriptors: usize,
     pub threads: usize,
-    /// Of its BPF programs and maps.
+    /// Memory of its BPF programs and maps.
     pub kernel_bytes: u64,
     pub page_bytes: usize,
     pub dropped: f64,
-    /// Seconds since the agent's facts were new.
+    /// Age of the agent's facts, in seconds.
     pub age: f64,
 }
 
@@ -87,17 +87,17 @@ impl Need {
     }
 }
 
-/// What the kernel could not hand to the agent.
+/// Returns what the kernel could not deliver to the agent.
 pub fn dropped(page: &Scrape) -> f64 {
     page.sum("ros2probe_capture_dropped_packets_total", &[])
         + page.sum("ros2probe_records_dropped_total", &[])
 }
 
-/// What the kernel says that the BPF objects take which a process holds.
+/// Returns the memory of the BPF objects held by a process, as the kernel reports it.
 fn kernel_bytes(pid: u32) -> Result<u64> {
     let mut bytes = 0;
     for entry in fs::read_dir(format!("/proc/{pid}/fdinfo"))? {
-        // A descriptor may be closed meanwhile.
+        // A descriptor may be closed between listing and reading.
         let text = fs::read_to_string(entry?.path()).unwrap_or_default();
         let locked = text
             .lines()
@@ -109,7 +109,7 @@ fn kernel_bytes(pid: u32) -> Result<u64> {
     Ok(bytes)
 }
 
-/// An agent's needs over time.
+/// An agent's resource usage over time.
 #[derive(Clone, Debug)]
 pub struct Curve {
     pub name: &'static str,
@@ -117,7 +117,7 @@ pub struct Curve {
 }
 
 impl Curve {
-    /// Looks until it is told to stop, and says once a minute what it saw.
+    /// Samples the usage until it is stopped, and logs it once per minute.
     pub fn draw(
         name: &'static str,
         (pid, host): (u32, &Namespace),
@@ -142,7 +142,7 @@ impl Curve {
         Ok(Curve { name, needs })
     }
 
-    /// Medians of the minutes in which the graph was large, once the first ones are over.
+    /// Returns the medians of the minutes with a large graph, after the first ones.
     fn minutes(&self, skipped: f64) -> Vec<(f64, f64)> {
         let largest = self.needs.iter().map(|need| need.participants);
         let large = largest.fold(0.0, f64::max) * 0.9;
@@ -158,8 +158,8 @@ impl Curve {
             .collect()
     }
 
-    /// The growth of its memory over the whole time as a part of it: by the median of all slopes
-    /// between two minutes (Theil and Sen), and by the last tenth against the first.
+    /// Returns the growth of its memory over the whole time as a fraction: by the median of all
+    /// slopes between two minutes (Theil and Sen), and by comparing the last tenth with the first.
     pub fn growth(&self, skipped: f64) -> Option<(f64, f64)> {
         let minutes = self.minutes(skipped);
         let (first, last) = (minutes.first()?, minutes.last()?);
@@ -181,7 +181,7 @@ impl Curve {
         })
     }
 
-    /// Fails if anything but memory is more at the end than it was in the middle.
+    /// Fails if anything but memory is higher at the end than in the middle.
     pub fn is_level(&self) -> Result<()> {
         let middle = self.needs.len() / 2;
         let (early, late) = self.needs.split_at(middle);
@@ -189,10 +189,10 @@ impl Curve {
             |part: &[Need], what: fn(&Need) -> f64| part.iter().map(what).fold(0.0, f64::max);
         type Kind = (&'static str, fn(&Need) -> f64, f64);
         let kinds: [Kind; 4] = [
-            // A connection of a scrape may be open while they are counted.
+            // A scrape may have a connection open during the count.
             ("descriptors", |need| need.descriptors as f64, 4.0),
             ("threads", |need| need.threads as f64, 1.0),
-            // Hash maps take what their entries need.
+            // Hash maps grow with their entries.
             (
                 "bytes of BPF objects",
                 |need| need.kernel_bytes as f64,
@@ -269,7 +269,7 @@ pub fn publish(curves: &[Curve]) -> Result<()> {
     Ok(())
 }
 
-/// Memory of each agent in colour, and the participants it saw in grey.
+/// Draws the memory of each agent in colour, and its number of participants in grey.
 fn picture(curves: &[Curve]) -> Result<String> {
     const COLOURS: [&str; 2] = ["#0b6", "#06c"];
     const POINTS: usize = 240;
@@ -348,7 +348,7 @@ fn picture(curves: &[Curve]) -> Result<String> {
     Ok(svg)
 }
 
-/// Appends what a fault led to to `faults.md`, in the long form, and says it.
+/// In the long run, appends the result of a fault to `faults.md`; prints it.
 pub fn outcome(fault: &str, outcome: &str) -> Result<()> {
     eprintln!("{fault}: {outcome}");
     if long().is_none() {
@@ -361,7 +361,7 @@ pub fn outcome(fault: &str, outcome: &str) -> Result<()> {
         text.push_str("| fault | outcome |\n| --- | --- |\n");
     }
     writeln!(text, "| {fault} | {outcome} |")?;
-    // One write: tests run side by side.
+    // One write: tests run in parallel.
     let mut file = fs::File::options().create(true).append(true).open(file)?;
     std::io::Write::write_all(&mut file, text.as_bytes())?;
     Ok(())

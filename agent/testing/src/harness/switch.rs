@@ -1,5 +1,5 @@
-//! A switch between two hosts. What it loses, the sender's packet taps have seen and the receiver's
-//! have not: `Loss::of_samples` on it makes loss between two agents.
+//! A switch between two hosts. The sender's packet taps see what it drops, the receiver's do not:
+//! `Loss::of_samples` on it creates loss between two agents.
 
 use anyhow::Result;
 
@@ -15,7 +15,7 @@ pub struct Switched {
 }
 
 impl Switched {
-    /// Plugs the two ends of a new link into a switch.
+    /// Connects the two ends of a new link to a switch.
     pub fn new() -> Result<Switched> {
         let link = Link::new()?;
         let switch = Namespace::alone()?;

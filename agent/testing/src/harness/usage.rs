@@ -1,4 +1,4 @@
-//! What a process and the whole machine have spent, from `/proc`.
+//! CPU time and memory of a process and of the whole machine, from `/proc`.
 
 use std::fs;
 use std::path::Path;
@@ -11,7 +11,7 @@ const TICK: Duration = Duration::from_millis(10);
 
 #[derive(Clone, Copy, Debug)]
 pub struct Usage {
-    /// Time on a CPU of all its threads, to the nanosecond.
+    /// CPU time of all its threads, to the nanosecond.
     pub cpu: Duration,
     pub memory: Memory,
 }
@@ -19,21 +19,22 @@ pub struct Usage {
 /// Its memory in bytes.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Memory {
-    /// What the kernel cannot have back without the process: its own pages (anonymous, changed, swapped)
-    /// and the rings that it shares with the kernel. The rest is pages of files, as the program's.
+    /// Memory that the kernel cannot reclaim while the process exists: its own pages (anonymous,
+    /// changed, swapped) and the rings that it shares with the kernel. The rest is pages of files,
+    /// such as the program's.
     pub unreclaimable: u64,
-    /// Of that, what belongs to the rings.
+    /// The part of it in the rings.
     pub rings: u64,
-    /// Of that, pages of the program that its start or its run changed.
+    /// The part of it in pages of the program changed at start or run time.
     pub program: u64,
     /// All pages in memory.
     pub rss: u64,
-    /// Likewise, shared pages divided among their users.
+    /// All pages in memory, with shared pages divided among their users.
     pub pss: u64,
 }
 
 impl Usage {
-    /// Threads that have ended are not counted any more.
+    /// Reads the usage of a process. Threads that have ended no longer count.
     pub fn of(pid: u32) -> Result<Usage> {
         let mut cpu = Duration::ZERO;
         let tasks = fs::read_dir(format!("/proc/{pid}/task"))
@@ -45,7 +46,7 @@ impl Usage {
         Ok(Usage { cpu, memory })
     }
 
-    /// The CPU time between two looks, and the memory at the later one.
+    /// Returns the CPU time since `earlier`, and the current memory.
     pub fn since(&self, earlier: &Usage) -> Usage {
         Usage {
             cpu: self.cpu.saturating_sub(earlier.cpu),
@@ -55,17 +56,17 @@ impl Usage {
 }
 
 impl Memory {
-    /// The most of each.
+    /// Returns the maximum of each figure.
     pub fn max(self, other: Memory) -> Memory {
         self.with(other, u64::max)
     }
 
-    /// Of several processes together.
+    /// Returns the sum of two processes.
     pub fn plus(self, other: Memory) -> Memory {
         self.with(other, u64::saturating_add)
     }
 
-    /// In MB (10^6): unreclaimable, RSS, PSS.
+    /// Formats unreclaimable, RSS and PSS in MB (10^6).
     pub fn megabytes(&self) -> String {
         let megabytes = |bytes: u64| bytes as f64 / 1e6;
         let (own, rss, pss) = (self.unreclaimable, self.rss, self.pss);
@@ -87,7 +88,7 @@ impl Memory {
         }
     }
 
-    /// At this moment.
+    /// Reads the current memory of a process.
     pub fn of(pid: u32) -> Result<Memory> {
         let maps = fs::read_to_string(format!("/proc/{pid}/smaps"))
             .with_context(|| format!("cannot read the memory of process {pid}"))?;
@@ -143,7 +144,7 @@ impl Mapping {
         memory.rss += self.rss;
         memory.pss += self.pss;
         let own = if self.is_ring {
-            // The kernel's rings are mapped twice, one behind the other: RSS counts them twice.
+            // The kernel's rings are mapped twice in succession: RSS counts them twice.
             memory.rings += self.pss;
             self.pss
         } else {
@@ -156,8 +157,8 @@ impl Mapping {
     }
 }
 
-/// Time that all CPUs of the machine have been idle. What they worked is the rest of the time: the
-/// kernel's counters of work are sampled at its ticks, and miss what a timer starts just after one.
+/// Returns the idle time of all CPUs of the machine; the rest is work. The kernel's counters of
+/// work are sampled at its ticks, and miss work that a timer starts just after one.
 pub fn machine_idle() -> Result<Duration> {
     let statistics = fs::read_to_string("/proc/stat").context("cannot read /proc/stat")?;
     let times = statistics.lines().next().context("/proc/stat is empty")?;
@@ -167,7 +168,7 @@ pub fn machine_idle() -> Result<Duration> {
     Ok(ticks.map(|ticks| TICK * ticks).sum())
 }
 
-/// Time on a CPU of the threads to which the kernel puts off packets that it has no time for.
+/// Returns the CPU time of the threads to which the kernel defers packets.
 pub fn softirq_cpu() -> Result<Duration> {
     let mut cpu = Duration::ZERO;
     for entry in fs::read_dir("/proc")
@@ -182,7 +183,7 @@ pub fn softirq_cpu() -> Result<Duration> {
     Ok(cpu)
 }
 
-/// The first number of `schedstat`: nanoseconds on a CPU.
+/// Returns the first number of `schedstat`: nanoseconds on a CPU.
 fn run_time(task: &Path) -> Duration {
     let statistics = fs::read_to_string(task.join("schedstat")).unwrap_or_default();
     let run = statistics

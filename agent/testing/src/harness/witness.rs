@@ -1,5 +1,5 @@
-//! The agent's library inside the test: what it knows, sample by sample, where the agent's page has
-//! sums only. It works as the agent does, and looks at sockets of the whole machine: give it a
+//! The agent's library inside a test: it exposes each sample, while the agent's page has only sums.
+//! It works as the agent does, and observes sockets of the whole machine unless it is given a
 //! control group.
 
 use std::path::{Path, PathBuf};
@@ -24,7 +24,7 @@ use super::bpf;
 use super::network::Namespace;
 
 const SLICE: Duration = Duration::from_millis(100);
-/// How long the kernel may wait for IP fragments, and some more: after that every cause is settled.
+/// Longer than the kernel waits for IP fragments: after that every cause is settled.
 const UNTIL_ALL_IS_SETTLED: u64 = 60_000_000_000;
 
 pub struct Witness {
@@ -32,20 +32,20 @@ pub struct Witness {
     thread: Option<JoinHandle<Result<Testimony>>>,
 }
 
-/// All it knows at the end.
+/// Its state at the end.
 pub struct Testimony {
-    /// Once the peers had gone and everything open was settled.
+    /// Snapshot after the peers left and everything open was settled.
     pub end: Snapshot,
     pub losses: Vec<Loss>,
     pub delivery_losses: Vec<DeliveryLoss>,
     /// The kernel programs' own counters.
     pub counters: Vec<(Counter, u64)>,
-    /// Runs of those that the kernel left out.
+    /// Runs of the programs that the kernel skipped.
     pub skipped_runs: u64,
 }
 
 impl Testimony {
-    /// Fails when the kernel programs had to leave anything out.
+    /// Fails if the kernel programs had to omit anything.
     pub fn ensure_complete(&self) -> Result<()> {
         for (counter, value) in &self.counters {
             let blind = ["records_lost", "contended"].contains(&counter.label());
@@ -62,12 +62,12 @@ struct Shared {
 }
 
 impl Witness {
-    /// Returns once it sees all that happens.
+    /// Returns once it observes all traffic.
     pub fn start(configuration: &str) -> Result<Witness> {
         Witness::start_in(None, configuration)
     }
 
-    /// As [`Witness::start`], on a host's network.
+    /// Starts as [`Witness::start`] does, on a host's network.
     pub fn start_on(host: &Namespace, configuration: &str) -> Result<Witness> {
         let network = PathBuf::from(format!("/run/netns/{}", host.name()));
         Witness::start_in(Some(network), configuration)
@@ -104,7 +104,7 @@ impl Witness {
         latest.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Waits until what it knows answers `question`.
+    /// Waits until `question` returns an answer for the current state.
     pub fn wait_for<T>(
         &self,
         what: &str,
@@ -124,7 +124,7 @@ impl Witness {
         }
     }
 
-    /// Takes in what the kernel still holds and settles everything.
+    /// Reads what the kernel still holds and settles everything.
     pub fn finish(&mut self) -> Result<Testimony> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let thread = self.thread.take().context("the witness has ended")?;

@@ -1,4 +1,4 @@
-//! Writes captures of what participants say, as tcpdump does.
+//! Writes captures of participants' messages, as tcpdump does.
 
 use std::path::Path;
 
@@ -20,7 +20,7 @@ impl Capture {
         Self(bytes)
     }
 
-    /// A message to the discovery multicast address of a domain.
+    /// Adds a message to the discovery multicast address of a domain.
     pub fn put(&mut self, time: u64, domain_id: u16, message: Message) {
         let message = message.bytes();
         let length = |header: usize| u16::try_from(message.len() + header).unwrap();
@@ -38,7 +38,7 @@ impl Capture {
         self.frame(time, &frame);
     }
 
-    /// A frame as it is.
+    /// Adds a frame unchanged.
     pub fn frame(&mut self, time: u64, frame: &[u8]) {
         let length = u32::try_from(frame.len()).unwrap();
         let seconds = u32::try_from(time / 1_000_000_000).unwrap();
@@ -57,21 +57,21 @@ impl Capture {
         );
     }
 
-    /// The `number`th announcement of a writer of `std_msgs/msg/String`.
+    /// Adds the `number`th announcement of a writer of `std_msgs/msg/String`.
     pub fn writer(&mut self, time: u64, domain_id: u16, guid: Guid, topic: &str, number: u64) {
         let payload = forge::endpoint(guid, topic, "std_msgs::msg::dds_::String_", true);
         let message = Message::from(guid.prefix).data(SEDP_WRITERS, number, &payload);
         self.put(time, domain_id, message);
     }
 
-    /// Likewise of a reader.
+    /// Adds the `number`th announcement of a reader.
     pub fn reader(&mut self, time: u64, domain_id: u16, guid: Guid, topic: &str, number: u64) {
         let payload = forge::endpoint(guid, topic, "std_msgs::msg::dds_::String_", true);
         let message = Message::from(guid.prefix).data(SEDP_READERS, number, &payload);
         self.put(time, domain_id, message);
     }
 
-    /// A sample `std_msgs/msg/String`.
+    /// Adds a sample of `std_msgs/msg/String`.
     pub fn sample(&mut self, time: u64, domain_id: u16, guid: Guid, number: u64) {
         let payload = b"\0\x01\0\0\x06\0\0\0hello\0\0\0";
         let message = Message::from(guid.prefix).info_ts(time);
@@ -83,13 +83,13 @@ impl Capture {
     }
 }
 
-/// The `number`th writer of a participant.
+/// Returns the GUID of the `number`th writer of a participant.
 pub fn writer(prefix: GuidPrefix, number: usize) -> Guid {
     let [_, .., high, low] = u32::try_from(number + 0x100).unwrap().to_be_bytes();
     Guid::new(prefix, EntityId([0, high, low, 0x03]))
 }
 
-/// The `number`th reader.
+/// Returns the GUID of the `number`th reader.
 pub fn reader(prefix: GuidPrefix, number: usize) -> Guid {
     let [_, .., high, low] = u32::try_from(number + 0x100).unwrap().to_be_bytes();
     Guid::new(prefix, EntityId([0, high, low, 0x04]))

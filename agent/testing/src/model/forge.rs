@@ -1,4 +1,4 @@
-//! Writes RTPS messages as real participants do, and as nobody should.
+//! Builds RTPS messages as real participants send them, and invalid ones.
 
 use std::net::SocketAddrV4;
 
@@ -9,7 +9,7 @@ pub const SPDP: EntityId = EntityId::SPDP_WRITER;
 pub const SEDP_WRITERS: EntityId = EntityId::SEDP_PUBLICATIONS_WRITER;
 pub const SEDP_READERS: EntityId = EntityId::SEDP_SUBSCRIPTIONS_WRITER;
 
-/// One RTPS message being written, little-endian.
+/// One RTPS message under construction, little-endian.
 pub struct Message(Vec<u8>);
 
 impl Message {
@@ -27,13 +27,13 @@ impl Message {
         self.submessage(0x09, 0x01, &body)
     }
 
-    /// DATA with a payload.
+    /// Adds a DATA with a payload.
     pub fn data(self, writer: EntityId, number: u64, payload: &[u8]) -> Self {
         let body = [&fixed(16, writer, number)[..], payload].concat();
         self.submessage(0x15, 0x05, &body)
     }
 
-    /// Disposal with a key as payload, as Cyclone DDS writes it.
+    /// Adds a disposal with a key as payload, as Cyclone DDS writes it.
     pub fn dispose_by_key(self, writer: EntityId, number: u64, pid: u16, guid: Guid) -> Self {
         let inline_qos = parameters(&[(0x71, vec![0, 0, 0, 3])]);
         let payload = encapsulated(&[(pid, guid.to_bytes().to_vec())]);
@@ -41,14 +41,14 @@ impl Message {
         self.submessage(0x15, 0x01 | 0x02 | 0x08, &body)
     }
 
-    /// Disposal with a key hash and no payload, as Fast DDS writes it.
+    /// Adds a disposal with a key hash and no payload, as Fast DDS writes it.
     pub fn dispose_by_hash(self, writer: EntityId, number: u64, guid: Guid) -> Self {
         let inline_qos = parameters(&[(0x70, guid.to_bytes().to_vec()), (0x71, vec![0, 0, 0, 3])]);
         let body = [&fixed(16, writer, number)[..], &inline_qos].concat();
         self.submessage(0x15, 0x01 | 0x02, &body)
     }
 
-    /// DATA_FRAG of one fragment.
+    /// Adds a DATA_FRAG of one fragment.
     pub fn fragment(
         self,
         writer: EntityId,
@@ -83,7 +83,7 @@ impl Message {
     }
 }
 
-/// The fields of DATA and DATA_FRAG up to the sequence number.
+/// Returns the fields of DATA and DATA_FRAG up to the sequence number.
 fn fixed(to_inline_qos: u16, writer: EntityId, number: u64) -> Vec<u8> {
     let mut body = vec![0, 0];
     body.extend_from_slice(&to_inline_qos.to_le_bytes());
@@ -116,12 +116,12 @@ fn text(text: &str) -> Vec<u8> {
     [&len.to_le_bytes()[..], text.as_bytes(), &[0]].concat()
 }
 
-/// SPDP payload; the domain is left to the port when `None`.
+/// Returns an SPDP payload; with `None` the domain is left to the port.
 pub fn participant(prefix: GuidPrefix, lease_seconds: u32, domain_id: Option<u32>) -> Vec<u8> {
     participant_at(prefix, lease_seconds, domain_id, &[])
 }
 
-/// SPDP payload of a participant that is reached by unicast at these addresses.
+/// Returns the SPDP payload of a participant with these unicast addresses.
 pub fn participant_at(
     prefix: GuidPrefix,
     lease_seconds: u32,
@@ -152,14 +152,14 @@ pub fn participant_at(
     encapsulated(&list)
 }
 
-/// SEDP payload.
+/// Returns an SEDP payload.
 pub fn endpoint(guid: Guid, topic: &str, type_name: &str, reliable: bool) -> Vec<u8> {
     let reliability = if reliable { 2u32 } else { 1 };
     let value = [&reliability.to_le_bytes()[..], &[0; 8]].concat();
     endpoint_with(guid, topic, type_name, &[(0x1a, &value)])
 }
 
-/// SEDP payload with these parameters beside GUID, topic and type.
+/// Returns an SEDP payload with these parameters in addition to GUID, topic and type.
 pub fn endpoint_with(guid: Guid, topic: &str, type_name: &str, others: &[(u16, &[u8])]) -> Vec<u8> {
     let mut list = vec![
         (0x5a, guid.to_bytes().to_vec()),
@@ -170,7 +170,8 @@ pub fn endpoint_with(guid: Guid, topic: &str, type_name: &str, others: &[(u16, &
     encapsulated(&list)
 }
 
-/// `ros_discovery_info` payload: nodes by name with one writer each; gids of 16 or 24 bytes.
+/// Returns a `ros_discovery_info` payload: nodes by name with one writer each; gids of 16 or 24
+/// bytes.
 pub fn entities(prefix: GuidPrefix, gid_len: usize, nodes: &[(&str, &str, Guid)]) -> Vec<u8> {
     let gid = |guid: Guid| {
         let mut bytes = guid.to_bytes().to_vec();
@@ -196,7 +197,7 @@ pub fn entities(prefix: GuidPrefix, gid_len: usize, nodes: &[(&str, &str, Guid)]
     [&[0, 1, 0, 0][..], &cdr].concat()
 }
 
-/// To the discovery multicast address of a domain.
+/// Returns the context of a datagram to the discovery multicast address of a domain.
 pub fn multicast(time: u64, domain_id: u16) -> Envelope {
     let mut destination = [0; 16];
     destination[10..].copy_from_slice(&[0xff, 0xff, 239, 255, 0, 1]);

@@ -1,4 +1,4 @@
-//! A host in virtual time: a writer elsewhere or on it, and receivers at its sockets.
+//! A host in virtual time: a remote or local writer, and receivers at its sockets.
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
@@ -23,11 +23,11 @@ pub const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
 pub const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 pub const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 pub const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
-/// Where multicast samples go.
+/// Destination of multicast samples.
 pub const GROUP: &str = "239.255.0.1:7401";
 const STRING: &str = "std_msgs::msg::dds_::String_";
 
-/// Where a record is seen.
+/// Place at which a record is seen.
 #[derive(Clone, Copy)]
 pub struct Seen {
     pub socket: u64,
@@ -37,7 +37,7 @@ pub struct Seen {
 }
 
 impl Seen {
-    /// The same receiver's multicast socket.
+    /// Returns the same receiver's multicast socket.
     pub fn multicast(self, socket: u64) -> Self {
         Self {
             socket,
@@ -47,7 +47,7 @@ impl Seen {
         }
     }
 
-    /// On its way out to there.
+    /// Returns the same place for a datagram sent to it.
     pub fn leaving(self) -> Self {
         Self {
             socket: 9,
@@ -56,7 +56,7 @@ impl Seen {
         }
     }
 
-    /// On a wire.
+    /// Returns the same place on a wire.
     pub fn wire(self) -> Self {
         Self {
             socket: 0,
@@ -90,7 +90,7 @@ impl Host {
         Self::default()
     }
 
-    /// With a reliable writer of Alice's on `/chatter`.
+    /// Creates a host with a reliable writer of Alice's on `/chatter`.
     pub fn with(settings: Settings) -> Self {
         let mut observer = Observer::new(settings);
         observer.input(Input::Watchlist(Arc::new(
@@ -117,7 +117,7 @@ impl Host {
         self.announce(Message::from(prefix).data(SPDP, 1, &payload));
     }
 
-    /// A participant with one reader, reached by unicast at this port.
+    /// Adds a participant with one reader, at this unicast port.
     pub fn reader(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
         let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
         self.participant(prefix, address);
@@ -130,12 +130,12 @@ impl Host {
         }
     }
 
-    /// Announces a reader; `number` is that of the announcement.
+    /// Announces a reader; `number` is the announcement's sequence number.
     pub fn subscribe(&mut self, prefix: GuidPrefix, number: u64) {
         self.subscribe_with(prefix, number, true);
     }
 
-    /// Likewise, with this reliability.
+    /// Announces a reader with this reliability.
     pub fn subscribe_with(&mut self, prefix: GuidPrefix, number: u64, reliable: bool) {
         let guid = Guid::new(prefix, READER);
         let payload = forge::endpoint(guid, "rt/chatter", STRING, reliable);
@@ -147,7 +147,7 @@ impl Host {
         self.announce(Message::from(prefix).dispose_by_hash(SEDP_READERS, number, guid));
     }
 
-    /// A participant with a reader of another topic only.
+    /// Adds a participant with a reader of another topic only.
     pub fn bystander(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
         let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
         self.participant(prefix, address);
@@ -161,7 +161,7 @@ impl Host {
         }
     }
 
-    /// The socket is held by the process in which the participant lives, as its own packets tell.
+    /// Reports that the participant's process holds the socket, as its own packets show.
     pub fn owner(&mut self, seen: Seen, prefix: GuidPrefix) {
         let process_id = u32::from(prefix.0[2]);
         let sending = 1000 + u64::from(process_id);
@@ -202,7 +202,7 @@ impl Host {
         self.observer.input(Input::Time(Timestamp(self.now)));
     }
 
-    /// A record of Alice's writer.
+    /// Returns a record of Alice's writer.
     pub fn record(&self, seen: Seen, kind: u8, number: u64) -> Record {
         let [a, b, c, d] = seen.address.ip().octets();
         let directed = seen
@@ -241,7 +241,7 @@ impl Host {
         self.put(self.record(seen, kind::DATA, number));
     }
 
-    /// It reached the socket, which had no room.
+    /// Reports that the socket had no room for the record.
     pub fn no_room(&mut self, seen: Seen, number: u64) {
         let arrival = self.record(seen, kind::DATA, number);
         self.put(Record {
@@ -251,7 +251,7 @@ impl Host {
         self.put(arrival);
     }
 
-    /// Fragments of a sample of ten, joined over `elapsed` nanoseconds.
+    /// Returns fragments of a sample with ten, joined over `elapsed` nanoseconds.
     pub fn fragments(&self, seen: Seen, number: u64, start: u32, count: u32) -> Record {
         Record {
             fragment_start: start,
@@ -272,12 +272,12 @@ impl Host {
         });
     }
 
-    /// Bob's reader has all below `base`.
+    /// Acknowledges all samples below `base` by Bob's reader.
     pub fn acknack(&mut self, bob: Seen, base: u64) {
         self.request(bob, base, 0, 0);
     }
 
-    /// And asks for some of the next `bits`.
+    /// Acknowledges, and requests some of the next `bits` samples.
     pub fn request(&mut self, bob: Seen, base: u64, bits: u32, bitmap: u32) {
         self.put(Record {
             reader: guid_words(Guid::new(BOB, READER)),
@@ -287,7 +287,7 @@ impl Host {
         });
     }
 
-    /// This one will not come.
+    /// Announces that this sample will not be sent.
     pub fn gap(&mut self, seen: Seen, number: u64) {
         self.put(Record {
             payload_len: 0,
@@ -309,14 +309,14 @@ impl Host {
         *self.topic().measurement.unwrap()
     }
 
-    /// At receivers.
+    /// Returns the deliveries at receivers.
     pub fn deliveries(&self) -> Vec<DeliveryFacts> {
         let mut deliveries = self.topic().deliveries;
         deliveries.retain(|each| each.direction == Direction::Received);
         deliveries
     }
 
-    /// Numbers lost by this cause, of all receivers.
+    /// Returns the numbers lost by this cause, of all receivers.
     pub fn losses(&self, cause: LossCause) -> Vec<u64> {
         let losses = self.observer.journal().delivery_losses();
         let mut lost: Vec<_> = losses

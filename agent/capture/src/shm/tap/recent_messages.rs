@@ -1,11 +1,11 @@
-//! The latest messages, so that one which stands in several ports counts once.
+//! The latest messages, so that a message in several ports counts once.
 
 use std::collections::{HashSet, VecDeque};
 
-/// Messages remembered, so that one is not read again at another port.
+/// Messages remembered, so that none is read again at another port.
 pub(super) const REMEMBERED: usize = 8192;
 
-/// The latest messages by where they lay.
+/// The latest messages by position.
 #[derive(Default)]
 pub(super) struct RecentMessages {
     pub(super) set: HashSet<Identity>,

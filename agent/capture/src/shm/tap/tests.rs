@@ -1,4 +1,4 @@
-//! The tap over files that our own writer of the layout makes.
+//! Tests the tap on files written in Fast DDS's layout.
 
 use std::cell::Cell;
 use std::fs;
@@ -36,7 +36,7 @@ fn sample(number: u32) -> Vec<u8> {
     bytes
 }
 
-/// One host's shared memory, the tap on it and its clock.
+/// The shared memory of one host, the tap on it and its clock.
 struct Host {
     directory: TempDir,
     tap: Tap,
@@ -77,7 +77,7 @@ impl Host {
         SegmentImage::new([id; 8], 1 << 16).in_directory(self.path())
     }
 
-    /// Lets time pass and looks.
+    /// Advances the clock and polls.
     fn find_after(&mut self, nanoseconds: u64) -> Vec<Item> {
         self.now += nanoseconds;
         self.calendar.set(self.calendar.get() + nanoseconds);
@@ -86,7 +86,7 @@ impl Host {
         found
     }
 
-    /// Lets time pass and looks; the numbers of the samples that were found.
+    /// Advances the clock and polls; returns the numbers of the samples found.
     fn poll_after(&mut self, nanoseconds: u64) -> Vec<u64> {
         let found = self.find_after(nanoseconds);
         let numbers = found.iter().filter_map(|item| match item {
@@ -96,8 +96,7 @@ impl Host {
         numbers.collect()
     }
 
-    /// Files of this host that are open; the images' own, which are open for writing, are not
-    /// counted.
+    /// Open files of this host; the images' own files, which are open for writing, are not counted.
     fn descriptors(&self) -> usize {
         let open = fs::read_dir("/proc/self/fd").unwrap().flatten();
         let open = open.filter(|entry| {
@@ -147,7 +146,7 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
     host.tap.classifier.set(writer(), Some(Verdict::Capture));
     let (mut port, mut segment) = (host.port(7411), host.large_segment(1));
     host.poll_after(SECOND);
-    // The last submessage of a message may be longer than its length field can tell: 0, to the end.
+    // The last submessage of a message may exceed its length field: 0 means to the end.
     let mut message = sample(1);
     message[34..36].fill(0);
     message.resize(200_000, 7);
@@ -157,7 +156,7 @@ fn a_message_of_200_kilobytes_in_one_buffer_is_captured_whole() {
         panic!("{found:?}");
     };
     assert_eq!(bytes, &message);
-    // Metered, it is one sample of that size.
+    // Metered, the message is one sample of that size.
     host.tap.classifier.set(writer(), Some(Verdict::Meter));
     port.push(segment.put(&message));
     let found = host.find_after(MILLISECOND);
@@ -173,7 +172,7 @@ fn a_message_bears_the_time_after_it_was_announced_and_not_that_of_the_look_s_be
     let mut host = Host::new();
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(SECOND);
-    // It is sent while the look is under way already.
+    // It is sent while the poll is in progress.
     let clock = Rc::clone(&host.calendar);
     host.tap.calendar = Box::new(move || clock.replace(clock.get() + 1000));
     port.push(segment.put(&sample(1)));
@@ -197,13 +196,13 @@ fn while_every_message_is_wanted_a_silent_port_is_looked_at_each_time() {
     let descriptor = segment.put(&sample(5));
     port.push(descriptor);
     assert_eq!(host.poll_after(MILLISECOND), [5]);
-    // One that is read tells of no participant: looks stay within the budget for readers.
+    // A sample that is read indicates no new participant: polls stay within the budget for readers.
     host.tap.classifier.set(writer(), Some(Verdict::Capture));
     host.tap.take_discovery_seen();
     port.push(segment.put(&sample(6)));
     assert_eq!(host.find_after(MILLISECOND).len(), 1);
     assert!(!host.tap.take_discovery_seen());
-    // Its buffer is used again before a port at rest would be looked at.
+    // Its buffer is reused before a port at rest would be polled.
     segment.free(descriptor);
 }
 
@@ -224,7 +223,7 @@ fn what_stood_in_the_ring_before_is_found_without_a_time_of_its_own() {
     assert_eq!(host.tap.counters().missed, 1);
 }
 
-/// Beside a file of Fast DDS's, the one whose lock says that its process lives.
+/// Creates the lock file beside a file of Fast DDS; its lock shows that the process lives.
 fn lock_of(path: &Path, lives: bool) -> fs::File {
     let mut name = path.as_os_str().to_owned();
     name.push("_el");
@@ -244,7 +243,7 @@ fn files_of_a_killed_process_are_no_port_and_their_messages_no_traffic() {
     port.push(segment.put(&sample(1)));
     assert_eq!(host.poll_after(SECOND), [0; 0]);
     assert!(!host.tap.has_ports() && !host.tap.take_discovery_seen());
-    // Its port is another's now, who was sent something by one that lives.
+    // Another process has taken over its port and received a message of a living one.
     let mut living = host.segment(2);
     let lives = [port.path(host.path()), living.path(host.path())];
     let lives = lives.each_ref().map(|path| lock_of(path, true));
@@ -288,7 +287,7 @@ fn a_restarted_participants_new_files_are_taken_and_the_old_ones_let_go() {
         port.push(segment.put(&sample(round)));
         assert_eq!(host.poll_after(MILLISECOND), [u64::from(round)]);
         assert_eq!(host.descriptors(), 2);
-        // Each removes what the one before it left: the same names, other files.
+        // Each process removes the files of the previous one: the same names, other files.
         fs::remove_file(port.path(host.path())).unwrap();
         fs::remove_file(segment.path(host.path())).unwrap();
     }
@@ -309,7 +308,7 @@ fn a_segment_that_changes_its_owner_while_its_port_stays_is_opened_anew() {
     let mut segment = host.segment(1);
     host.poll_after(200 * MILLISECOND);
     port.push(segment.put(&sample(2)));
-    // The new segment lays its first buffer where the old one did, with the same validity.
+    // The new segment places its first buffer where the old one did, with the same validity.
     segment.free(segment_descriptor(&segment, 2));
     port.push(segment.put(&sample(3)));
     let found = host.poll_after(MILLISECOND);
@@ -364,7 +363,7 @@ fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobo
     assert_eq!(due.count(), 0);
     ports[77].push(segment.put(&sample(5)));
     assert_eq!(host.poll_after(SILENT_EVERY), [5]);
-    // From now on that one is looked at each time.
+    // From now on that port is polled each time.
     ports[77].push(segment.put(&sample(6)));
     assert_eq!(host.poll_after(MILLISECOND), [6]);
     assert_eq!(host.tap.counters().ports, 128);
@@ -406,7 +405,7 @@ fn files_that_come_and_go_without_end_cost_no_more_than_listing_may() {
     let spent = thread_cpu() - before;
     let most = SAVINGS + (host.now - began) / SHARE;
     assert!(spent < 2 * most, "{spent} {most}");
-    // A new port is opened all the same, when the share allows it.
+    // A new port is opened all the same, if the share allows it.
     let (mut port, mut segment) = (host.port(7411), host.segment(1));
     host.poll_after(100 * SECOND);
     port.push(segment.put(&sample(5)));
@@ -426,7 +425,7 @@ fn garbage_links_and_directories_with_the_right_names_are_left_alone() {
     host.poll_after(SECOND);
     let counters = host.tap.counters();
     assert_eq!((counters.ports, counters.directories), (1, 1));
-    // It announces something that is nowhere, and something in a file that is no segment.
+    // It announces a message without a segment, and one in a file that is not a segment.
     port.push(Descriptor {
         segment: SegmentId([2; 8]),
         node: 16,

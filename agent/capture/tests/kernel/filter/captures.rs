@@ -1,4 +1,4 @@
-//! The kernel programs and user space make the same records of every capture.
+//! The kernel programs and user space write the same records for every capture.
 
 use super::*;
 
@@ -22,9 +22,9 @@ pub(super) fn captures() -> Vec<PathBuf> {
         found.len() >= 3,
         "the captures of the project itself are missing: {found:?}"
     );
-    // Captures with a shortened frame length cannot be given to the kernel as frames.
+    // Truncated captures cannot be passed to the kernel as frames.
     found.retain(|path| !path.to_string_lossy().contains("snap256"));
-    // It has a datagram of 300 submessages, more than a program follows: user space gets its rest.
+    // It has a datagram of 300 submessages, more than a program reads: user space reads the rest.
     found.retain(|path| !path.to_string_lossy().contains("announced-late"));
     found.sort();
     found
@@ -35,7 +35,7 @@ fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
         return;
     };
     for path in entries.map(|entry| entry.unwrap().path()) {
-        // What Zenoh sends is no RTPS.
+        // Zenoh traffic is not RTPS.
         if path.ends_with("zenoh") {
             continue;
         }
@@ -63,7 +63,8 @@ pub(super) fn ip_packets(path: &Path) -> Vec<IpPacket> {
         };
         let bytes = &captured.bytes[header..];
         let pieces = match packet.payload {
-            // A program run takes a page at most: show it as a link with a smaller MTU would.
+            // A program run accepts a page at most: cut the packet as a link with a smaller MTU
+            // would.
             Payload::Datagram(udp) if bytes.len() > 3000 => {
                 let id = u32::try_from(packets.len()).unwrap() % 60_000;
                 program_run::fragments(udp.payload, 2960, false, id)
@@ -76,7 +77,7 @@ pub(super) fn ip_packets(path: &Path) -> Vec<IpPacket> {
     packets
 }
 
-/// What user space makes of a packet: every datagram it completes, in whole.
+/// User space's result for a packet: every datagram that it completes.
 struct UserSpace {
     reassembly: Reassembly,
 }
@@ -126,7 +127,7 @@ fn user_space() -> UserSpace {
     }
 }
 
-/// The filter's verdict on a whole datagram, stated once more and plainly.
+/// The filter's expected verdict on a whole datagram, stated independently.
 fn expected(
     payload: &[u8],
     envelope: &Envelope,
@@ -150,7 +151,7 @@ fn expected(
     (capture, if capture { Vec::new() } else { records })
 }
 
-/// All user endpoints that a capture mentions as sender.
+/// Returns all user endpoints that send in a capture.
 fn endpoints(packets: &[IpPacket]) -> BTreeSet<Guid> {
     let mut found = BTreeSet::new();
     let mut user = user_space();
@@ -218,7 +219,7 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
     (records + stalled.len(), captures)
 }
 
-/// Fragments that follow each other, joined as the filter joins them: by stream, one CPU.
+/// Joins consecutive fragments as the filter does: by stream, on one CPU.
 #[derive(Default)]
 struct Runs(BTreeMap<([u32; 4], [u32; 4], u16), Record>);
 
@@ -266,7 +267,7 @@ fn the_kernel_and_user_space_make_the_same_records_of_every_capture() {
     }
 }
 
-/// A datagram as sockets see it: one IP packet, however many fragments it came in.
+/// A datagram as sockets see it: one IP packet, however many fragments it was cut into.
 struct Datagram {
     packet: Vec<u8>,
     payload: Vec<u8>,
@@ -297,12 +298,14 @@ fn datagrams(packets: &[IpPacket]) -> Vec<Datagram> {
             });
         });
     }
-    // A program run takes a page at most; longer ones pass real sockets in `live/host_hook`.
+    // A program run accepts a page at most; `live/host_hook` sends longer ones through real
+    // sockets.
     found.retain(|datagram| datagram.packet.len() <= 3000);
     found
 }
 
-/// What the host hook says of a datagram besides what [`comparable`] leaves out.
+/// Clears the fields of a host hook record that [`comparable`] leaves, so that any socket compares
+/// equal.
 fn of_any_socket(record: Record) -> Record {
     assert_ne!(record.flags & flag::HOST, 0);
     assert_ne!((record.socket, record.datagram), (0, 0));
@@ -336,7 +339,7 @@ fn compare_host(
             assert_eq!(piece.source_port, envelope.source_port, "{case}");
             captures += 1;
         } else if capture {
-            // The run before was within a millisecond, however long ago the captured one was.
+            // The previous run was within a millisecond, however old the captured packet is.
             copied += 1;
             assert_eq!(kernel.counter(Counter::CopiesNotCaptured), copied, "{case}");
             let metered = interest.iter().map(|(guid, verdict)| match verdict {
@@ -345,7 +348,7 @@ fn compare_host(
             });
             wanted = metered_records(&datagram.payload, &envelope, &metered.collect());
         }
-        // Each run has a socket of its own, so fragments join within one datagram only.
+        // Each run has its own socket, so only fragments of one datagram are joined.
         let (mut runs, mut joined) = (Runs::default(), Vec::new());
         for record in wanted {
             runs.give(record, true, &mut joined);
@@ -363,7 +366,7 @@ fn compare_host(
     (records, captures)
 }
 
-/// The records of everything that is metered, whatever else is in the datagram.
+/// Returns the records of all metered submessages, whatever else is in the datagram.
 fn metered_records(
     payload: &[u8],
     envelope: &Envelope,
@@ -385,7 +388,7 @@ fn metered_records(
 
 #[test]
 fn the_host_hook_makes_the_same_records_of_every_capture_in_both_directions() {
-    // The kernel takes half a second to verify a program: once is enough.
+    // The kernel takes half a second to verify a program: load it once.
     let mut kernels = [Hook::Ingress, Hook::Egress].map(|hook| (hook, Kernel::load_hook(hook)));
     for path in captures() {
         let all = endpoints(&ip_packets(&path));

@@ -2,8 +2,8 @@
 
 use super::*;
 
-/// Cuts a message into fragments, shows them to the kernel in `order`, and gives all records found
-/// and the fragments kept.
+/// Cuts a message into fragments, passes them to the kernel in `order`, and returns all records and
+/// the captured fragments.
 fn fragmented(
     kernel: &mut Kernel,
     payload: &[u8],
@@ -14,7 +14,7 @@ fn fragmented(
     show(kernel, &fragments, order)
 }
 
-/// Shows fragments to the kernel in `order`, and gives all records found and the fragments kept.
+/// Passes fragments to the kernel in `order`, and returns all records and the captured fragments.
 fn show(kernel: &mut Kernel, fragments: &[Vec<u8>], order: &[usize]) -> (Vec<Record>, Vec<usize>) {
     let (mut records, mut kept) = (Vec::new(), Vec::new());
     for index in order {
@@ -32,7 +32,7 @@ fn samples_in_later_fragments_are_found_and_count_only_when_all_fragments_came()
     let writer = Guid::new(GuidPrefix(*b"\x01\x10fragmented"), EntityId([0, 0, 1, 3]));
     let mut kernel = Kernel::load();
     kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
-    // Submessages of 496 bytes from offset 20 on: none begins or ends its header across a cut.
+    // Submessages of 496 bytes from offset 20: no header crosses a cut.
     let payload = program_run::message(writer, 1..=9, 472);
     for ipv6 in [false, true] {
         let (records, kept) = fragmented(&mut kernel, &payload, ipv6, &[0, 1, 2, 3]);
@@ -67,7 +67,7 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
     };
     let all: Vec<u64> = (1..=9).collect();
     for ipv6 in [false, true] {
-        // Half a submessage each.
+        // Half a submessage in each fragment.
         let id = kernel.next_identification();
         let fragments = program_run::fragments(&payload, 248, ipv6, id);
         let order: Vec<_> = (0..fragments.len()).collect();
@@ -85,7 +85,7 @@ fn two_fragments_that_begin_within_512_bytes_of_each_other_both_count() {
         let (records, _) = show(&mut kernel, &fragments, &order[..order.len() - 1]);
         assert!(records.is_empty(), "IPv6 {ipv6}: the last one is missing");
     }
-    // A link that takes 8 bytes less than the one before cuts them off each fragment.
+    // A link with an MTU 8 bytes smaller cuts them off each fragment.
     let id = kernel.next_identification();
     let fragments = program_run::fragments_of(&payload, &[1472, 8], false, id);
     let order: Vec<_> = (0..fragments.len()).collect();
@@ -112,7 +112,7 @@ fn a_header_cut_in_two_and_fragments_out_of_order_are_handed_over() {
             if kept.len() == count {
                 continue; // user space has all of it
             }
-            // What was handed over is read by user space from the kept fragments.
+            // User space reads the handed-over rest from the captured fragments.
             records.extend(kernel.take_rest());
             let numbers: BTreeSet<_> = records
                 .iter()

@@ -1,4 +1,4 @@
-//! Datagrams that a socket has no room for.
+//! Datagrams dropped at a full socket buffer.
 
 use super::*;
 
@@ -24,7 +24,7 @@ fn samples(payload: &[u8]) -> FragmentNumbers {
 fn fragment(talker: &Talker, number: u32, start: u32, size: u16) -> Vec<u8> {
     let mut bytes = talker.header();
     bytes.extend_from_slice(&[0x16, 1]);
-    // The last submessage of a message may leave its length open (RTPS 2.5, 9.4.5.1.3).
+    // The last submessage of a message may omit its length (RTPS 2.5, 9.4.5.1.3).
     bytes.extend_from_slice(&[0, 0, 0, 0, 28, 0, 0, 0, 0, 0]);
     bytes.extend_from_slice(&SAMPLES_WRITER);
     for word in [0, number, start] {
@@ -37,7 +37,7 @@ fn fragment(talker: &Talker, number: u32, start: u32, size: u16) -> Vec<u8> {
     bytes
 }
 
-/// The receive buffer errors of a host: over IPv4 and over IPv6.
+/// Returns the receive buffer errors of a host, over IPv4 and over IPv6.
 fn full_buffers(host: &Namespace) -> (u64, u64) {
     let read = |path: &str| std::fs::read_to_string(format!("/proc/thread-self/net/{path}"));
     let (v4, v6) = netns::within(&forged::path(host), || {
@@ -67,7 +67,7 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
         let before = full_buffers(&link.monitor);
         let mut sent = FragmentNumbers::new();
-        // Half of them find some room again.
+        // Half of them fit again.
         let mut got = FragmentNumbers::new();
         for round in 0..2 {
             for _ in 0..150 {
@@ -93,7 +93,7 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         assert_eq!(refused.len(), missing.len());
         assert_eq!(fragment_numbers(seen.iter().copied()), sent);
         for record in &refused {
-            // Each cancels one arrival: the same record but for the flag.
+            // Each cancels one arrival: the same record except for the flag.
             let arrival = Record {
                 flags: record.flags & !flag::NO_ROOM,
                 ..**record

@@ -2,7 +2,7 @@
 
 use super::*;
 
-/// Makes the kernel of a host give up on fragments after a second.
+/// Sets a host's reassembly timeout to a second.
 fn hurry(host: &Namespace) {
     netns::within(&forged::path(host), || {
         for path in ["ipv4/ipfrag_time", "ipv6/ip6frag_time"] {
@@ -12,7 +12,7 @@ fn hurry(host: &Namespace) {
     .unwrap();
 }
 
-/// Long enough for a kernel in a hurry to give up.
+/// Longer than that timeout.
 const GIVEN_UP: Duration = Duration::from_millis(2500);
 
 #[test]
@@ -77,7 +77,7 @@ fn without_its_first_fragment_a_datagram_is_counted_once_and_cannot_be_named() {
         wire.carry(&talker.sample(30_000)).unwrap();
     }
     assert_eq!(observed.records(writer, GIVEN_UP), []);
-    // Other tests may lose some at the same time, but not one per fragment.
+    // Parallel tests may lose some at the same time, but not one per fragment.
     let unnamed = observed.counted(Counter::NotReassembledUnnamed) - before;
     assert!((5..20).contains(&unnamed), "{unnamed}");
 }
@@ -132,11 +132,11 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
     ] {
         let _receiver = observed.socket(&link.monitor, &to);
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
-        // The receiver's link address has to be found first.
+        // The receiver's link address must be resolved first.
         sender.carry(&talker.sample(100)).unwrap();
         std::thread::sleep(SETTLED);
         observed.records(writer, Duration::ZERO);
-        // Half of the first datagram takes all there is, and keeps it.
+        // Half of the first datagram uses up the limit, and keeps it.
         let limit = |bytes: &str| {
             std::fs::write(format!("/proc/sys/net/{family}_low_thresh"), "1").unwrap();
             std::fs::write(format!("/proc/sys/net/{family}_high_thresh"), bytes).unwrap();
@@ -152,7 +152,7 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
             .iter()
             .filter(|record| record.flags & flag::NOT_REASSEMBLED != 0)
             .collect();
-        // The first one is waited for; the others have found no room.
+        // The first one waits; the others did not fit.
         let expected: FragmentNumbers = (some + 1..some + 5)
             .map(|number| (number.into(), 0))
             .collect();
@@ -192,7 +192,7 @@ fn over_ipv6_and_multicast_it_is_named_likewise() {
     ];
     for (from, to, last_fragment, family) in ways {
         let mut sender = forged::Sender::new(&link.robot, &from, &to).unwrap();
-        // The receiver's link address has to be found first.
+        // The receiver's link address must be resolved first.
         sender.carry(&talker.sample(100)).unwrap();
         std::thread::sleep(SETTLED);
         observed.records(writer, Duration::ZERO);

@@ -19,9 +19,9 @@ use self::delay::{Age, Ages};
 use self::hz::{Intervals, Rate};
 use self::table::table;
 use super::{Dialect, Refused};
-use ros2probe_model::header::begins_with_header;
+use ros2probe_daemon::subscriptions::begins_with_header;
 
-const SECOND: i64 = ros2probe_wire::time::SECOND.cast_signed();
+const SECOND: i64 = 1_000_000_000;
 /// Of a nanosecond, in seconds.
 const NANOSECOND: f64 = 1e-9;
 /// Clears a terminal, as `--all` does before each table.

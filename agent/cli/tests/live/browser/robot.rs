@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 use serde_json::Value;
 use tempfile::TempDir;
 

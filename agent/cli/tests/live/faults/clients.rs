@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, anyhow};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 
 use super::{API_PORT, METRICS_PORT};
 use ros2probe_testing::forged::path;

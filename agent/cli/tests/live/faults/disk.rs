@@ -283,6 +283,6 @@ fn readable(bag: &Path, messages: u64) -> Result<()> {
         bag.display()
     );
     let text = fs::read_to_string(bag.join("metadata.yaml"))?;
-    ros2probe::bag::metadata::Metadata::read(&text)?;
+    ros2probe_bag::metadata::Metadata::read(&text)?;
     Ok(())
 }

@@ -8,7 +8,7 @@ use std::os::unix::net::UnixStream;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 use serde_json::Value;
 
 use super::clients::{Asker, Clients, Doors, answer};

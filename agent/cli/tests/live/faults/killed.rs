@@ -10,7 +10,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, anyhow, ensure};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 use serde_json::Value;
 
 use super::{Counted, PATIENCE, Scene, ask, launch};

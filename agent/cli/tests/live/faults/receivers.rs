@@ -11,7 +11,7 @@ use std::time::Duration;
 use anyhow::{Result, anyhow, ensure};
 
 use super::{API_PORT, Counted, METRICS_PORT, Scene};
-use ros2probe::capture::netns;
+use ros2probe_capture::netns;
 use ros2probe_testing::forged::path;
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::{Link, Namespace};

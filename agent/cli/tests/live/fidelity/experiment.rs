@@ -5,9 +5,9 @@ use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe::model::loss::DeliveryLoss;
-use ros2probe::model::loss::LossCause;
-use ros2probe::model::snapshot::{Delivered, Direction, Snapshot};
+use ros2probe_model::loss::DeliveryLoss;
+use ros2probe_model::loss::LossCause;
+use ros2probe_model::snapshot::{Delivered, Direction, Snapshot};
 use ros2probe_wire::{EntityId, Guid};
 
 use super::cell::Cell;

@@ -4,8 +4,8 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe::model::loss::LossCause;
-use ros2probe::model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
+use ros2probe_model::loss::LossCause;
+use ros2probe_model::snapshot::{AcknowledgementFacts, Delivered, Snapshot};
 
 use super::experiment::{DISCOVERY, Truth, is, reported, sums};
 use ros2probe_testing::harness::loss::{Loss, Part};

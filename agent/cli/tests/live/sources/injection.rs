@@ -8,9 +8,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
-use ros2probe::capture::netns;
-use ros2probe::capture::pcap::PcapReader;
-use ros2probe::capture::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_capture::netns;
+use ros2probe_capture::pcap::PcapReader;
+use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use ros2probe_testing::harness::cgroup::Cgroup;

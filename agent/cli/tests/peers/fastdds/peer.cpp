@@ -1,6 +1,7 @@
-// A ROS 2 publisher or subscriber on Fast DDS, announced as rmw_fastrtps does: UDPv4 only unless
-// it is asked for the default transports, which share memory; the enclave in the participant's user data, ros_discovery_info republished whole
-// whenever an entity comes or goes. Command line and log: ../peer.hpp.
+// A ROS 2 publisher or subscriber on Fast DDS, announced as rmw_fastrtps does. Uses only UDPv4, or
+// with an option the default transports, which include shared memory. The enclave is in the
+// participant's user data, and ros_discovery_info is republished whenever an entity is created or
+// deleted. Command line and log: ../peer.hpp.
 #include <fastdds/dds/domain/DomainParticipant.hpp>
 #include <fastdds/dds/domain/DomainParticipantFactory.hpp>
 #include <fastdds/dds/publisher/DataWriter.hpp>
@@ -55,7 +56,7 @@ class SerializedType : public TopicDataType {
     return [sample] { return static_cast<uint32_t>(static_cast<Payload*>(sample)->size()); };
   }
 
-  // Histories are shared of bounded types only.
+  // Fast DDS shares histories of bounded types only.
   bool is_bounded() const override { return true; }
 
   void* createData() override { return new Payload; }

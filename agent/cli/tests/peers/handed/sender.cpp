@@ -1,8 +1,8 @@
-// Hands messages over as Fast DDS does to its shared memory: in a function that is called the same
-// and gets the same, in one piece as 2.x does or, with -DLIST, in a list of buffers as 3.x does.
+// Passes messages as Fast DDS does to its shared memory: to a function of the same name and
+// parameters, in one piece as 2.x does or, with -DLIST, in a list of buffers as 3.x does.
 //
-// A line is the lengths of the buffers, a colon, and the message in hexadecimal digits; or `nowhere`,
-// for a message where no memory is. Prints `handed` after each.
+// An input line has the lengths of the buffers, a colon, and the message in hexadecimal digits; or
+// `nowhere`, for a message at an unmapped address. Prints `handed` after each.
 #include <chrono>
 #include <cstdint>
 #include <iostream>
@@ -63,7 +63,7 @@ int main() {
     const uint32_t size = bytes.empty() ? 100 : bytes.size();
 #ifdef LIST
     std::vector<NetworkBuffer> buffers;
-    // Each in memory of its own.
+    // Each in separate memory.
     std::vector<std::vector<unsigned char>> parts;
     size_t at = 0;
     for (uint32_t length : lengths) {

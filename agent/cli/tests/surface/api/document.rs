@@ -4,7 +4,7 @@ use super::*;
 
 #[test]
 fn the_checked_in_document_is_the_generated_one() {
-    let generated = ros2probe::surface::api::document()
+    let generated = ros2probe_daemon::surface::api::document()
         .to_pretty_json()
         .unwrap()
         + "\n";
@@ -21,7 +21,7 @@ fn the_checked_in_document_is_the_generated_one() {
 
 #[test]
 fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
-    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let document = serde_json::to_value(ros2probe_daemon::surface::api::document()).unwrap();
     let topic = &document["paths"]["/watch/{topic}"]["post"]["parameters"][0]["schema"];
     assert!(topic["pattern"].is_string(), "{topic}");
     let validator = jsonschema::validator_for(topic).unwrap();
@@ -56,7 +56,7 @@ fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
         &format!("{long}c"),
     ] {
         let documented = validator.is_valid(&Value::from(name));
-        let accepted = ros2probe::config::watch::check_pattern(&format!("/{name}")).is_ok();
+        let accepted = ros2probe_daemon::config::watch::check_pattern(&format!("/{name}")).is_ok();
         assert_eq!(documented, accepted, "{name}");
     }
     assert_expectations_are_documented(&document);
@@ -64,7 +64,7 @@ fn the_document_says_of_topics_and_limits_what_the_agent_accepts() {
 
 /// Limits of an expectation are those of the configuration, and the agent refuses what is beyond.
 fn assert_expectations_are_documented(document: &Value) {
-    let schema = ros2probe::config::Config::schema();
+    let schema = ros2probe_daemon::config::Config::schema();
     let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
     let body = &document["components"]["schemas"]["WatchRequest"]["properties"];
     let (mut low, mut high) = (Expectations::default(), Expectations::default());
@@ -167,7 +167,7 @@ fn every_bound_of_the_document_is_the_agents_and_the_next_value_is_refused() {
         &["--config", config.to_str().unwrap(), "--speed", "max"],
     );
     agent.wait_for_log("ready");
-    let document = serde_json::to_value(ros2probe::surface::api::document()).unwrap();
+    let document = serde_json::to_value(ros2probe_daemon::surface::api::document()).unwrap();
     let mut checked = 0;
     let mut check = |what: &str, allowed: u16, beyond: u16| {
         assert!(

@@ -5,8 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use ros2probe::bag::read;
-use ros2probe::recording::Report;
+use ros2probe_api::recording_report::Report;
+use ros2probe_bag::read;
 use serde_json::Value;
 
 use super::metadata;
@@ -134,7 +134,7 @@ fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
     let mut counts = BTreeMap::new();
     let mut sequences: BTreeMap<String, Vec<u32>> = BTreeMap::new();
     for file in metadata(bag).relative_file_paths {
-        let each = &mut |message: &ros2probe::bag::mcap::Message<'_>, known: &read::Contents| {
+        let each = &mut |message: &ros2probe_bag::mcap::Message<'_>, known: &read::Contents| {
             let topic = known.channels[&message.channel_id].topic.clone();
             if topic == "/robot1/points" {
                 assert_cloud(name, message.sequence, message.data);

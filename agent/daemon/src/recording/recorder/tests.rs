@@ -1,6 +1,7 @@
 use ros2probe_wire::{DomainId, EntityId, GuidPrefix};
 
 use super::*;
+use crate::recording::shortfalls;
 use crate::subscriptions::{Missed, MissedReason};
 use ros2probe_bag::Options;
 
@@ -165,9 +166,7 @@ fn a_recording_ends_at_its_size_with_the_limit_in_its_report() {
         ended.report
     );
     assert!(
-        ended
-            .report
-            .shortfalls()
+        shortfalls(&ended.report)
             .concat()
             .contains("ended by a limit")
     );
@@ -206,7 +205,7 @@ fn a_topic_of_two_types_keeps_the_first_and_says_so() {
     let ended = recorder.finish(None);
     assert_eq!(numbers(&ended).len(), 1);
     assert_eq!(ended.report.left_out, ["/a"]);
-    assert!(ended.report.shortfalls()[0].ends_with("other types than the first are not recorded"));
+    assert!(shortfalls(&ended.report)[0].ends_with("other types than the first are not recorded"));
 }
 
 #[test]

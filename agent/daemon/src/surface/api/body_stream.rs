@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 
 use futures_util::stream::{self, Stream};
+use serde::Serialize;
 
 /// Produces the pieces of one client's response.
 pub(super) trait Pieces: Send + 'static {
@@ -21,4 +22,11 @@ pub(super) fn stream_of<S: Pieces>(
         let piece = source.next().await?;
         Some((Ok(piece), source))
     })
+}
+
+/// Appends a line of JSON to `lines`.
+pub(super) fn write_line(lines: &mut Vec<u8>, line: &impl Serialize) {
+    // Plain numbers and strings into memory: nothing that could fail.
+    let _ = serde_json::to_writer(&mut *lines, line);
+    lines.push(b'\n');
 }

@@ -15,39 +15,19 @@ use axum::http::header::{
 };
 use axum::response::{IntoResponse, Response};
 use futures_util::stream;
-use serde::Serialize;
 use tokio::task::spawn_blocking;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem, ProblemBody};
 use super::recordings::find;
+use ros2probe_api::recordings::{RecordingFile, RecordingFiles};
 
 /// Files of one bag that are listed.
 const MAX_FILES: usize = 10_000;
 /// Bytes that are read at once.
 const PIECE: usize = 64 << 10;
-
-/// Files of a recording.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = RecordingFiles)]
-struct FilesView {
-    /// By name.
-    files: Vec<FileView>,
-}
-
-/// A file.
-#[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, ToSchema)]
-#[schema(as = RecordingFile)]
-struct FileView {
-    /// Its name.
-    #[schema(example = "metadata.yaml")]
-    file: String,
-    /// Its bytes so far.
-    bytes: u64,
-}
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -62,7 +42,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 200, description = "Its files.", body = FilesView),
+        (status = 200, description = "Its files.", body = RecordingFiles),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -70,11 +50,11 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn list(
     State(context): State<Context>,
     Path(name): Path<String>,
-) -> Result<Json<FilesView>, Problem> {
+) -> Result<Json<RecordingFiles>, Problem> {
     let recording = find(&context, &name)?;
     let listed = spawn_blocking(move || files(&recording.directory)).await;
     let files = listed.map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))?;
-    Ok(Json(FilesView { files }))
+    Ok(Json(RecordingFiles { files }))
 }
 
 /// A file of a recording
@@ -113,7 +93,7 @@ async fn download(
         let detail = format!("no such file; GET /recordings/{name}/files lists them");
         Problem::new(Code::NoSuchRecording, detail)
     };
-    let (FileView { file, bytes }, open) = opened.ok_or_else(missing)?;
+    let (RecordingFile { file, bytes }, open) = opened.ok_or_else(missing)?;
     let pieces = stream::unfold(Some((open, bytes)), |open| async {
         let (open, left) = open.filter(|(_, left)| *left > 0)?;
         let read = spawn_blocking(move || piece(open, left)).await;
@@ -150,7 +130,7 @@ fn piece(mut file: File, left: u64) -> io::Result<(Bytes, (File, u64))> {
 }
 
 /// Plain files of a directory, whose names can stand in a header.
-fn files(directory: &FilePath) -> Vec<FileView> {
+fn files(directory: &FilePath) -> Vec<RecordingFile> {
     let entries = fs::read_dir(directory).into_iter().flatten();
     let files = entries.filter_map(|entry| {
         let entry = entry.ok()?;
@@ -158,7 +138,7 @@ fn files(directory: &FilePath) -> Vec<FileView> {
         let metadata = entry.metadata().ok().filter(fs::Metadata::is_file)?;
         let file = entry.file_name().into_string().ok()?;
         let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);
-        file.bytes().all(is_plain).then_some(FileView {
+        file.bytes().all(is_plain).then_some(RecordingFile {
             file,
             bytes: metadata.len(),
         })

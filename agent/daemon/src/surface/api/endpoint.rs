@@ -1,9 +1,6 @@
 //! Writers and readers as answers show them, with what they offer or ask for.
 
 use std::borrow::Cow;
-use std::fmt::Display;
-
-use serde::Serializer;
 
 use super::index::Index;
 use super::measured::measurement;
@@ -72,11 +69,6 @@ pub(super) fn texts<T: AsRef<str>>(texts: &[T]) -> Vec<Cow<'_, str>> {
         .iter()
         .map(|text| Cow::Borrowed(text.as_ref()))
         .collect()
-}
-
-/// As it is printed.
-pub(super) fn text<T: Display, S: Serializer>(value: &T, out: S) -> Result<S::Ok, S::Error> {
-    out.collect_str(value)
 }
 
 /// Each as it is printed.

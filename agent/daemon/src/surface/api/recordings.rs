@@ -11,8 +11,6 @@ use axum::extract::{DefaultBodyLimit, Path, State};
 use axum::http::StatusCode;
 use axum::http::header::LOCATION;
 use axum::response::{IntoResponse, Response};
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -20,10 +18,8 @@ use super::Context;
 use super::body::Body;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::RecordingLimits;
-use crate::recording::{
-    Command, FilterOptions, Recording, RecordingOptions, RecordingState, Refusal, Report,
-};
+use crate::recording::{Command, Recording, RecordingOptions, Refusal};
+use ros2probe_api::recordings::{self as answers, FilterOptions, RecordingList, RecordingRequest};
 use ros2probe_bag::{Form, Options, Storage};
 use ros2probe_wire::DomainId;
 
@@ -31,88 +27,6 @@ use ros2probe_wire::DomainId;
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest time of one file, a year.
 const MAX_DURATION: u64 = 31_536_000;
-
-/// All recordings.
-#[derive(Debug, Serialize, ToSchema)]
-struct RecordingList {
-    /// Where they lie; null where the agent has no place for them.
-    directory: Option<String>,
-    /// Those under way, and the last ones that ended.
-    recordings: Vec<RecordingView>,
-    /// What they may take of the disk.
-    limits: RecordingLimitsView,
-}
-
-/// What recordings may take of the disk; one ends in order where it meets a limit.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = RecordingLimits)]
-struct RecordingLimitsView {
-    /// Bytes of each; null = any.
-    max_bytes: Option<u64>,
-    /// Bytes of all bags in the directory; null = any.
-    max_total_bytes: Option<u64>,
-    /// Of the file system stays free: the larger one of these percent and those bytes.
-    reserve_percent: u8,
-    /// Likewise.
-    reserve_bytes: u64,
-}
-
-/// One recording.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Recording)]
-struct RecordingView {
-    /// Its name, that of its directory.
-    name: String,
-    /// Where it lies on the robot.
-    directory: String,
-    /// Whose topics.
-    domain_id: u32,
-    /// `recording`, `paused` or `ended`.
-    #[schema(value_type = String)]
-    state: &'static str,
-    /// Unix time of its beginning.
-    began_timestamp_seconds: f64,
-    /// Bytes of its files.
-    file_bytes: u64,
-    /// Files begun.
-    files: usize,
-    /// Why it ended, if that was not asked for.
-    error: Option<String>,
-    /// What was asked for.
-    topics: FilterOptions,
-    /// What it has and has not.
-    report: Report,
-}
-
-/// What is to be recorded. Without any topic, every topic is.
-#[derive(Debug, Default, Deserialize, ToSchema)]
-#[serde(deny_unknown_fields, default)]
-struct RecordingRequest {
-    /// Name of the directory; the time when left out.
-    #[schema(max_length = 128, pattern = "^[A-Za-z0-9_-][A-Za-z0-9_.-]*$")]
-    name: Option<String>,
-    /// Which topics.
-    topics: FilterOptions,
-    /// Of which domain.
-    #[schema(minimum = 0, maximum = 232)]
-    domain_id: u32,
-    /// Split when a file reaches so many bytes; 0 = never.
-    max_bag_size: u64,
-    /// Split when a file reaches so many seconds; 0 = never.
-    #[schema(maximum = 31_536_000)]
-    max_bag_duration_seconds: u64,
-    /// `none`, `fastwrite`, `zstd_fast` or `zstd_small`.
-    #[schema(value_type = String, example = "zstd_fast")]
-    storage_preset_profile: String,
-    /// `zstd` or `lz4`: compress whole files once they are complete.
-    #[schema(value_type = String)]
-    file_compression: String,
-    /// For whom metadata.yaml is written: a distribution; for all of them when left out.
-    #[schema(value_type = String)]
-    distro: String,
-    /// Begin paused.
-    paused: bool,
-}
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -138,7 +52,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     Json(RecordingList {
         directory: directory.map(|directory| directory.display().to_string()),
         recordings: recordings.iter().map(|each| view(each)).collect(),
-        limits: context.recordings.limits().into(),
+        limits: limits(&context),
     })
 }
 
@@ -151,7 +65,7 @@ async fn list(State(context): State<Context>) -> Json<RecordingList> {
     tag = "recordings",
     request_body = RecordingRequest,
     responses(
-        (status = 201, description = "It is under way.", body = RecordingView,
+        (status = 201, description = "It is under way.", body = answers::Recording,
             headers(("location" = String, description = "Path of the recording."))),
         (status = 409, description = "There is one of that name, or there are too many.",
             body = ProblemBody, content_type = "application/problem+json"),
@@ -188,7 +102,7 @@ async fn begin(
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 200, description = "How it goes.", body = RecordingView),
+        (status = 200, description = "How it goes.", body = answers::Recording),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -196,7 +110,7 @@ async fn begin(
 async fn show(
     State(context): State<Context>,
     Path(name): Path<String>,
-) -> Result<Json<RecordingView>, Problem> {
+) -> Result<Json<answers::Recording>, Problem> {
     let recording = find(&context, &name)?;
     Ok(Json(view(&recording)))
 }
@@ -210,8 +124,8 @@ async fn show(
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 200, description = "It has ended; its report.", body = RecordingView),
-        (status = 202, description = "It is ending; the storage is slow.", body = RecordingView),
+        (status = 200, description = "It has ended; its report.", body = answers::Recording),
+        (status = 202, description = "It is ending; the storage is slow.", body = answers::Recording),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -238,7 +152,7 @@ async fn end(
     params(("name" = String, Path, description = "Its name.")),
     responses(
         (status = 202, description = "It will be paused within a tenth of a second.",
-            body = RecordingView),
+            body = answers::Recording),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -258,7 +172,7 @@ async fn pause(
     params(("name" = String, Path, description = "Its name.")),
     responses(
         (status = 202, description = "It will go on within a tenth of a second.",
-            body = RecordingView),
+            body = answers::Recording),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -277,7 +191,7 @@ async fn resume(
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 202, description = "It will within a tenth of a second.", body = RecordingView),
+        (status = 202, description = "It will within a tenth of a second.", body = answers::Recording),
         (status = 404, description = "No such name.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -360,35 +274,24 @@ fn problem(refusal: &Refusal) -> Problem {
     Problem::new(code, refusal.to_string())
 }
 
-impl From<RecordingLimits> for RecordingLimitsView {
-    fn from(limits: RecordingLimits) -> Self {
-        let RecordingLimits {
-            max_bytes,
-            max_total_bytes,
-            reserve_percent,
-            reserve_bytes,
-        } = limits;
-        Self {
-            max_bytes,
-            max_total_bytes,
-            reserve_percent,
-            reserve_bytes,
-        }
+fn limits(context: &Context) -> answers::RecordingLimits {
+    let limits = context.recordings.limits();
+    answers::RecordingLimits {
+        max_bytes: limits.max_bytes,
+        max_total_bytes: limits.max_total_bytes,
+        reserve_percent: limits.reserve_percent,
+        reserve_bytes: limits.reserve_bytes,
     }
 }
 
-fn view(recording: &Recording) -> RecordingView {
+fn view(recording: &Recording) -> answers::Recording {
     let status = recording.status();
     let began = recording.began.duration_since(UNIX_EPOCH);
-    RecordingView {
+    answers::Recording {
         name: recording.name.clone(),
         directory: recording.directory.display().to_string(),
         domain_id: recording.domain_id,
-        state: match status.state {
-            RecordingState::Recording => "recording",
-            RecordingState::Paused => "paused",
-            RecordingState::Ended => "ended",
-        },
+        state: status.state.into(),
         began_timestamp_seconds: began.unwrap_or_default().as_secs_f64(),
         file_bytes: status.file_bytes,
         files: status.files,

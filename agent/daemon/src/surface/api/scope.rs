@@ -6,6 +6,8 @@ use utoipa::IntoParams;
 
 use super::problem::{Code, Problem};
 
+const _: () = assert!(ros2probe_api::MAX_DOMAIN_ID == DomainId::MAX.0);
+
 /// What a listing covers.
 #[derive(Clone, Copy, Debug, Default, Deserialize, IntoParams)]
 #[serde(deny_unknown_fields, default)]

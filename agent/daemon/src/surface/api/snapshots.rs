@@ -4,61 +4,13 @@ use axum::Json;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use axum::response::{IntoResponse, Response};
-use serde::Serialize;
-use utoipa::ToSchema;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem, ProblemBody};
 use crate::recording::SnapshotFigures;
-
-/// All snapshots.
-#[derive(Debug, Serialize, ToSchema)]
-struct SnapshotList {
-    /// In the configuration's order.
-    snapshots: Vec<SnapshotView>,
-}
-
-/// What is kept of some topics.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = Snapshot)]
-struct SnapshotView {
-    /// Its name in the configuration.
-    name: String,
-    /// Names and globs.
-    topics: Vec<String>,
-    /// Their domain.
-    domain_id: u32,
-    /// How much is kept at most.
-    seconds: u64,
-    /// How much memory that may take.
-    max_bytes: usize,
-    /// Whether it is written when an expectation is violated.
-    on_violation: bool,
-    /// Messages in memory.
-    messages: u64,
-    /// Memory they take.
-    bytes: u64,
-    /// Messages that were young enough and had to go for want of room.
-    crowded_out: u64,
-    /// Bags written so far.
-    written: u64,
-    /// Bags that could not be.
-    failed: u64,
-}
-
-/// A bag of a snapshot.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = WrittenSnapshot)]
-struct WrittenView {
-    /// Name of its directory.
-    name: String,
-    /// Where it lies on the robot.
-    directory: String,
-    /// Messages in it.
-    messages: u64,
-}
+use ros2probe_api::snapshots::{Snapshot, SnapshotList, WrittenSnapshot};
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
     OpenApiRouter::new()
@@ -84,7 +36,7 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
             written,
             failed,
         } = known.map_or_else(SnapshotFigures::default, |(_, figures)| *figures);
-        SnapshotView {
+        Snapshot {
             name: settings.name.clone(),
             topics: settings.topics.clone(),
             domain_id: settings.domain_id,
@@ -112,7 +64,7 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
     tag = "recordings",
     params(("name" = String, Path, description = "Its name.")),
     responses(
-        (status = 201, description = "The bag.", body = WrittenView),
+        (status = 201, description = "The bag.", body = WrittenSnapshot),
         (status = 404, description = "The configuration has no snapshot of that name.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 507, description = "It could not be written, and is still in memory.",
@@ -129,7 +81,7 @@ async fn write(
         return Err(Problem::new(Code::NoSuchSnapshot, detail));
     };
     let written = written.map_err(|reason| Problem::new(Code::StorageRefuses, reason))?;
-    let view = WrittenView {
+    let view = WrittenSnapshot {
         name: written.name,
         directory: written.directory.display().to_string(),
         messages: written.messages,

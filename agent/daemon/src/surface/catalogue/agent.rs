@@ -16,7 +16,8 @@ pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
 pub(in crate::surface) const SANDBOX_INFO: Metric = Metric::info(
     "ros2probe_sandbox_info",
     &["system_calls", "reason"],
-    "Whether the kernel refuses system calls that the agent does not make (`filtered`, or `all` may be made), and why not.",
+    "System calls that the kernel permits to the agent: `filtered` (only those that it makes), \
+     or `all` with the reason.",
 );
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
@@ -28,7 +29,7 @@ pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
 pub(in crate::surface) const READY: Metric = Metric::gauge(
     "ros2probe_ready",
     &[],
-    "1 while packets are captured and the model is fresh, as /readyz answers.",
+    "1 while packets are captured and the model is fresh: the condition of /readyz.",
 );
 pub(in crate::surface) const CAPTURE_PACKETS: Metric = Metric::counter(
     "ros2probe_capture_packets_total",
@@ -79,18 +80,19 @@ pub(in crate::surface) const CONTENDED: Metric = Metric::counter(
 pub(in crate::surface) const INCOMPLETE_DATAGRAMS: Metric = Metric::counter(
     "ros2probe_incomplete_datagrams_total",
     &[],
-    "Fragmented datagrams that were begun and never became complete.",
+    "Fragmented datagrams that never became complete.",
 );
 pub(in crate::surface) const REASSEMBLY: Metric = Metric::gauge(
     "ros2probe_reassembly_bytes",
     &[],
-    "Memory held to put captured datagrams together: IP fragments up to limits.reassembly_bytes, and pieces from the sockets up to 4 MiB.",
+    "Memory for reassembling captured datagrams: IP fragments up to limits.reassembly_bytes, and \
+     pieces from the sockets up to 4 MiB.",
 )
 .unit("bytes");
 pub(in crate::surface) const SHM_OPEN: Metric = Metric::gauge(
     "ros2probe_shm_open",
     &["kind"],
-    "Ports and segments of Fast DDS's shared memory that are open, and directories they are in.",
+    "Open ports and segments of Fast DDS's shared memory, and their directories.",
 );
 pub(in crate::surface) const SHM_EVENTS: Metric = Metric::counter(
     "ros2probe_shm_events_total",
@@ -103,24 +105,23 @@ pub(in crate::surface) const SHM_LOOKS: Metric =
 pub(in crate::surface) const SHM_CPU: Metric = Metric::counter(
     "ros2probe_shm_cpu_seconds_total",
     &[],
-    "CPU time that they took: capture.shm.cpu_percent of a CPU, and more for moments in which participants meet.",
+    "CPU time of these polls: up to capture.shm.cpu_percent of a CPU, and briefly more while \
+     participants discover each other.",
 )
 .unit("seconds");
 pub(in crate::surface) const SHM_EXACT_INFO: Metric = Metric::info(
     "ros2probe_shm_exact_info",
     &["library", "state", "reason"],
-    "With capture.shm.exact: the Fast DDS libraries in use, attached or refused with the reason; without a library: why some messages, or all, are only sampled.",
+    "With capture.shm.exact: Fast DDS libraries in use, attached or refused with the reason; \
+     without a library: why messages are only sampled.",
 );
 pub(in crate::surface) const DATAGRAMS: Metric = Metric::counter(
     "ros2probe_datagrams_total",
     &[],
     "Datagrams parsed in user space.",
 );
-pub(in crate::surface) const RECORDS: Metric = Metric::counter(
-    "ros2probe_records_total",
-    &[],
-    "Measurement records taken in.",
-);
+pub(in crate::surface) const RECORDS: Metric =
+    Metric::counter("ros2probe_records_total", &[], "Measurement records read.");
 pub(in crate::surface) const DECODE_ERRORS: Metric = Metric::counter(
     "ros2probe_decode_errors_total",
     &["stage", "reason"],
@@ -131,8 +132,11 @@ pub(in crate::surface) const TABLE_ENTRIES: Metric = Metric::gauge(
     &["table"],
     "Entries of a bounded table; bytes for samples.",
 );
-pub(in crate::surface) const TABLE_LIMIT: Metric =
-    Metric::gauge("ros2probe_table_limit", &["table"], "Its cap.");
+pub(in crate::surface) const TABLE_LIMIT: Metric = Metric::gauge(
+    "ros2probe_table_limit",
+    &["table"],
+    "Cap of a bounded table.",
+);
 pub(in crate::surface) const TABLE_EVICTIONS: Metric = Metric::counter(
     "ros2probe_table_evictions_total",
     &["table"],
@@ -146,7 +150,7 @@ pub(in crate::surface) const LIMIT: Metric = Metric::gauge(
 pub(in crate::surface) const LIMIT_USED: Metric = Metric::gauge(
     "ros2probe_limit_used",
     &["limit"],
-    "How much of each cap is in use; of api_clients, at the listener that has most.",
+    "Use of each cap; for api_clients, at the busiest listener.",
 );
 pub(in crate::surface) const LIMIT_REACHED: Metric = Metric::counter(
     "ros2probe_limit_reached_total",
@@ -157,18 +161,17 @@ pub(in crate::surface) const LIMIT_REACHED: Metric = Metric::counter(
 pub(in crate::surface) const AT_LIMIT: Metric = Metric::gauge(
     "ros2probe_at_limit",
     &["limit"],
-    "1 while there is no room below a cap, and for a minute after something was refused or evicted \
-     because of it.",
+    "1 while a cap is reached, and for a minute after it caused a refusal or eviction.",
 );
 pub(in crate::surface) const TRACKED_TOPICS: Metric = Metric::gauge(
     "ros2probe_tracked_topics",
     &[],
-    "Topics that are or were measured and shown.",
+    "Topics with series, measured now or earlier.",
 );
 pub(in crate::surface) const TOPICS_REJECTED: Metric = Metric::counter(
     "ros2probe_topics_rejected_total",
     &[],
-    "Topics that the watchlist matched but the cap kept from being measured.",
+    "Topics that match a watch but are not measured because of the cap.",
 );
 pub(in crate::surface) const TOPICS_HIDDEN: Metric = Metric::gauge(
     "ros2probe_topics_not_shown",
@@ -178,18 +181,19 @@ pub(in crate::surface) const TOPICS_HIDDEN: Metric = Metric::gauge(
 pub(in crate::surface) const DELIVERIES_HIDDEN: Metric = Metric::gauge(
     "ros2probe_deliveries_not_shown",
     &[],
-    "Deliveries and acknowledging readers of per_subscriber topics beyond the first 1000 of each: they are in the topic's sums alone.",
+    "Deliveries and acknowledging readers of per_subscriber topics beyond the first 1000 of \
+     each: they are only in the topic's sums.",
 );
 pub(in crate::surface) const SNAPSHOT_AGE: Metric = Metric::gauge(
     "ros2probe_snapshot_age_seconds",
     &[],
-    "How old the state shown here is.",
+    "Age of the state on this page.",
 )
 .unit("seconds");
 pub(in crate::surface) const SCRAPE_DURATION: Metric = Metric::gauge(
     "ros2probe_scrape_duration_seconds",
     &[],
-    "How long writing the previous scrape took.",
+    "Time taken to write the previous scrape.",
 )
 .unit("seconds");
 pub(in crate::surface) const RELOAD_SUCCESSFUL: Metric = Metric::gauge(
@@ -200,7 +204,7 @@ pub(in crate::surface) const RELOAD_SUCCESSFUL: Metric = Metric::gauge(
 pub(in crate::surface) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
     "ros2probe_config_last_reload_success_timestamp_seconds",
     &[],
-    "Unix time when a configuration was last taken over.",
+    "Unix time of the last successful load of the configuration.",
 )
 .unit("seconds");
 
@@ -230,7 +234,7 @@ pub(in crate::surface) const OTLP_DROPPED: Metric = Metric::counter(
 pub(in crate::surface) const SUBSCRIPTIONS: Metric = Metric::gauge(
     "ros2probe_subscriptions",
     &[],
-    "Clients that get messages one by one, and recordings, up to limits.subscriptions.",
+    "Clients that receive single messages, and recordings; at most limits.subscriptions.",
 );
 pub(in crate::surface) const SUBSCRIPTIONS_REFUSED: Metric = Metric::counter(
     "ros2probe_subscriptions_refused_total",
@@ -240,15 +244,15 @@ pub(in crate::surface) const SUBSCRIPTIONS_REFUSED: Metric = Metric::counter(
 pub(in crate::surface) const SAMPLES_GIVEN: Metric = Metric::counter(
     "ros2probe_given_messages_total",
     &[],
-    "Messages put into the queues of subscriptions, each for each.",
+    "Messages put into the queues of subscriptions, counted per subscription.",
 );
 pub(in crate::surface) const SAMPLES_MISSED: Metric = Metric::counter(
     "ros2probe_missed_messages_total",
     &["reason"],
-    "Messages that a subscription missed and that were reported to it: incomplete (fragments \
-     were never seen), lost (nothing of it was seen), unannounced (sent before its writer was \
-     announced and never repeated), not_captured (its bytes could not be captured), queue_full \
-     (the reader was too slow).",
+    "Messages that a subscription missed, as reported to it: incomplete (fragments were never \
+     seen), lost (no part was seen), unannounced (sent before the writer's announcement and \
+     never repeated), not_captured (the bytes could not be captured), queue_full (the reader was \
+     too slow).",
 );
 pub(in crate::surface) const SAMPLES_QUEUED: Metric = Metric::gauge(
     "ros2probe_queued_bytes",
@@ -294,7 +298,7 @@ pub(in crate::surface) const SNAPSHOT_MESSAGES: Metric = Metric::gauge(
 pub(in crate::surface) const SNAPSHOT_BYTES: Metric = Metric::gauge(
     "ros2probe_snapshot_bytes",
     &["snapshot"],
-    "Memory that a snapshot takes, up to its max_bytes.",
+    "Memory of a snapshot, at most its max_bytes.",
 )
 .unit("bytes");
 pub(in crate::surface) const SNAPSHOT_CROWDED_OUT: Metric = Metric::counter(
@@ -306,7 +310,7 @@ pub(in crate::surface) const SNAPSHOT_CROWDED_OUT: Metric = Metric::counter(
 pub(in crate::surface) const SNAPSHOTS_WRITTEN: Metric = Metric::counter(
     "ros2probe_snapshots_written_total",
     &["snapshot"],
-    "Bags written of a snapshot.",
+    "Bags written from a snapshot.",
 );
 pub(in crate::surface) const SNAPSHOTS_FAILED: Metric = Metric::counter(
     "ros2probe_snapshots_failed_total",
@@ -327,7 +331,7 @@ pub(in crate::surface) const EVENTS_DROPPED: Metric = Metric::counter(
 pub(in crate::surface) const LOG_LINES_LOST: Metric = Metric::counter(
     "ros2probe_log_lines_lost_total",
     &[],
-    "Lines of the log that standard error did not take, being full, closed or not read.",
+    "Log lines lost because standard error was full, closed or not read.",
 );
 
 // The process, under the names every exporter uses.
@@ -342,7 +346,7 @@ pub(in crate::surface) const PROCESS_RESIDENT: Metric =
 pub(in crate::surface) const PROCESS_UNRECLAIMABLE: Metric = Metric::gauge(
     "process_unreclaimable_memory_bytes",
     &[],
-    "Memory that the kernel cannot have back: anonymous and changed pages, swap, rings.",
+    "Memory that the kernel cannot reclaim: anonymous and changed pages, swap, rings.",
 )
 .unit("bytes");
 pub(in crate::surface) const PROCESS_VIRTUAL: Metric =
@@ -350,7 +354,7 @@ pub(in crate::surface) const PROCESS_VIRTUAL: Metric =
 pub(in crate::surface) const PROCESS_OPEN_FDS: Metric =
     Metric::gauge("process_open_fds", &[], "Open file descriptors.");
 pub(in crate::surface) const PROCESS_MAX_FDS: Metric =
-    Metric::gauge("process_max_fds", &[], "File descriptors that may be open.");
+    Metric::gauge("process_max_fds", &[], "Limit of open file descriptors.");
 pub(in crate::surface) const PROCESS_START_TIME: Metric = Metric::gauge(
     "process_start_time_seconds",
     &[],

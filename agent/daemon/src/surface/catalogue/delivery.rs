@@ -20,7 +20,7 @@ const READER: &[&str] = &["domain_id", "topic", "writer", "reader", "ros_node"];
 pub(in crate::surface) const TOPIC_SENT: Metric = Metric::counter(
     "ros2_topic_sent_messages_total",
     TOPIC,
-    "Messages seen leaving this host, once for each destination.",
+    "Messages seen leaving this host, once per destination.",
 );
 pub(in crate::surface) const TOPIC_SENT_BYTES: Metric = Metric::counter(
     "ros2_topic_sent_bytes_total",
@@ -31,7 +31,7 @@ pub(in crate::surface) const TOPIC_SENT_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERED: Metric = Metric::counter(
     "ros2_topic_delivered_messages_total",
     TOPIC,
-    "Messages that reached a receiver on this host whole, once for each receiver.",
+    "Messages that reached a receiver on this host whole, once per receiver.",
 );
 pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
     "ros2_topic_delivered_bytes_total",
@@ -42,7 +42,7 @@ pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERY_LOST: Metric = Metric::counter(
     "ros2_topic_delivery_lost_messages_total",
     &["domain_id", "topic", "cause"],
-    "Messages that a receiver on this host never got, by where they were lost: before_host, \
+    "Messages that a receiver on this host never received, by place of loss: before_host, \
      reassembly or socket_buffer.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_PENDING: Metric = Metric::gauge(
@@ -74,20 +74,21 @@ pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
 pub(in crate::surface) const TOPIC_LAG_SECONDS: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_seconds",
     TOPIC,
-    "Age of the oldest message that a reliable reader has not acknowledged; infinite when older than is remembered.",
+    "Age of the oldest message that a reliable reader has not acknowledged; infinite beyond the \
+     agent's history.",
 )
 .unit("seconds");
 pub(in crate::surface) const TOPIC_SEND_DELAY: Metric = Metric::histogram(
     "ros2_topic_send_delay_seconds",
     TOPIC,
-    "From the writer's timestamp to the message's first datagram leaving this host.",
+    "Time from the writer's timestamp to the message's first datagram leaving this host.",
 )
 .unit("seconds");
 pub(in crate::surface) const TOPIC_TRANSIT: Metric = Metric::histogram(
     "ros2_topic_transit_seconds",
     TOPIC,
     "Time from sending to arrival, last datagram to last datagram, if both are on this host; one \
-     value for each receiver.",
+     value per receiver.",
 )
 .unit("seconds");
 pub(in crate::surface) const TOPIC_TRANSFER: Metric = Metric::histogram(
@@ -99,7 +100,8 @@ pub(in crate::surface) const TOPIC_TRANSFER: Metric = Metric::histogram(
 pub(in crate::surface) const TOPIC_RETRANSMISSION: Metric = Metric::histogram(
     "ros2_topic_retransmission_delay_seconds",
     TOPIC,
-    "From noticing that a message is missing to its arrival by retransmission; one value for each receiver.",
+    "Time from the detection of a missing message to its arrival by retransmission; one value \
+     per receiver.",
 )
 .unit("seconds");
 
@@ -150,7 +152,7 @@ pub(in crate::surface) const SUBSCRIBER_RECEIVED_BYTES: Metric = Metric::counter
 pub(in crate::surface) const SUBSCRIBER_LOST: Metric = Metric::counter(
     "ros2_subscriber_lost_messages_total",
     SUBSCRIBER_CAUSE,
-    "Messages of a writer that this receiver never got, by where they were lost.",
+    "Messages of a writer that this receiver never received, by place of loss.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_PENDING: Metric = Metric::gauge(
@@ -168,32 +170,32 @@ pub(in crate::surface) const SUBSCRIBER_RECOVERED: Metric = Metric::counter(
 pub(in crate::surface) const SUBSCRIBER_RECOVERY_SECONDS: Metric = Metric::counter(
     "ros2_subscriber_recovery_seconds_total",
     SUBSCRIBER,
-    "Total time for which those were missing.",
+    "Total time for which those messages were missing.",
 )
 .unit("seconds")
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_IRRELEVANT: Metric = Metric::counter(
     "ros2_subscriber_irrelevant_messages_total",
     SUBSCRIBER,
-    "Messages that the writer left out (GAP), or that the reader acknowledged unseen.",
+    "Messages that the writer declared irrelevant (GAP), or that the reader acknowledged unseen.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_UNMATCHED: Metric = Metric::counter(
     "ros2_subscriber_unmatched_messages_total",
     SUBSCRIBER,
-    "Messages that arrived while no reader of the topic was there: not among the received ones.",
+    "Messages that arrived without a reader of the topic; not counted as received.",
 )
 .experimental();
 pub(in crate::surface) const READER_LAG: Metric = Metric::gauge(
     "ros2_reader_acknowledgement_lag_messages",
     READER,
-    "Messages that exist and that this reliable reader has not acknowledged.",
+    "Messages that this reliable reader has not acknowledged.",
 )
 .experimental();
 pub(in crate::surface) const READER_LAG_SECONDS: Metric = Metric::gauge(
     "ros2_reader_acknowledgement_lag_seconds",
     READER,
-    "Age of the oldest of them; infinite when older than is remembered.",
+    "Age of the oldest of those messages; infinite beyond the agent's history.",
 )
 .unit("seconds")
 .experimental();

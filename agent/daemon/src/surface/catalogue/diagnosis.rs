@@ -10,12 +10,12 @@ pub(in crate::surface) const DIAGNOSES: Metric = Metric::gauge(
 pub(in crate::surface) const QOS_INCOMPATIBLE_PAIRS: Metric = Metric::gauge(
     "ros2_qos_incompatible_pairs",
     &["domain_id", "topic", "policy"],
-    "Publishers and subscribers of one topic that do not talk because of this policy, in pairs.",
+    "Pairs of publisher and subscriber that cannot communicate because of this policy.",
 );
 pub(in crate::surface) const TOPIC_CONFLICTING_TYPES: Metric = Metric::gauge(
     "ros2_topic_conflicting_types",
     TOPIC,
-    "Types of a topic that has several: endpoints of different types do not talk.",
+    "Types of a topic that has several: endpoints of different types cannot communicate.",
 );
 pub(in crate::surface) const TOPIC_CONFLICTING_TYPE_HASHES: Metric = Metric::gauge(
     "ros2_topic_conflicting_type_hashes",

@@ -157,7 +157,7 @@ impl Client {
                 tracing::debug!(
                     signal = self.signal.label(),
                     message = partial.error_message,
-                    "the OTLP receiver remarks"
+                    "the OTLP receiver sent a message"
                 );
             }
             u64::try_from(partial.rejected_data_points).unwrap_or(0)

@@ -36,10 +36,10 @@ pub enum StartError {
     #[error(transparent)]
     Settings(#[from] SettingsError),
     /// The system has no thread for it.
-    #[error("cannot start the thread that exports")]
+    #[error("cannot start the export thread")]
     Runtime(#[source] std::io::Error),
     /// Likewise, or it has privileges that it should not have.
-    #[error("cannot start the thread that exports")]
+    #[error("cannot start the export thread")]
     Thread(#[from] SpawnError),
 }
 

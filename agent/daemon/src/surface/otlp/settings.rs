@@ -189,7 +189,7 @@ fn target(
     if let Some((name, value)) = variables.of(signal, "PROTOCOL")
         && value != "grpc"
     {
-        tracing::warn!(name, value, "only grpc is spoken here");
+        tracing::warn!(name, value, "only the protocol grpc is supported");
     }
     let timeout = file.timeout.or_else(|| {
         let (name, value) = variables.of(signal, "TIMEOUT")?;

@@ -1,4 +1,4 @@
-//! One participant of a crowd: its endpoints and what it sends of them.
+//! One participant of a crowd: its endpoints and its messages.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -14,7 +14,7 @@ pub(super) struct Member {
     pub(super) lease: Duration,
     pub(super) node: String,
     pub(super) endpoints: BTreeMap<[u8; 4], String>,
-    /// Numbers of announcements of writers, readers and nodes.
+    /// Sequence numbers of announcements of writers, readers and nodes.
     pub(super) numbers: [u32; 3],
     pub(super) entity: u16,
     pub(super) seen: Instant,
@@ -29,7 +29,7 @@ impl Member {
         self.seen.elapsed() > self.lease.mul_f64(LATE)
     }
 
-    /// When its lease ends.
+    /// Returns the end of its lease.
     pub(super) fn ends(&self) -> Instant {
         self.seen + self.lease
     }
@@ -53,7 +53,7 @@ impl Member {
         }
     }
 
-    /// All that it has to say, as to one that has just come.
+    /// Returns all its announcements, as for a newcomer.
     pub(super) fn introduction(&self) -> Vec<Vec<u8>> {
         let mut messages = vec![self.announcement()];
         let mut numbers = self.numbers;
@@ -91,7 +91,7 @@ impl Member {
         self.message(announcer(entity), number, &list.finish())
     }
 
-    /// `ros_discovery_info` with 16-byte gids: one node that has all.
+    /// Returns `ros_discovery_info` with 16-byte gids: one node with all endpoints.
     pub(super) fn entities(&self) -> Vec<u8> {
         let mut bytes = vec![0, 1, 0, 0];
         bytes.extend_from_slice(&self.prefix);
@@ -112,7 +112,7 @@ impl Member {
         self.message(ENTITIES_WRITER, 1, &bytes)
     }
 
-    /// A farewell, as Cyclone DDS (key) or Fast DDS (key hash) puts it.
+    /// Returns a disposal in the form of Cyclone DDS (key) or Fast DDS (key hash).
     pub(super) fn disposal(
         &self,
         writer: [u8; 4],
@@ -138,7 +138,7 @@ impl Member {
             inline.extend_from_slice(&key.finish());
         }
         let mut message = self.message(writer, number, &inline);
-        // Inline QoS; and a key in the place of data, or nothing there.
+        // Inline QoS; and a key instead of data, or no payload.
         message[21] = if by_key { 0x0b } else { 0x03 };
         message
     }
@@ -155,7 +155,7 @@ pub(super) fn entity(number: u16, kind: u8) -> [u8; 4] {
     [0, high, low, kind]
 }
 
-/// Who announces an endpoint.
+/// Returns the builtin writer that announces an endpoint.
 pub(super) fn announcer(entity: [u8; 4]) -> [u8; 4] {
     if entity[3] == 3 {
         PUBLICATIONS_WRITER
@@ -168,7 +168,7 @@ pub(super) fn role(entity: [u8; 4]) -> &'static str {
     if entity[3] == 3 { "writer" } else { "reader" }
 }
 
-/// As the agent writes it.
+/// Returns a GUID in the agent's form.
 pub(super) fn guid(prefix: &[u8; 12], entity: [u8; 4]) -> String {
     let hexadecimal =
         |bytes: &[u8]| -> String { bytes.iter().map(|byte| format!("{byte:02x}")).collect() };

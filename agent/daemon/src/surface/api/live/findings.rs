@@ -5,11 +5,11 @@ use std::collections::HashMap;
 
 use ros2probe_wire::{DomainId, Duration, Guid};
 
-use super::line::{Finding, Severity};
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
-use ros2probe_model::diagnosis::{Diagnosis, Policy};
+use ros2probe_api::live::{Finding, Severity};
+use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
 
@@ -33,7 +33,7 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list.extend(of_watches(circumstances));
     list.extend(losses(circumstances));
     list.sort_by(|one, other| {
-        (one.severity, one.kind, &one.id).cmp(&(other.severity, other.kind, &other.id))
+        (one.severity, &one.kind, &one.id).cmp(&(other.severity, &other.kind, &other.id))
     });
     list.truncate(MOST);
     list
@@ -42,7 +42,7 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
 fn finding(kind: &'static str, severity: Severity, about: &str, text: String) -> Finding {
     Finding {
         id: format!("{kind}|{about}"),
-        kind,
+        kind: kind.into(),
         severity,
         domain_id: None,
         topic: None,
@@ -56,39 +56,30 @@ fn finding(kind: &'static str, severity: Severity, about: &str, text: String) ->
     }
 }
 
-impl Finding {
-    fn helped_by(self, remedy: impl Into<String>) -> Self {
-        Self {
-            remedy: Some(remedy.into()),
-            ..self
-        }
-    }
-}
-
 fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
     let (agent, snapshot) = (all.agent, all.snapshot);
     let mut list = Vec::new();
     if let Some(reason) = all.unready {
         let text = format!("The agent does not see the robot: {reason}");
         let unready = finding("agent_not_ready", Severity::Error, "", text);
-        list.push(unready.helped_by("rp doctor"));
+        list.push(unready.with_remedy("rp doctor"));
     }
     let dropped = dropped(agent);
     if dropped > 0 {
         let text =
             "The agent lost packets for want of room: its counts are lower bounds".to_owned();
         let drops = finding("agent_drops", Severity::Warning, "", text);
-        list.push(drops.helped_by("raise capture.ring_bytes and capture.record_ring_bytes"));
+        list.push(drops.with_remedy("raise capture.ring_bytes and capture.record_ring_bytes"));
     }
     if !snapshot.unknown_writers.is_empty() {
         let text = "Writers are active whose announcement was missed; their topics are unknown";
         let unknown = finding("unknown_writers", Severity::Warning, "", text.to_owned());
-        list.push(unknown.helped_by("sudo rp discover --all"));
+        list.push(unknown.with_remedy("sudo rp discover --all"));
     }
     if snapshot.topics_rejected > 0 {
         let text = "Watched topics are not measured: limits.topics is reached".to_owned();
         let rejected = finding("topics_rejected", Severity::Warning, "", text);
-        list.push(rejected.helped_by("raise limits.topics, or watch fewer topics"));
+        list.push(rejected.with_remedy("raise limits.topics, or watch fewer topics"));
     }
     list.extend(unseen(agent));
     list
@@ -177,27 +168,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             writer,
             reader,
             policies,
-        } => {
-            let differ: Vec<_> = policies
-                .iter()
-                .map(|policy| ends.difference(policy, *writer, *reader))
-                .collect();
-            let text = format!(
-                "{} sends nothing to {} on {}: {}",
-                ends.who(*writer),
-                ends.who(*reader),
-                topic.name,
-                differ.join("; ")
-            );
-            let about = format!("{}|{}|{writer}|{reader}", topic.domain_id, topic.dds_name);
-            Finding {
-                writer: Some(writer.to_string()),
-                reader: Some(reader.to_string()),
-                policies: policies.iter().map(Policy::label).collect(),
-                ..finding(kind, Severity::Error, &about, text)
-            }
-            .helped_by("let the publisher offer what the subscription requests, or request less")
-        }
+        } => incompatible(kind, topic, (*writer, *reader), policies, ends),
         Diagnosis::TypeConflict { topic, types } => {
             let types: Vec<&str> = types.iter().map(AsRef::as_ref).collect();
             let text = format!(
@@ -207,7 +178,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             );
             let about = format!("{}|{}", topic.domain_id, topic.dds_name);
             finding(kind, Severity::Error, &about, text)
-                .helped_by("rename one of the topics, or use one type")
+                .with_remedy("rename one of the topics, or use one type")
         }
         Diagnosis::TypeHashConflict {
             topic,
@@ -220,7 +191,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             );
             let about = format!("{}|{}|{message_type}", topic.domain_id, topic.dds_name);
             finding(kind, Severity::Error, &about, text)
-                .helped_by("build all nodes with one version of the interface package")
+                .with_remedy("build all nodes with one version of the interface package")
         }
         Diagnosis::DuplicateNode {
             domain_id, node, ..
@@ -236,19 +207,15 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
                     text,
                 )
             }
-            .helped_by("give each node a name or a namespace of its own")
+            .with_remedy("give each node a name or a namespace of its own")
         }
         Diagnosis::UnheardPublisher {
             topic,
             writer,
             reason,
         } => {
-            let who = ends.who(*writer);
-            let text = format!(
-                "{who} publishes {}, and {}",
-                topic.name,
-                lacks(reason.label(), "subscription")
-            );
+            let why = lacks(reason.label(), "subscription");
+            let text = format!("{} publishes {}, and {why}", ends.who(*writer), topic.name);
             let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
             Finding {
                 writer: Some(writer.to_string()),
@@ -260,12 +227,9 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reader,
             reason,
         } => {
+            let why = lacks(reason.label(), "publisher");
             let who = ends.who(*reader);
-            let text = format!(
-                "{who} subscribes to {}, and {}",
-                topic.name,
-                lacks(reason.label(), "publisher")
-            );
+            let text = format!("{who} subscribes to {}, and {why}", topic.name);
             let about = format!("{}|{}|{reader}", topic.domain_id, topic.dds_name);
             Finding {
                 reader: Some(reader.to_string()),
@@ -281,9 +245,38 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
                 node: first.and_then(|domain_id| all.ids.node(domain_id, node)),
                 ..finding(kind, Severity::Warning, node, text)
             }
-            .helped_by("start all of its processes with the same ROS_DOMAIN_ID")
+            .with_remedy("start all of its processes with the same ROS_DOMAIN_ID")
         }
     }
+}
+
+/// A writer and a reader whose QoS differs.
+fn incompatible(
+    kind: &'static str,
+    topic: &TopicKey,
+    (writer, reader): (Guid, Guid),
+    policies: &Policies,
+    ends: &Ends<'_>,
+) -> Finding {
+    let differ: Vec<_> = policies
+        .iter()
+        .map(|policy| ends.difference(policy, writer, reader))
+        .collect();
+    let text = format!(
+        "{} sends nothing to {} on {}: {}",
+        ends.who(writer),
+        ends.who(reader),
+        topic.name,
+        differ.join("; ")
+    );
+    let about = format!("{}|{}|{writer}|{reader}", topic.domain_id, topic.dds_name);
+    Finding {
+        writer: Some(writer.to_string()),
+        reader: Some(reader.to_string()),
+        policies: policies.iter().map(|each| each.label().into()).collect(),
+        ..finding(kind, Severity::Error, &about, text)
+    }
+    .with_remedy("let the publisher offer what the subscription requests, or request less")
 }
 
 /// Why an endpoint has no counterpart.
@@ -353,7 +346,7 @@ fn losses(all: &Circumstances<'_>) -> Vec<Finding> {
             since: began(all.past, known),
             ..finding("loss", Severity::Error, &about, text)
         };
-        Some(loss.helped_by(remedy))
+        Some(loss.with_remedy(remedy))
     });
     found.collect()
 }
@@ -501,7 +494,7 @@ mod tests {
         assert_eq!(found.len(), MOST);
         let first = found.first().unwrap();
         assert_eq!(
-            (first.kind, first.severity),
+            (&*first.kind, first.severity),
             ("agent_not_ready", Severity::Error)
         );
         assert!(found.is_sorted_by_key(|each| each.severity));

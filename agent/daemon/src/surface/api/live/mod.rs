@@ -6,7 +6,6 @@
 //! computed while no stream is open.
 
 mod findings;
-mod line;
 mod shared_lines;
 mod structure;
 mod values;
@@ -25,14 +24,14 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::body_stream::{Pieces, stream_of};
+use super::body_stream::{Pieces, stream_of, write_line};
 use super::events::event;
 use super::health::HOST;
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::events::Reader;
-use line::{End, Events, Line, Open, Replay};
+use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::snapshot::Transport;
 use shared_lines::SharedLines;
 
@@ -99,7 +98,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     tag = "graph",
     responses(
         (status = 200, description = "Lines, until the client disconnects or the agent stops.",
-            body = line::Line<'static>, content_type = "application/x-ndjson"),
+            body = ros2probe_api::live::Line<'static>, content_type = "application/x-ndjson"),
         (status = 503, description = "Too many streams, or the agent is shutting down.",
             body = ProblemBody, content_type = "application/problem+json"),
     )
@@ -142,8 +141,8 @@ impl Pieces for Stream {
             self.context.state().await;
         } else if !self.moment().await {
             self.ended = true;
-            let reason = "the agent ends";
-            Line::End(End { reason }).write(&mut lines);
+            let reason = "the agent ends".into();
+            write_line(&mut lines, &Line::End(End { reason }));
             return Some(lines.into());
         }
         self.sent = Instant::now();
@@ -184,23 +183,23 @@ impl Stream {
             let open = Open {
                 run: context.events.run(),
                 host: HOST.clone(),
-                version: env!("CARGO_PKG_VERSION"),
-                source: state.agent.source.label(),
+                version: env!("CARGO_PKG_VERSION").into(),
+                source: state.agent.source.label().into(),
                 access: self.access.clone(),
                 interval_seconds: 1,
                 history_seconds: context.live.history.as_secs(),
-                flags: &values::FLAGS,
-                passages: Transport::ALL.map(Transport::label).into(),
+                flags: values::FLAGS.map(Into::into).into(),
+                passages: Transport::ALL.map(|each| each.label().into()).into(),
                 replay,
             };
-            Line::Open(open).write(lines);
+            write_line(lines, &Line::Open(open));
         }
         for part in shared.parts(seen) {
             lines.extend_from_slice(part);
         }
         if self.seen.is_none() {
             let history = values::history(state.known(), &past, &shared.ids);
-            Line::History(history).write(lines);
+            write_line(lines, &Line::History(history));
         }
         let log = &context.events;
         let batch = log.read(self.place, EVENTS);
@@ -215,9 +214,9 @@ impl Stream {
                     .map(|record| event(log, record))
                     .collect(),
             };
-            Line::Events(events).write(lines);
+            write_line(lines, &Line::Events(events));
         }
-        Line::Values(shared.values(seen)).write(lines);
+        write_line(lines, &Line::Values(shared.values(seen)));
         self.seen = Some(shared.round());
     }
 }

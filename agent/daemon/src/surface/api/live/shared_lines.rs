@@ -7,16 +7,18 @@ use std::time::Instant;
 
 use bytes::Bytes;
 
+use super::super::body_stream::write_line;
 use super::super::index::Index;
 use super::findings::{Circumstances, dropped, findings};
-use super::line::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use super::structure::Ids;
 use super::values::{Figures, lost_lately, totals};
 use crate::agent_facts::Ability as Able;
 use crate::agent_facts::SourceKind;
 use crate::snapshot_cell::State;
 use crate::watches::InForce;
+use ros2probe_api::live::{Ability, Agent, Graph, Line, Progress, Row, Totals, Values};
 use ros2probe_model::history::Past;
+use ros2probe_model::snapshot::Snapshot;
 
 /// One moment, and what it took to come there.
 #[derive(Debug, Default)]
@@ -46,7 +48,7 @@ struct Part {
 impl Part {
     fn set(&mut self, line: &Line<'_>, round: u64) {
         let mut text = Vec::with_capacity(self.text.len());
-        line.write(&mut text);
+        write_line(&mut text, line);
         if self.text != text {
             (self.changed, self.text) = (round, text.into());
         }
@@ -69,48 +71,72 @@ impl SharedLines {
             return;
         }
         self.round += 1;
-        let round = self.round;
-        let (snapshot, agent) = (state.known(), &state.agent);
+        let snapshot = state.known();
         let index = Index::new(snapshot);
+        self.update_structure(snapshot, &index, in_force);
+        self.update_agent(state, past, in_force);
+        let figures = Figures {
+            snapshot,
+            index: &index,
+            past,
+            watchlist: in_force.watchlist(),
+            sees_memory: state.agent.shared_memory.is_some(),
+            lost: lost_lately(past),
+        };
+        self.update_rows(figures.rows(&self.ids));
+        self.at = snapshot.at.seconds();
+        self.totals = totals(snapshot, past);
+        self.progress = (state.agent.source == SourceKind::Replay)
+            .then(|| Progress(state.agent.replayed, state.agent.finished.into()));
+        self.state = Some(Arc::clone(state));
+        self.past = Some(Arc::clone(past));
+        self.in_force = Some(Arc::clone(in_force));
+    }
+
+    /// The line of the graph.
+    fn update_structure<'a>(
+        &mut self,
+        snapshot: &'a Snapshot,
+        index: &Index<'a>,
+        in_force: &InForce,
+    ) {
+        let round = self.round;
         let version = self.structure.changed;
-        let graph = self.ids.structure(snapshot, &index, in_force, round);
-        self.structure
-            .set(&Line::Graph(Graph { version, ..graph }), round);
+        let graph = self.ids.structure(snapshot, index, in_force, round);
+        let mut line = Line::Graph(Graph { version, ..graph });
+        self.structure.set(&line, round);
         if self.structure.changed == round {
             // The version is the round, so a graph has another one whenever it differs.
-            let graph = self.ids.structure(snapshot, &index, in_force, round);
-            self.structure.set(
-                &Line::Graph(Graph {
-                    version: round,
-                    ..graph
-                }),
-                round,
-            );
+            if let Line::Graph(graph) = &mut line {
+                graph.version = round;
+            }
+            self.structure.set(&line, round);
         }
+    }
+
+    /// The lines of the agent and of the findings.
+    fn update_agent(&mut self, state: &State, past: &Past, in_force: &InForce) {
+        let (snapshot, agent, round) = (state.known(), &state.agent, self.round);
         let unready = state.ready(Instant::now()).err();
-        self.agent.set(
-            &Line::Agent(Agent {
-                ready: unready.is_none(),
-                reason: unready.clone(),
-                finished: agent.finished,
-                dropped: dropped(agent),
-                unknown_writers: snapshot.unknown_writers.len(),
-                topics_rejected: snapshot.topics_rejected,
-                abilities: Able::ALL
-                    .iter()
-                    .map(|ability| {
-                        let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
-                        Ability(
-                            ability.label(),
-                            agent.abilities.contains(ability).into(),
-                            reason.map(|(_, reason)| reason.as_str()),
-                        )
-                    })
-                    .collect(),
-                watches: in_force.entries().len(),
-            }),
-            round,
-        );
+        let abilities = Able::ALL.iter().map(|ability| {
+            let reason = agent.blind.iter().find(|(blind, _)| blind == ability);
+            Ability(
+                ability.label().into(),
+                agent.abilities.contains(ability).into(),
+                reason.map(|(_, reason)| reason.into()),
+            )
+        });
+        let line = Line::Agent(Agent {
+            ready: unready.is_none(),
+            reason: unready.clone(),
+            finished: agent.finished,
+            dropped: dropped(agent),
+            unknown_writers: snapshot.unknown_writers.len(),
+            topics_rejected: snapshot.topics_rejected,
+            abilities: abilities.collect(),
+            watches: in_force.entries().len(),
+        });
+        self.agent.set(&line, round);
         let list = findings(&Circumstances {
             snapshot,
             agent,
@@ -119,16 +145,12 @@ impl SharedLines {
             unready: unready.as_deref(),
         });
         self.findings.set(&Line::Findings(list), round);
-        let figures = Figures {
-            snapshot,
-            index: &index,
-            past,
-            watchlist: in_force.watchlist(),
-            sees_memory: agent.shared_memory.is_some(),
-            lost: lost_lately(past),
-        };
-        let rows = figures.rows(&self.ids);
-        // A topic without figures has an empty row once, so that no mark is left behind.
+    }
+
+    /// The figures of topics. A topic without figures has an empty row once, so that no mark is left
+    /// behind.
+    fn update_rows(&mut self, rows: BTreeMap<u32, Row>) {
+        let round = self.round;
         let emptied = self.rows.keys().filter(|id| !rows.contains_key(id));
         let emptied = emptied.map(|id| (*id, Row::empty(*id)));
         let emptied: Vec<_> = emptied.collect();
@@ -140,13 +162,6 @@ impl SharedLines {
         }
         let topics = self.ids.topics();
         self.rows.retain(|id, _| topics.contains(id));
-        self.at = snapshot.at.seconds();
-        self.totals = totals(snapshot, past);
-        self.progress = (agent.source == SourceKind::Replay)
-            .then(|| Progress(agent.replayed, agent.finished.into()));
-        self.state = Some(Arc::clone(state));
-        self.past = Some(Arc::clone(past));
-        self.in_force = Some(Arc::clone(in_force));
     }
 
     /// What changed of the graph, the agent and the findings since the round `seen`.

@@ -1,14 +1,15 @@
 //! The structure of the graph: what changes seldom, and what the rows of figures refer to.
 
+use std::borrow::Cow;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::hash::Hash;
 
 use ros2probe_wire::{DomainId, EntityId, Guid};
 
-use super::super::endpoint::vendor;
+use super::super::endpoint::{texts, vendor};
 use super::super::index::Index;
-use super::line::{Endpoint, Graph, Node, Participant, Topic};
 use crate::watches::{InForce, Origin};
+use ros2probe_api::live::{Endpoint, Graph, Node, Participant, Topic};
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts};
 use ros2probe_model::topic_kind::TopicKind;
 
@@ -87,13 +88,13 @@ impl Ids {
             let process = &facts.process;
             graph.participants.push(Participant(
                 self.participants.number(facts.guid, round),
-                facts.guid,
+                facts.guid.to_string(),
                 facts.domain_id.0,
                 vendor(facts.vendor),
-                process.host.as_deref(),
+                process.host.as_deref().map(Cow::Borrowed),
                 process.id,
-                process.name.as_deref(),
-                process.cgroup.as_deref(),
+                process.name.as_deref().map(Cow::Borrowed),
+                process.cgroup.as_deref().map(Cow::Borrowed),
             ));
         }
         let mut nodes: BTreeMap<(DomainId, &str), Vec<u32>> = BTreeMap::new();
@@ -105,9 +106,13 @@ impl Ids {
         for ((domain_id, name), participants) in nodes {
             let id = self.nodes.number((domain_id, name.to_owned()), round);
             let hidden = name.split('/').any(|token| token.starts_with('_'));
-            graph
-                .nodes
-                .push(Node(id, domain_id.0, name, participants, hidden.into()));
+            graph.nodes.push(Node(
+                id,
+                domain_id.0,
+                name.into(),
+                participants,
+                hidden.into(),
+            ));
         }
         for facts in snapshot.topics.iter().filter(|topic| is_shown(topic)) {
             let key = (facts.domain_id, facts.dds_name.to_string());
@@ -116,10 +121,10 @@ impl Ids {
             graph.topics.push(Topic(
                 id,
                 facts.domain_id.0,
-                &facts.name,
-                &facts.dds_name,
-                facts.kind.label(),
-                &facts.message_types,
+                Cow::Borrowed(&*facts.name),
+                Cow::Borrowed(&*facts.dds_name),
+                facts.kind.label().into(),
+                texts(&facts.message_types),
                 facts.hidden.into(),
                 facts.vanished.into(),
                 is_measured(facts, index).into(),
@@ -157,10 +162,10 @@ impl Ids {
             topic,
             node,
             self.participants.number(participant, round),
-            facts.guid,
+            facts.guid.to_string(),
             facts.transports,
-            facts.qos.reliability.label(),
-            facts.qos.durability.label(),
+            Cow::Borrowed(facts.qos.reliability.label()),
+            Cow::Borrowed(facts.qos.durability.label()),
         )
     }
 }

@@ -4,9 +4,9 @@ use std::collections::{BTreeMap, HashMap};
 
 use super::super::history::{short, thousandths};
 use super::super::index::Index;
-use super::line::{History, Rates, Row, Totals};
 use super::structure::{Ids, is_measured, is_shown};
 use crate::config::Watchlist;
+use ros2probe_api::live::{History, Rates, Row, Totals};
 use ros2probe_model::diagnosis::Diagnosis;
 use ros2probe_model::history::{Past, Second};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts, Transport, WatchState};

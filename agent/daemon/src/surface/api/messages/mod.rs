@@ -14,15 +14,14 @@ use axum::body::Body;
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use ros2probe_wire::Guid;
 use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::task::spawn_blocking;
 use tokio::time::{Instant, sleep_until};
 use utoipa::{IntoParams, ToSchema};
 
-use super::body_stream::{Pieces, stream_of};
-use super::endpoint::text;
+use super::body_stream::{Pieces, stream_of, write_line};
 use super::problem::{Code, Problem, ProblemBody};
 use super::scope::Domain;
 use super::security::Granted;
@@ -32,6 +31,7 @@ use crate::config::Access;
 use crate::subscriptions::{
     Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
+use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{Library, Limits, MessageType, decode};
 use ros2probe_model::dispatch::Sample;
 use ros2probe_model::names::TypeName;
@@ -60,93 +60,13 @@ pub(super) struct Wanted {
     max_hertz: Option<f64>,
 }
 
-/// One line: an object with one member.
+/// A decoded message, as JSON text.
 #[derive(Debug, Serialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-#[schema(as = MessagesLine)]
-pub(super) enum Line {
-    /// The type of the messages that follow.
-    Type(TypeLine),
-    /// A message.
-    Message(MessageLine),
-    /// Messages that will not be shown because their bytes are not known.
-    Missed(MissedLine),
-    /// The stream lives.
-    Beat(Beat),
-    /// Nothing will follow.
-    End(End),
-}
+#[serde(transparent)]
+#[schema(value_type = Object)]
+pub(super) struct JsonText(Box<RawValue>);
 
-/// A type.
-#[derive(Clone, Debug, Serialize, ToSchema)]
-#[schema(as = MessagesType)]
-pub(super) struct TypeLine {
-    /// ROS name.
-    #[schema(example = "sensor_msgs/msg/Imu")]
-    name: String,
-    /// Whether its definition is known, so that messages can be decoded.
-    known: bool,
-    /// Why not.
-    reason: Option<String>,
-    /// The definition with those of its parts, as ROS bags have it.
-    definition: Option<String>,
-}
-
-/// A message.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = MessagesMessage)]
-pub(super) struct MessageLine {
-    /// Unix time of its arrival.
-    time: f64,
-    /// Unix time at which it was written, by the writer's clock.
-    source_time: Option<f64>,
-    /// GUID of its writer.
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    writer: Guid,
-    /// The writer's node.
-    node: Option<String>,
-    /// Its number among those of this writer.
-    sequence_number: u64,
-    /// Bytes of the serialized message.
-    bytes: u32,
-    /// Messages that came between the one shown before and this one.
-    skipped: u64,
-    /// Its fields, in the order of the definition. 64-bit numbers beyond 2^53, NaN and infinities are
-    /// text; of long arrays and texts there is `$length` and the beginning, `$items` or `$text`.
-    #[schema(value_type = Option<Object>)]
-    value: Option<Box<serde_json::value::RawValue>>,
-    /// Why it cannot be decoded.
-    error: Option<String>,
-}
-
-/// Messages that are not known.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = MessagesMissed)]
-pub(super) struct MissedLine {
-    /// How many.
-    messages: u64,
-    /// Why.
-    #[schema(value_type = String)]
-    reason: &'static str,
-}
-
-/// The stream lives.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = MessagesBeat)]
-pub(super) struct Beat {
-    /// Unix time up to which all messages have come.
-    t: Option<f64>,
-}
-
-/// Why nothing follows.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = MessagesEnd)]
-pub(super) struct End {
-    /// In words.
-    #[schema(value_type = String)]
-    reason: &'static str,
-}
+pub(super) type Line = messages::Line<Message<JsonText>>;
 
 /// One client's stream.
 struct Stream {
@@ -159,7 +79,7 @@ struct Stream {
     newest: Option<Arc<Sample>>,
     skipped: u64,
     /// Messages that are not known, with the latest reason.
-    missed: Option<MissedLine>,
+    missed: Option<Missed>,
     clock: Option<f64>,
     known: Option<Known>,
     ended: bool,
@@ -184,7 +104,7 @@ struct Known {
     tag = "graph",
     params(TopicParameter, Domain),
     responses(
-        (status = 200, description = "Its type, known or not.", body = TypeLine),
+        (status = 200, description = "Its type, known or not.", body = Definition),
         (status = 404, description = "No such topic.",
             body = ProblemBody, content_type = "application/problem+json"),
         (status = 409, description = "It is in several domains.",
@@ -337,9 +257,9 @@ impl Stream {
             Item::Clock(clock) => self.clock = Some(clock.seconds()),
             Item::Missed(missed) => {
                 let messages = self.missed.as_ref().map_or(0, |missed| missed.messages);
-                self.missed = Some(MissedLine {
+                self.missed = Some(Missed {
                     messages: messages + missed.samples,
-                    reason: missed.reason.label(),
+                    reason: missed.reason.label().into(),
                 });
             }
             Item::End(_) => {}
@@ -351,16 +271,21 @@ impl Stream {
         if self.newest.is_some() {
             self.say(lines).await;
         }
-        write(lines, &Line::End(End { reason }));
+        write_line(
+            lines,
+            &Line::End(End {
+                reason: reason.into(),
+            }),
+        );
     }
 
     /// Shows the newest message, or that the stream lives.
     async fn say(&mut self, lines: &mut Vec<u8>) {
         if let Some(missed) = self.missed.take() {
-            write(lines, &Line::Missed(missed));
+            write_line(lines, &Line::Missed(missed));
         }
         let Some(sample) = self.newest.take() else {
-            write(lines, &Line::Beat(Beat { t: self.clock }));
+            write_line(lines, &Line::Beat(Beat { t: self.clock }));
             return;
         };
         self.shown = Some(Instant::now());
@@ -379,10 +304,10 @@ impl Stream {
             let publisher = publishers.find(|publisher| publisher.guid == sample.writer)?;
             publisher.node.as_ref().map(ToString::to_string)
         });
-        let line = MessageLine {
+        let line = Message {
             time: sample.time.seconds(),
             source_time: sample.source_timestamp.map(|time| time.seconds()),
-            writer: sample.writer,
+            writer: sample.writer.to_string(),
             node,
             sequence_number: sample.sequence_number,
             bytes: sample.size,
@@ -390,7 +315,7 @@ impl Stream {
             value,
             error,
         };
-        write(lines, &Line::Message(line));
+        write_line(lines, &Line::Message(line));
     }
 
     /// The type of a message; writes a `type` line where it differs from that of the message before.
@@ -412,7 +337,7 @@ impl Stream {
             let reason = "looking for its definition failed".to_owned();
             (unknown(name, reason), None)
         });
-        write(lines, &Line::Type(line));
+        write_line(lines, &Line::Type(line));
         self.known = Some(Known {
             name: name.clone(),
             hash,
@@ -426,10 +351,10 @@ fn look_up(
     library: &Library,
     name: &str,
     hash: Option<&str>,
-) -> (TypeLine, Option<Arc<MessageType>>) {
+) -> (Definition, Option<Arc<MessageType>>) {
     match library.find(name, hash) {
         Ok(found) => {
-            let line = TypeLine {
+            let line = Definition {
                 name: name.to_owned(),
                 known: true,
                 reason: None,
@@ -441,8 +366,8 @@ fn look_up(
     }
 }
 
-fn unknown(name: &str, reason: String) -> TypeLine {
-    TypeLine {
+fn unknown(name: &str, reason: String) -> Definition {
+    Definition {
         name: name.to_owned(),
         known: false,
         reason: Some(reason),
@@ -451,10 +376,7 @@ fn unknown(name: &str, reason: String) -> TypeLine {
 }
 
 /// The fields of a message; `None` where its type or its bytes are not known.
-fn value(
-    message_type: Option<&MessageType>,
-    sample: &Sample,
-) -> Result<Option<Box<serde_json::value::RawValue>>, String> {
+fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<JsonText>, String> {
     let (Some(message_type), Some(payload)) = (message_type, &sample.payload) else {
         return Ok(None);
     };
@@ -464,19 +386,15 @@ fn value(
     };
     let decoded = decode(message_type, payload, &limits).map_err(|error| error.to_string())?;
     let shown = serde_json::value::to_raw_value(&Tree::new(&decoded.message));
-    shown.map(Some).map_err(|error| error.to_string())
-}
-
-fn write(lines: &mut Vec<u8>, line: &Line) {
-    // Plain numbers and strings into memory: nothing that could fail.
-    let _ = serde_json::to_writer(&mut *lines, line);
-    lines.push(b'\n');
+    shown
+        .map(|text| Some(JsonText(text)))
+        .map_err(|error| error.to_string())
 }
 
 #[cfg(test)]
 mod tests {
     use ros2probe_wire::DomainId;
-    use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
+    use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
     use super::*;

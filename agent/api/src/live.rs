@@ -1,23 +1,19 @@
-//! The lines of `GET /live`, declared once, for the stream and for the OpenAPI document.
+//! `/live`: the lines of the stream that the page follows.
 //!
 //! Rows are arrays where there are many of them. Members and elements are only ever added at the
 //! end.
 
 use std::borrow::Cow;
 
-use ros2probe_model::names::TypeName;
-use ros2probe_wire::Guid;
-use serde::Serialize;
-use utoipa::ToSchema;
+use serde::{Deserialize, Serialize};
 
-use super::super::endpoint::text;
-use ros2probe_api::events::Event;
+use crate::events::Event;
 
 /// One line: an object with one member.
-#[derive(Debug, Serialize, ToSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveLine))]
 #[serde(rename_all = "snake_case")]
-#[schema(as = LiveLine)]
-pub(in super::super) enum Line<'a> {
+pub enum Line<'a> {
     /// The first line: the agent, and the meaning of flags and passages.
     Open(Open),
     /// The whole structure; again when it has changed.
@@ -37,17 +33,17 @@ pub(in super::super) enum Line<'a> {
 }
 
 /// The agent, and the meaning of flags and passages.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveOpen)]
-pub(in super::super) struct Open {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveOpen))]
+pub struct Open {
     /// Of this run of the agent.
     pub run: String,
     /// Name of its host.
     pub host: Option<String>,
     /// Version of the agent.
-    pub version: &'static str,
+    pub version: Cow<'static, str>,
     /// Where it looks: `host`, `wire` or `replay`.
-    pub source: &'static str,
+    pub source: Cow<'static, str>,
     /// Rights of this client: `read`, `watch` or `all`.
     pub access: String,
     /// Time between two batches of lines.
@@ -55,26 +51,26 @@ pub(in super::super) struct Open {
     /// How far `/topics/{topic}/history` reaches back.
     pub history_seconds: u64,
     /// What the bits of a topic's flags mean, from the lowest one on.
-    pub flags: &'static [&'static str],
+    pub flags: Vec<Cow<'static, str>>,
     /// What the bits of passages mean, likewise.
-    pub passages: Vec<&'static str>,
+    pub passages: Vec<Cow<'static, str>>,
     /// Where the capture begins; null for a live agent.
     pub replay: Option<Replay>,
 }
 
 /// The capture that is replayed.
-#[derive(Clone, Debug, Serialize, ToSchema)]
-#[schema(as = LiveReplay)]
-pub(in super::super) struct Replay {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveReplay))]
+pub struct Replay {
     /// Unix time of its first packet; null before that is read.
     pub begin: Option<f64>,
 }
 
 /// Participants, nodes, topics and endpoints. Numbers that stand for them are valid within one
 /// stream, where none is used twice.
-#[derive(Debug, Default, Serialize, ToSchema)]
-#[schema(as = LiveGraph)]
-pub(in super::super) struct Graph<'a> {
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveGraph))]
+pub struct Graph<'a> {
     /// Counts up.
     pub version: u64,
     /// Participants.
@@ -91,38 +87,36 @@ pub(in super::super) struct Graph<'a> {
 
 /// `[id, GUID, domain, implementation, host, process id, process, control group]`; the last four
 /// are null where they are not known.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveParticipant)]
-pub(in super::super) struct Participant<'a>(
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveParticipant))]
+pub struct Participant<'a>(
     pub u32,
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    pub Guid,
+    pub String,
     pub u32,
-    #[schema(value_type = String)] pub Cow<'a, str>,
-    pub Option<&'a str>,
+    pub Cow<'a, str>,
+    pub Option<Cow<'a, str>>,
     pub Option<u32>,
-    pub Option<&'a str>,
-    pub Option<&'a str>,
+    pub Option<Cow<'a, str>>,
+    pub Option<Cow<'a, str>>,
 );
 
 /// `[id, domain, name, ids of its participants, 1 if hidden]`.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveNode)]
-pub(in super::super) struct Node<'a>(pub u32, pub u32, pub &'a str, pub Vec<u32>, pub u8);
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveNode))]
+pub struct Node<'a>(pub u32, pub u32, pub Cow<'a, str>, pub Vec<u32>, pub u8);
 
 /// `[id, domain, name, DDS name, kind, types, 1 if hidden, 1 if vanished, 1 if measured, watched]`.
 /// `watched` is 1 for the configuration, 2 for the command line, 3 for a client, 0 for no watch of
 /// this name; 4 is added where a glob covers it.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveTopic)]
-pub(in super::super) struct Topic<'a>(
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTopic))]
+pub struct Topic<'a>(
     pub u32,
     pub u32,
-    pub &'a str,
-    pub &'a str,
-    pub &'a str,
-    #[schema(value_type = Vec<String>)] pub &'a [TypeName],
+    pub Cow<'a, str>,
+    pub Cow<'a, str>,
+    pub Cow<'a, str>,
+    pub Vec<Cow<'a, str>>,
     pub u8,
     pub u8,
     pub u8,
@@ -131,24 +125,22 @@ pub(in super::super) struct Topic<'a>(
 
 /// `[topic, node or 0, participant, GUID, passages, reliability, durability]`; passages are a set of
 /// bits, empty without a counterpart.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveEndpoint)]
-pub(in super::super) struct Endpoint<'a>(
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEndpoint))]
+pub struct Endpoint<'a>(
     pub u32,
     pub u32,
     pub u32,
-    #[serde(serialize_with = "text")]
-    #[schema(value_type = String)]
-    pub Guid,
+    pub String,
     pub u8,
-    pub &'a str,
-    pub &'a str,
+    pub Cow<'a, str>,
+    pub Cow<'a, str>,
 );
 
 /// The agent itself.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveAgent)]
-pub(in super::super) struct Agent<'a> {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveAgent))]
+pub struct Agent<'a> {
     /// It observes the robot.
     pub ready: bool,
     /// Why not.
@@ -168,15 +160,15 @@ pub(in super::super) struct Agent<'a> {
 }
 
 /// `[ability, 1 if it has it, why not]`.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveAbility)]
-pub(in super::super) struct Ability<'a>(pub &'static str, pub u8, pub Option<&'a str>);
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveAbility))]
+pub struct Ability<'a>(pub Cow<'static, str>, pub u8, pub Option<Cow<'a, str>>);
 
 /// How bad a finding is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveSeverity))]
 #[serde(rename_all = "lowercase")]
-#[schema(as = LiveSeverity)]
-pub(in super::super) enum Severity {
+pub enum Severity {
     /// Something does not work.
     Error,
     /// Something may not work.
@@ -186,15 +178,14 @@ pub(in super::super) enum Severity {
 }
 
 /// One thing that is wrong, in words.
-#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
-#[schema(as = LiveFinding)]
-pub(in super::super) struct Finding {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveFinding))]
+pub struct Finding {
     /// The same as long as it is about the same.
     pub id: String,
     /// Which: as in `diagnoses` of `/topics`, or `loss`, `watch_violated`, `watch_silent`,
     /// `agent_not_ready`, `agent_drops`, `unknown_writers`, `topics_rejected` or `ability`.
-    #[schema(value_type = String)]
-    pub kind: &'static str,
+    pub kind: Cow<'static, str>,
     /// How bad.
     pub severity: Severity,
     /// Its domain; null for the agent.
@@ -211,22 +202,22 @@ pub(in super::super) struct Finding {
     pub remedy: Option<String>,
     /// GUID of the writer.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub writer: Option<String>,
     /// GUID of the reader.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reader: Option<String>,
     /// Policies that differ.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    #[schema(value_type = Vec<String>, required = false)]
-    pub policies: Vec<&'static str>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[cfg_attr(feature = "openapi", schema(required = false))]
+    pub policies: Vec<Cow<'static, str>>,
 }
 
 /// Rates of the last minutes, for small charts.
-#[derive(Debug, Default, Serialize, ToSchema)]
-#[schema(as = LiveHistory)]
-pub(in super::super) struct History {
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveHistory))]
+pub struct History {
     /// Time between two values.
     pub step_seconds: u32,
     /// Unix time at which each step ended.
@@ -238,14 +229,14 @@ pub(in super::super) struct History {
 }
 
 /// `[topic, messages a second in each step]`, null where it was not measured.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveRates)]
-pub(in super::super) struct Rates(pub u32, pub Vec<Option<f64>>);
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRates))]
+pub struct Rates(pub u32, pub Vec<Option<f64>>);
 
 /// Events.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveEvents)]
-pub(in super::super) struct Events<'a> {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEvents))]
+pub struct Events<'a> {
     /// Events that were overwritten before they could be sent.
     pub missed: u64,
     /// The others, in the form of `/events`.
@@ -253,9 +244,9 @@ pub(in super::super) struct Events<'a> {
 }
 
 /// Figures.
-#[derive(Debug, Default, Serialize, ToSchema)]
-#[schema(as = LiveValues)]
-pub(in super::super) struct Values {
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveValues))]
+pub struct Values {
     /// Unix time of the facts, in the source's clock.
     pub t: f64,
     /// Rows that differ from those that were sent last.
@@ -264,16 +255,16 @@ pub(in super::super) struct Values {
     pub totals: Totals,
     /// How far a replay is.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(nullable = false)]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub replay: Option<Progress>,
 }
 
 /// `[topic, messages a second, payload bytes a second, messages, lost messages, lost in the last
 /// second, median latency, its 99th percentile, flags, Unix time of the last message]`. All but
 /// topic and flags are null while it is not measured.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, ToSchema)]
-#[schema(as = LiveRow)]
-pub(in super::super) struct Row(
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRow))]
+pub struct Row(
     pub u32,
     pub Option<f64>,
     pub Option<f64>,
@@ -287,36 +278,38 @@ pub(in super::super) struct Row(
 );
 
 /// `[messages, payload bytes, lost messages, measured topics]`.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, ToSchema)]
-#[schema(as = LiveTotals)]
-pub(in super::super) struct Totals(pub u64, pub u64, pub u64, pub u64);
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveTotals))]
+pub struct Totals(pub u64, pub u64, pub u64, pub u64);
 
 /// `[part of the file that was read, 1 if all of it was]`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, ToSchema)]
-#[schema(as = LiveProgress)]
-pub(in super::super) struct Progress(pub Option<f64>, pub u8);
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveProgress))]
+pub struct Progress(pub Option<f64>, pub u8);
 
 /// Why nothing follows.
-#[derive(Debug, Serialize, ToSchema)]
-#[schema(as = LiveEnd)]
-pub(in super::super) struct End {
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveEnd))]
+pub struct End {
     /// In words.
-    #[schema(value_type = String)]
-    pub reason: &'static str,
+    pub reason: Cow<'static, str>,
 }
 
 impl Row {
     /// Nothing is measured and nothing is wrong.
-    pub(in super::super) fn empty(topic: u32) -> Self {
+    #[must_use]
+    pub const fn empty(topic: u32) -> Self {
         Self(topic, None, None, None, None, None, None, None, 0, None)
     }
 }
 
-impl Line<'_> {
-    /// Appends it to `lines`.
-    pub(in super::super) fn write(&self, lines: &mut Vec<u8>) {
-        // Plain numbers and strings into memory: nothing that could fail.
-        let _ = serde_json::to_writer(&mut *lines, self);
-        lines.push(b'\n');
+impl Finding {
+    /// The same with what helps.
+    #[must_use]
+    pub fn with_remedy(self, remedy: impl Into<String>) -> Self {
+        Self {
+            remedy: Some(remedy.into()),
+            ..self
+        }
     }
 }

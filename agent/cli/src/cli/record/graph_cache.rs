@@ -1,0 +1,72 @@
+//! What an agent knows of topics, requested for all of them at once and kept for a second.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use ros2probe::client::Agent;
+use ros2probe_api::participants::ParticipantList;
+use ros2probe_api::topics::TopicList;
+use ros2probe_daemon::recording::{DiscoveredTopic, GraphSnapshot, by_name};
+
+/// How long an answer about announcements is waited for, and how old it may be.
+const GRAPH_TIMEOUT: Duration = Duration::from_secs(2);
+const GRAPH_AGE: Duration = Duration::from_secs(1);
+
+/// What an agent says of topics, asked for all of them at once.
+pub(super) struct GraphCache<'a> {
+    agent: &'a Agent,
+    domain_id: u32,
+    known: HashMap<String, DiscoveredTopic>,
+    pub(super) graph: GraphSnapshot,
+    at: Option<Instant>,
+}
+
+impl<'a> GraphCache<'a> {
+    pub(super) fn new(agent: &'a Agent, domain_id: u32) -> Self {
+        Self {
+            agent,
+            domain_id,
+            known: HashMap::new(),
+            graph: GraphSnapshot::default(),
+            at: None,
+        }
+    }
+
+    /// What was known last, where the agent does not answer any more.
+    pub(super) fn of(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
+        let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
+        if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
+            self.ask();
+        }
+        let known = names.iter().map(|name| self.known.get(name).cloned());
+        known.map(Option::unwrap_or_default).collect()
+    }
+
+    pub(super) fn latest_snapshot(&mut self) -> GraphSnapshot {
+        self.ask();
+        self.graph.clone()
+    }
+
+    fn ask(&mut self) {
+        let graph = self
+            .agent
+            .get_within::<TopicList<'_>>("/topics?hidden=true", GRAPH_TIMEOUT);
+        let participants = self
+            .agent
+            .get_within::<ParticipantList<'_>>("/participants", GRAPH_TIMEOUT);
+        let (Ok(graph), Ok(participants)) = (graph, participants) else {
+            return;
+        };
+        self.known = by_name(&graph.topics, self.domain_id);
+        self.graph = GraphSnapshot::answered(&graph.topics, participants.unknown_writers);
+        self.at = Some(Instant::now());
+    }
+}
+
+/// What is behind the lock is whole at any moment.
+pub(super) fn locked<'l, 'a>(
+    graph_cache: &'l Mutex<GraphCache<'a>>,
+) -> MutexGuard<'l, GraphCache<'a>> {
+    graph_cache.lock().unwrap_or_else(PoisonError::into_inner)
+}

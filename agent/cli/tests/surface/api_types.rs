@@ -1,0 +1,167 @@
+//! Each answer of the API reads as its type of `ros2probe_api`, which writes the same JSON again.
+//! Bodies of requests are written by their types.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use crate::page::{self, Lines};
+use crate::{read_as, rp};
+use ros2probe_api::health::Reloaded;
+use ros2probe_api::messages::{self, Definition};
+use ros2probe_api::problem::{Code, Problem};
+use ros2probe_api::recordings::{
+    FilterOptions, Recording, RecordingFiles, RecordingList, RecordingRequest, RecordingState,
+};
+use ros2probe_api::snapshots::{SnapshotList, WrittenSnapshot};
+use ros2probe_api::watches::{Watch, WatchRequest};
+use ros2probe_api::{live, samples};
+use ros2probe_testing::local_agent::{LocalAgent, PATIENCE, ask};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+const CONFIGURATION: &str = "watch: [{topic: '/**', retain: last}]\n";
+
+/// Asks with a typed body for a typed answer of this status.
+fn asked<T: DeserializeOwned + Serialize>(
+    agent: &LocalAgent,
+    method: &str,
+    path: &str,
+    body: impl Serialize,
+    status: u16,
+) -> T {
+    let body = serde_json::to_string(&body).unwrap();
+    let (answered, answer) = ask(agent.api, method, path, &body);
+    assert_eq!(answered, status, "{method} {path}: {answer}");
+    read_as(&answer)
+}
+
+fn get<T: DeserializeOwned + Serialize>(agent: &LocalAgent, path: &str) -> T {
+    asked(agent, "GET", path, (), 200)
+}
+
+/// A replay that goes on for longer than the test, with a place for bags.
+fn agent(capture: &str, configuration: &Path) -> LocalAgent {
+    let configuration = configuration.to_str().unwrap();
+    let arguments = ["--speed", "0.2", "--config", configuration];
+    let mut agent = LocalAgent::replay(&mut rp(), &page::data(capture), &arguments);
+    agent.wait_for_log("ready");
+    agent
+}
+
+#[test]
+fn answers_of_a_running_robot_read_as_their_types_and_write_the_same_again() {
+    for capture in [
+        "cyclonedds/points-besteffort-lossy-2ns",
+        "cyclonedds/samehost-any",
+    ] {
+        let directory = tempfile::tempdir().unwrap();
+        let file = directory.path().join("ros2probe.yaml");
+        let bags = directory.path().join("bags");
+        let text = format!(
+            "{CONFIGURATION}recordings:\n  directory: {}\n  reserve_percent: 0\n  \
+             reserve_bytes: 0\n  snapshots: [{{name: last, topics: ['/**'], seconds: 5}}]\n",
+            bags.display()
+        );
+        std::fs::write(&file, &text).unwrap();
+        let agent = agent(capture, &file);
+        recordings(&agent);
+        let topic = published(&agent);
+        streams(&agent, &topic);
+        let watch: Watch = asked(&agent, "POST", "/watch/new", WatchRequest::default(), 201);
+        assert_eq!(watch.topic, "/new");
+        reload(&agent, &file, &text);
+    }
+}
+
+fn recordings(agent: &LocalAgent) {
+    let request = RecordingRequest {
+        name: Some("drive".to_owned()),
+        topics: FilterOptions::everything(),
+        ..RecordingRequest::default()
+    };
+    let begun: Recording = asked(agent, "POST", "/recordings", &request, 201);
+    assert_eq!(begun.state, RecordingState::Recording);
+    assert_eq!((&*begun.name, &begun.topics), ("drive", &request.topics));
+    let deadline = Instant::now() + PATIENCE;
+    while get::<Recording>(agent, "/recordings/drive").report.messages == 0 {
+        assert!(Instant::now() < deadline, "nothing was recorded");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    let list: RecordingList = get(agent, "/recordings");
+    assert!(list.recordings.len() == 1 && list.directory.is_some());
+    let ended: Recording = asked(agent, "DELETE", "/recordings/drive", (), 200);
+    assert_eq!(ended.state, RecordingState::Ended);
+    assert!(ended.report.topics.values().any(|topic| topic.messages > 0));
+    let files: RecordingFiles = get(agent, "/recordings/drive/files");
+    assert!(files.files.iter().any(|file| file.file == "metadata.yaml"));
+    let written: WrittenSnapshot = asked(agent, "POST", "/snapshots/last", (), 201);
+    assert!(written.messages > 0);
+    let list: SnapshotList = get(agent, "/snapshots");
+    assert_eq!(
+        (&*list.snapshots[0].name, list.snapshots[0].written),
+        ("last", 1)
+    );
+}
+
+/// A topic of which messages come.
+fn published(agent: &LocalAgent) -> String {
+    let list: RecordingList = get(agent, "/recordings");
+    let topics = &list.recordings[0].report.topics;
+    let mut topics = topics.iter().filter(|(_, topic)| topic.messages > 1);
+    topics.next().unwrap().0.clone()
+}
+
+fn streams(agent: &LocalAgent, topic: &str) {
+    let open = |path: &str| Lines::open(agent.api, path, "").unwrap_or_else(|_| panic!("{path}"));
+    let mut stream = open("/live");
+    let line =
+        |(name, value): (String, Value)| Value::Object([(name, value)].into_iter().collect());
+    let lines = stream.batch().into_iter().chain(stream.batch());
+    let lines: Vec<live::Line<'_>> = lines.map(|each| read_as(&line(each))).collect();
+    assert!(matches!(lines.first(), Some(live::Line::Open(_))));
+    let is_graph = |line: &live::Line<'_>| matches!(line, live::Line::Graph(graph) if !graph.publishers.is_empty());
+    assert!(lines.iter().any(is_graph));
+    assert!(
+        lines
+            .iter()
+            .any(|line| matches!(line, live::Line::Findings(_)))
+    );
+
+    let known: Definition = get(agent, &format!("/topics{topic}/definition"));
+    let mut stream = open(&format!("/topics{topic}/messages"));
+    let mut has_type = false;
+    loop {
+        match read_as(&line(stream.next().unwrap())) {
+            messages::Line::Type(found) => {
+                has_type = true;
+                assert_eq!(found, known);
+            }
+            messages::Line::<messages::Message<Value>>::Message(message) => {
+                assert!(has_type && message.bytes > 0);
+                break;
+            }
+            messages::Line::End(end) => panic!("{end:?}"),
+            messages::Line::Missed(_) | messages::Line::Beat(_) => {}
+        }
+    }
+    let mut stream = open(&format!("/samples?topic={topic}"));
+    let mut has_sample = false;
+    while !has_sample {
+        let line: samples::Line = read_as(&line(stream.next().unwrap()));
+        has_sample = matches!(line, samples::Line::Sample(_));
+    }
+}
+
+fn reload(agent: &LocalAgent, file: &Path, text: &str) {
+    std::fs::write(file, format!("{text}limits: {{topics: 7}}\n")).unwrap();
+    let reloaded: Reloaded = asked(agent, "POST", "/-/reload", (), 200);
+    assert_eq!(
+        (reloaded.watches, &*reloaded.needs_restart),
+        (2, &["limits".into()][..])
+    );
+    std::fs::write(file, "watsch: []\n").unwrap();
+    let problem: Problem = asked(agent, "POST", "/-/reload", (), 422);
+    assert!(problem.kind.ends_with(Code::InvalidConfiguration.as_str()));
+    assert_eq!(problem.mistakes.len(), 1, "{problem:?}");
+}

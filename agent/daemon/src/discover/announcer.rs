@@ -1,0 +1,81 @@
+//! One builtin writer of a participant, and which of its announcements came.
+
+use std::collections::BTreeSet;
+use std::ops::RangeInclusive;
+
+use ros2probe_wire::EntityId;
+use ros2probe_wire::discovery::Role;
+use ros2probe_wire::record::Gap;
+
+use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
+
+/// Announcements of one kind believed to exist, whatever a HEARTBEAT says.
+pub(super) const MOST_ANNOUNCEMENTS: u64 = 4096;
+
+/// A writer of announcements, and what came of it.
+#[derive(Debug)]
+pub(super) struct Announcer {
+    pub(super) writer: EntityId,
+    pub(super) reader: EntityId,
+    pub(super) role: Role,
+    /// First and last number, by HEARTBEAT.
+    pub(super) there: Option<RangeInclusive<u64>>,
+    pub(super) came: BTreeSet<u64>,
+    /// Asked for last.
+    wanted: BTreeSet<u64>,
+}
+
+impl Announcer {
+    pub(super) const fn of(role: Role) -> Self {
+        let (writer, reader) = match role {
+            Role::Writer => (EntityId::SEDP_PUBLICATIONS_WRITER, PUBLICATIONS_READER),
+            Role::Reader => (EntityId::SEDP_SUBSCRIPTIONS_WRITER, SUBSCRIPTIONS_READER),
+        };
+        Self {
+            writer,
+            reader,
+            role,
+            there: None,
+            came: BTreeSet::new(),
+            wanted: BTreeSet::new(),
+        }
+    }
+
+    /// Numbers that are there and have not come, lowest first.
+    pub(super) fn missing(&self) -> impl Iterator<Item = u64> + '_ {
+        let (first, last) = match &self.there {
+            Some(range) => (*range.start(), *range.end()),
+            None => (1, 0),
+        };
+        let first = first.max(1);
+        let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
+        (first..=last).filter(|number| !self.came.contains(number))
+    }
+
+    /// The next numbers to ask for, as many as one request holds.
+    pub(super) fn want(&mut self) -> BTreeSet<u64> {
+        let first = self.missing().next().unwrap_or(0);
+        let wanted: BTreeSet<_> = self
+            .missing()
+            .take_while(|number| number - first < MOST_NUMBERS)
+            .collect();
+        self.wanted.clone_from(&wanted);
+        wanted
+    }
+
+    /// Whether all that was asked for has come.
+    pub(super) fn has_come(&self) -> bool {
+        self.wanted.is_subset(&self.came)
+    }
+
+    /// A GAP: these will never come.
+    pub(super) fn skip(&mut self, gap: Gap<'_>) {
+        let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
+        let listed: BTreeSet<u64> = list.iter().collect();
+        let skipped: Vec<u64> = self
+            .missing()
+            .filter(|number| irrelevant.contains(number) || listed.contains(number))
+            .collect();
+        self.came.extend(skipped);
+    }
+}

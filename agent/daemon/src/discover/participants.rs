@@ -1,0 +1,144 @@
+//! Participants that announce themselves, found by listening as the agent does. Nothing is sent.
+
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use ros2probe_capture::live::LiveSource;
+use ros2probe_capture::reassembly::Limits;
+use ros2probe_model::discovery::hexadecimal;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+use ros2probe_wire::GuidPrefix;
+
+use super::Refusal;
+use super::session::Target;
+use crate::config::{CaptureSettings, ShmMode, SourceChoice};
+use crate::privilege;
+
+/// The polling period while listening.
+const POLL_INTERVAL: Duration = Duration::from_millis(250);
+
+/// Where and for how long to listen, and for which participants.
+#[derive(Clone, Debug)]
+pub struct Listening {
+    /// The wire of this interface instead of the configured sources.
+    pub interface: Option<String>,
+    /// The domain; `None` = any.
+    pub domain_id: Option<u32>,
+    /// The participant, whose first announcement ends the listening; `None` = any.
+    pub participant: Option<GuidPrefix>,
+    /// How long to listen.
+    pub time: Duration,
+}
+
+/// A participant that announced itself.
+#[derive(Clone, Debug)]
+pub struct HeardParticipant {
+    /// The participant's GUID prefix.
+    pub prefix: GuidPrefix,
+    /// Domain.
+    pub domain_id: u32,
+    /// Implementation of DDS.
+    pub vendor: String,
+    /// Name of its process, if it is known.
+    pub process: Option<String>,
+    /// Id of its process, if it is known.
+    pub process_id: Option<u32>,
+    /// Host, if it is known.
+    pub host: Option<String>,
+    /// How to ask it, or why it is not asked.
+    pub target: Result<Target, Refusal>,
+}
+
+/// Opens the configured sources, gives up the privileges of this thread, and listens.
+///
+/// # Errors
+/// Returns [`privilege::Missing`] if a capability is missing, or why a source cannot be opened or
+/// read.
+pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<HeardParticipant>> {
+    let capture = capture(configured, listening.interface.as_deref());
+    privilege::check(&capture)?;
+    let mut live = LiveSource::open(&capture, Limits::default())?;
+    privilege::give_up(privilege::Role::capture())?;
+    let mut observer = Observer::new(Settings::default());
+    let end = Instant::now() + listening.time;
+    let is_meant = |participant: &ParticipantFacts| {
+        let (domain_id, prefix) = (participant.domain_id.0, participant.guid.prefix);
+        listening.domain_id.is_none_or(|it| it == domain_id)
+            && listening.participant.is_none_or(|it| it == prefix)
+    };
+    loop {
+        let left = end.saturating_duration_since(Instant::now());
+        live.poll(left.min(POLL_INTERVAL), None, &mut observer)?;
+        observer.input(Input::Time(live.clock()));
+        live.apply(&observer.drain().interest);
+        let mut heard = observer.snapshot(live.clock()).participants;
+        heard.retain(is_meant);
+        let is_found = listening.participant.is_some() && !heard.is_empty();
+        if left.is_zero() || is_found {
+            return Ok(heard.iter().map(HeardParticipant::of).collect());
+        }
+    }
+}
+
+/// Reads a GUID prefix of 24 hexadecimal digits. The `participant` label of metrics adds the entity
+/// id of a participant, which may stay.
+#[must_use]
+pub fn prefix(text: &str) -> Option<GuidPrefix> {
+    let text = text.strip_suffix(".000001c1").unwrap_or(text);
+    hexadecimal(text).map(GuidPrefix)
+}
+
+impl HeardParticipant {
+    fn of(facts: &ParticipantFacts) -> Self {
+        let ProcessFacts { name, id, host, .. } = &facts.process;
+        Self {
+            prefix: facts.guid.prefix,
+            domain_id: facts.domain_id.0,
+            vendor: facts.vendor.to_string(),
+            process: name.as_deref().map(str::to_owned),
+            process_id: *id,
+            host: host.as_deref().map(str::to_owned),
+            target: Target::of(facts),
+        }
+    }
+}
+
+/// The configured capture, or the wire of one interface.
+fn capture(mut configured: CaptureSettings, interface: Option<&str>) -> CaptureSettings {
+    // Participants announce themselves on the network.
+    configured.shm.mode = ShmMode::Off;
+    let Some(interface) = interface else {
+        return configured;
+    };
+    CaptureSettings {
+        source: SourceChoice::Wire,
+        cgroup: None,
+        mirror_interfaces: Vec::new(),
+        include_interfaces: vec![interface.to_owned()],
+        exclude_interfaces: Vec::new(),
+        ..configured
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_participant_is_named_as_the_metrics_name_it() {
+        let digits = "010f1a2b3c4d5e6f00000000";
+        assert_eq!(prefix(digits).unwrap().to_string(), digits);
+        assert_eq!(prefix(&format!("{digits}.000001c1")), prefix(digits));
+        for wrong in [
+            "",
+            "010f",
+            "all",
+            &digits[1..],
+            &format!("{digits}.00000103"),
+        ] {
+            assert!(prefix(wrong).is_none(), "{wrong}");
+        }
+    }
+}

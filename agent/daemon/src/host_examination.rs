@@ -1,0 +1,69 @@
+//! What `rp doctor` examines of this host with the code that captures, without an agent.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+
+use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
+use ros2probe_capture::error_chain::in_words;
+pub use ros2probe_capture::system::ClockState;
+use ros2probe_capture::system::clock_state;
+use ros2probe_capture::uprobe;
+use rustix::thread::CapabilitySet;
+
+/// The cgroup v2 hierarchy as this process sees it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CgroupHierarchy {
+    /// None is mounted.
+    NotMounted,
+    /// That of the whole host, at this mount point.
+    WholeHost(PathBuf),
+    /// A part of it, as containers have.
+    Part(PathBuf),
+    /// It cannot be opened, for this reason.
+    Unopened(PathBuf, String),
+    /// The mount point is no cgroup, for this reason.
+    Invalid(PathBuf, String),
+}
+
+impl CgroupHierarchy {
+    /// Finds the hierarchy in `mounts`, the content of `/proc/self/mountinfo`. `at` maps an absolute
+    /// path to the file to open.
+    #[must_use]
+    pub fn find(mounts: &[u8], at: impl Fn(&Path) -> PathBuf) -> Self {
+        let Some(point) = topmost(mounts) else {
+            return Self::NotMounted;
+        };
+        match Cgroup::open(&at(&point)) {
+            Ok(group) if group.is_whole_host() => Self::WholeHost(point),
+            Ok(_) => Self::Part(point),
+            Err(CgroupError::Open { source, .. }) => Self::Unopened(point, source.to_string()),
+            Err(error) => Self::Invalid(point, error.to_string()),
+        }
+    }
+}
+
+/// Reads the state of the kernel's clock.
+///
+/// # Errors
+/// Returns the kernel's reason if it refuses.
+pub fn clock() -> Result<ClockState, String> {
+    clock_state().map_err(|error| error.to_string())
+}
+
+/// Names of the capabilities that exact mode (`capture.shm.exact`) needs and `effective` lacks.
+#[must_use]
+pub fn exact_mode_lacks(effective: CapabilitySet) -> Vec<&'static str> {
+    uprobe::lacking(effective)
+}
+
+/// Whether a file of this name is the library of Fast DDS.
+#[must_use]
+pub fn is_fast_dds(name: &str) -> bool {
+    uprobe::processes::is_library(name)
+}
+
+/// An error and its causes in one line; of a verifier's log, the first line.
+#[must_use]
+pub fn error_in_words(error: &dyn Error) -> String {
+    in_words(error)
+}
