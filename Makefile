@@ -37,9 +37,10 @@ demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (n
 	cargo build --package ros2probe --bin rp --example robot --example demo
 	@$(SUDO) $(TARGET)/debug/examples/demo $(if $(DEMO_SECONDS),--seconds $(DEMO_SECONDS))
 
-test: ## format, lints, kernel object, and all tests with real DDS participants (needs root)
+test: ## format, spelling, lints, kernel object, and all tests with real DDS participants (needs root)
 	@.ci/prerequisites.sh test
 	cargo fmt --all --check
+	typos
 	cargo clippy --workspace --all-targets -- -D warnings
 	NIGHTLY=$$(.ci/prerequisites.sh --nightly) agent-ebpf/build.sh --check
 	@$(MAKE) --no-print-directory page

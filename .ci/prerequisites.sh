@@ -236,6 +236,13 @@ nextest() {
     cargo install cargo-nextest --version 0.9.151 --locked --debug --no-default-features --features default-no-update
 }
 
+# Checks the spelling of all files, with the exceptions in _typos.toml.
+spelling() {
+    [ "$(typos --version 2>/dev/null)" = "typos-cli 1.52.0" ] && return
+    say "installing typos-cli 1.52.0"
+    cargo install typos-cli --version 1.52.0 --locked --debug
+}
+
 # No package source has ROS 2 Humble for Debian 12: an archive with its own script installs it.
 ros2() {
     [ -e /opt/ros/humble/env.sh ] && return
@@ -349,6 +356,7 @@ for need; do
         page
         rust
         nextest
+        spelling
         musl aarch64
         qemu
         debian

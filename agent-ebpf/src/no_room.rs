@@ -2,8 +2,8 @@
 //!
 //! Directly before, on the same CPU and for the same socket, the host hook has read the datagram
 //! and stored what it found. So this module parses nothing and works alike on every kernel. Where
-//! the kernel's types are known it compares the socket, so a datagram that the hook has not seen
-//! (other traffic, a socket outside the hook's cgroup) is never mistaken for another.
+//! the kernel's types are known it compares the socket. So it never mistakes a datagram that the
+//! hook has not seen (other traffic, a socket outside the hook's cgroup) for another.
 //!
 //! Before Linux 6.6 the kernel reports a full buffer for IPv4 only. There this module watches
 //! packets being freed and recognizes the one that the hook has just seen.

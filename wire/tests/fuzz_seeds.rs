@@ -1,6 +1,6 @@
-//! The fuzz targets' entry functions over their seeds and all truncations of them, so that what
-//! fuzzing checks is also checked where there is no fuzzer. Of the seeds, `found-*` are what fuzzing
-//! came upon: kept for what they reach, and taken as they are.
+//! Runs the fuzz targets' entry functions over their seeds and all truncations of them, so that
+//! their checks run without a fuzzer. Of the seeds, `found-*` are what fuzzing came upon: kept for
+//! what they reach, and taken as they are.
 
 #![expect(
     clippy::unwrap_used,

@@ -1,9 +1,8 @@
 //! One MCAP file during writing: chunks, indexes, summary.
 //!
 //! Records have the order of rosbag2's files. A file grows by whole pieces only: an incomplete
-//! write is cut off again. Before a piece is written, space is reserved for it and for the summary,
-//! so that a full disk is noticed while the file can still be completed. Knows only the channels of
-//! topics.
+//! write is cut off again. Before a piece is written, space is reserved for it and for the summary:
+//! a full disk is noticed while the file can still be completed. Knows only the channels of topics.
 
 use std::collections::BTreeMap;
 use std::fs::File;

@@ -1,6 +1,6 @@
 //! CPU time of the kernel filter per datagram, by verdict, and of the same walk in user space. The
 //! kernel measures it (BPF_PROG_TEST_RUN). A datagram of many IP fragments runs the program once
-//! per fragment, as on a link of MTU 1500, and every run counts about 25 ns too many. Needs root.
+//! per fragment, as on a link of MTU 1500. Every run counts about 25 ns too many. Needs root.
 
 #![expect(
     clippy::unwrap_used,

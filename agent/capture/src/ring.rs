@@ -169,8 +169,8 @@ impl Ring {
         )?;
         let memory = Mapping::new(&socket, block_size * settings.blocks)?;
         // SAFETY: as many blocks are mapped from the start of a page, in whole pages each, until
-        // the mapping is dropped, which happens after `turns` is dropped. The other side is the
-        // kernel, which follows the TPACKET_V3 protocol.
+        // the mapping is dropped; `turns` is dropped before it. The other side is the kernel, which
+        // follows the TPACKET_V3 protocol.
         let turns = unsafe { Turns::new(memory.start.cast(), block_size, settings.blocks) };
         let ring = Self {
             turns,

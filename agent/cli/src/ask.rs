@@ -95,7 +95,7 @@ fn ask(target: &Target, domain_id: u32, options: &Discover, out: &mut impl Write
     if options.dry_run {
         return Ok(true);
     }
-    // What will be sent is said before it is sent.
+    // The plan is printed before anything is sent.
     out.flush()?;
     let took = converse(&mut session, &socket).context("the goodbye may not have been sent")?;
     report(&session, took, out)

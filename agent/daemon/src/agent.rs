@@ -191,26 +191,12 @@ pub fn run(options: Options) -> Result<()> {
     let (configured, file) = configuration(options.config.as_deref())?;
     let config = overridden(&configured, &options);
     let log = Log::start(config.log);
-    let export = otlp::Settings::resolve(
-        &config.otlp,
-        &|name| std::env::var(name).ok(),
-        &Host::read(),
-    )?;
+    let export = export(&config)?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
-    let sources = MetricSources {
-        lost_lines: log.lost_lines(),
-        ..MetricSources::new(source.kind(), Settings::new(&config))
-    };
-    let watches = Watches::new(
-        Arc::clone(&sources.limits),
-        Arc::clone(&sources.events),
-        Arc::clone(&sources.settings),
-        Arc::clone(sources.latest.bell()),
-        config.watches.clone(),
-        options.watch,
-    );
-    let watches = Arc::new(watches.context("the watchlist is unusable")?);
+    let mut sources = MetricSources::new(source.kind(), Settings::new(&config));
+    sources.lost_lines = log.lost_lines();
+    let watches = watches(&config, options.watch, &sources)?;
     let (server, mut control) = listeners(&config, &sources)?;
     // A replay is a person's own command, which reads and writes that person's files.
     if matches!(source, Source::Live(_)) {
@@ -222,7 +208,7 @@ pub fn run(options: Options) -> Result<()> {
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
-    let exporter = export.map(|settings| Exporter::start(settings, &sources, Arc::clone(&spans)));
+    let exporter = export.map(|export| Exporter::start(export, &sources, Arc::clone(&spans)));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, &watches);
@@ -242,15 +228,8 @@ pub fn run(options: Options) -> Result<()> {
             .context("cannot start the threads that keep state")?,
         recordings,
         library: library(),
-        // Only clients of the API read the history.
-        history: match control.is_empty() {
-            true => Duration::ZERO,
-            false => config.history,
-        },
-        addresses: match config.api.page {
-            PageChoice::On => control.addresses().collect(),
-            PageChoice::Off => Vec::new(),
-        },
+        history: history(&config, &control),
+        addresses: page_addresses(&config, &control),
         stop: stop.clone(),
     };
     let agent = components.assemble().context("recordings.snapshots")?;
@@ -303,6 +282,41 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         options.report,
     );
     config
+}
+
+/// What is exported, by the configuration and the environment.
+fn export(config: &Config) -> Result<Option<otlp::Settings>, otlp::SettingsError> {
+    let variable = |name: &str| std::env::var(name).ok();
+    otlp::Settings::resolve(&config.otlp, &variable, &Host::read())
+}
+
+/// The watches of the configuration and of the command line.
+fn watches(config: &Config, given: Vec<Watch>, sources: &MetricSources) -> Result<Arc<Watches>> {
+    let watches = Watches::new(
+        Arc::clone(&sources.limits),
+        Arc::clone(&sources.events),
+        Arc::clone(&sources.settings),
+        Arc::clone(sources.latest.bell()),
+        config.watches.clone(),
+        given,
+    );
+    Ok(Arc::new(watches.context("the watchlist is unusable")?))
+}
+
+/// How long figures are kept: only clients of the API read them.
+fn history(config: &Config, control: &api::Server) -> Duration {
+    match control.is_empty() {
+        true => Duration::ZERO,
+        false => config.history,
+    }
+}
+
+/// Where the page is served.
+fn page_addresses(config: &Config, control: &api::Server) -> Vec<SocketAddr> {
+    match config.api.page {
+        PageChoice::On => control.addresses().collect(),
+        PageChoice::Off => Vec::new(),
+    }
 }
 
 /// Starts the threads of the source and the working thread, which keep their privileges.

@@ -1,5 +1,5 @@
 //! What the agent knows about itself at one moment: filled by the capture thread, read by the
-//! surfaces. Plain numbers; whoever fills them decides what they cost.
+//! surfaces. Plain numbers, collected where they are counted.
 
 use std::time::Instant;
 
@@ -32,7 +32,7 @@ pub struct AgentFacts {
     pub finished: bool,
     /// When the capture that is replayed begins, in its own time.
     pub capture_begin: Option<Timestamp>,
-    /// Which part of the capture's file was read, 0 to 1; `None` where that cannot be told.
+    /// Which part of the capture's file was read, 0 to 1; `None` if that is unknown.
     pub replayed: Option<f64>,
     /// Packets of a capture whose link layer cannot be read, by the layer's number.
     pub unsupported_packets: Vec<(u16, u64)>,

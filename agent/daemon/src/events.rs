@@ -7,7 +7,7 @@
 //! that a capture gives the same events at any speed.
 //!
 //! A number belongs to one run of the agent. Written out, an id names the run too, so that after a
-//! restart nobody mistakes an old position for a new one.
+//! restart an old position is not taken for a new one.
 
 mod record;
 mod self_monitor;
@@ -126,7 +126,7 @@ impl EventLog {
     }
 
     /// Records what the model noticed until `clock`, the source's. Called with nothing too, so that a
-    /// storm's end is told.
+    /// storm's end is recorded.
     pub fn add(&self, taken: Taken, clock: Timestamp) {
         let mut log = self.log();
         let before = log.last;

@@ -1,7 +1,7 @@
 //! Files that others name, or leave in a directory: opened without waiting for them.
 //!
 //! Opening a pipe without a writer waits for ever, and so may reading a device. What is no regular
-//! file is refused. It is asked of the open file, so nobody can exchange it in between.
+//! file is refused. The open file is checked, so it cannot be exchanged in between.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, Read as _};

@@ -79,8 +79,8 @@ impl LimitFigures {
         &self.caps
     }
 
-    /// As many slots as `limit` allows, to whoever hands them out: a listener of several has its
-    /// own, so that who fills one does not lock the others.
+    /// As many slots as `limit` allows. Each of several listeners has its own slots, so that a full
+    /// listener does not lock the others.
     #[must_use]
     pub fn slots(&self, limit: Limit) -> Arc<Slots> {
         let slots = Arc::new(Slots {

@@ -1,5 +1,5 @@
 //! Where state is kept, as the configuration or the service manager says, and what was found there.
-//! Whatever is wrong with it is said in the log: an agent without memory still observes.
+//! Problems go to the log: an agent without memory still observes.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -67,8 +67,8 @@ pub(crate) fn load(directory: &StateDirectory) -> (Option<Memory>, bool) {
             tracing::info!(%path, "the state is from another boot and is ignored");
             None
         }
-        Loaded::Unusable { reason, aside } => {
-            let aside = aside.map(|aside| aside.display().to_string());
+        Loaded::Unusable { reason, moved_to } => {
+            let aside = moved_to.map(|path| path.display().to_string());
             tracing::warn!(%path, reason, aside, "the state cannot be used");
             None
         }
@@ -123,8 +123,8 @@ fn load_watches(directory: &StateDirectory) -> Option<Vec<Watch>> {
                 added");
             watches
         }
-        LoadedWatches::Unusable { reason, aside } => {
-            let aside = aside.map(|aside| aside.display().to_string());
+        LoadedWatches::Unusable { reason, moved_to } => {
+            let aside = moved_to.map(|path| path.display().to_string());
             tracing::warn!(%path, reason, aside, "the saved watches cannot be used");
             Vec::new()
         }

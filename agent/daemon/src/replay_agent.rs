@@ -49,7 +49,7 @@ pub struct ReplayOptions {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pace {
     /// It has ended before the first request.
-    Whole,
+    ToEnd,
     /// It pauses until [`ReplayAgent::resume`].
     Pause,
     /// It goes on at this speed.
@@ -186,12 +186,12 @@ fn open(
     };
     let speed = match options.pace {
         Pace::Live(speed) => speed,
-        Pace::Whole | Pace::Pause => Speed::Max,
+        Pace::ToEnd | Pace::Pause => Speed::Max,
     };
     let replay = Replay::open(capture, speed, limits).map_err(ReplayError::Capture)?;
     let replay = replay.until(options.until);
     Ok(match options.pace {
-        Pace::Whole => (replay, None),
+        Pace::ToEnd => (replay, None),
         Pace::Live(_) => (replay.quiet(), None),
         Pace::Pause => {
             let (pause, control) = pause_at(options.from);

@@ -73,7 +73,7 @@ pub enum StateError {
 pub enum Loaded {
     /// No file.
     Nothing,
-    /// Of another boot of this host: whoever used these GUIDs then is gone or on another host, and
+    /// Of another boot of this host. The participants of these GUIDs are gone or on another host, and
     /// process ids, which Fast DDS makes GUIDs of, come again.
     AnotherBoot,
     /// Everybody that was there.
@@ -85,7 +85,7 @@ pub enum Loaded {
         /// Why.
         reason: String,
         /// Where it lies, if it could be moved.
-        aside: Option<PathBuf>,
+        moved_to: Option<PathBuf>,
     },
 }
 
@@ -125,7 +125,7 @@ pub(crate) enum Found<T> {
         /// Why.
         reason: String,
         /// Where it lies, if it could be moved.
-        aside: Option<PathBuf>,
+        moved_to: Option<PathBuf>,
     },
 }
 
@@ -217,7 +217,7 @@ impl StateDirectory {
             Found::Newer(newer) => Loaded::Newer(newer),
             Found::This(document) if document.boot != boot() => Loaded::AnotherBoot,
             Found::This(document) => Loaded::Known(document.memory),
-            Found::Unusable { reason, aside } => Loaded::Unusable { reason, aside },
+            Found::Unusable { reason, moved_to } => Loaded::Unusable { reason, moved_to },
         }
     }
 
@@ -267,7 +267,7 @@ impl StateDirectory {
         let moved = fs::rename(self.path.join(file), &aside);
         Found::Unusable {
             reason,
-            aside: moved.is_ok().then_some(aside),
+            moved_to: moved.is_ok().then_some(aside),
         }
     }
 
@@ -279,7 +279,7 @@ impl StateDirectory {
             self.directory.sync_all()
         });
         if written.is_err() {
-            // Half a file helps nobody, least of all on a full disk.
+            // Half a file is of no use, least of all on a full disk.
             let _ = fs::remove_file(&new);
         }
         written

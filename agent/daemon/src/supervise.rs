@@ -338,7 +338,7 @@ impl Worker {
     }
 
     fn begin(self, run: Run) -> Working {
-        // Nobody takes it when the thread has died, which is what is heard next.
+        // A dead thread takes nothing; the next wait reports its death.
         let _ = self.begin.send(run);
         Working {
             thread: self.thread,

@@ -2,7 +2,7 @@
 //! add and remove while the agent runs.
 //!
 //! One entry for each pattern and domain; the configuration's comes first. The capture thread is
-//! handed the merged list in a slot that holds the latest one and is woken; nobody waits for it.
+//! handed the merged list in a slot that holds the latest one, and is woken. No thread waits for it.
 
 mod persistence;
 

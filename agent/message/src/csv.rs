@@ -4,9 +4,9 @@
 //! A comma only follows a value: empty values at the beginning of a message or an array leave no
 //! trace. This is the original's format, which its users parse.
 
-use super::python;
-use super::truncation::Truncation;
-use super::value::{Array, Items, Message, Scalar, Value};
+use crate::python;
+use crate::truncation::Truncation;
+use crate::value::{Array, Items, Message, Scalar, Value};
 
 /// Returns the line without its line break.
 pub fn line(message: &Message<'_>, shown: &Truncation) -> String {

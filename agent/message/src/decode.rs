@@ -11,8 +11,8 @@ use std::borrow::Cow;
 
 use ros2probe_wire::cursor::{Cursor, Endianness, Reason, WireError};
 
-use super::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
-use super::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
+use crate::definition::{Element, Field, MessageType, Shape, Structure, TypeName};
+use crate::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
 /// Every XCDR structure is aligned relative to the first byte behind this.
 const ENCAPSULATION: usize = 4;

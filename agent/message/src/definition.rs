@@ -4,13 +4,17 @@
 //! than [`MAX_DEPTH`], so code that walks it needs no checks. Defaults and constants are kept only
 //! in the text: they are neither on the wire nor part of the type hash.
 
+mod idl;
+mod implicit_types;
+pub(crate) mod parse;
+pub(crate) mod schema;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 
-use super::idl;
-use super::implicit_types::implicit_types;
-pub use super::name::{Kind, NotATypeName, TypeName};
-use super::parse::{self, ParseError};
+pub use crate::name::{Kind, NotATypeName, TypeName};
+use implicit_types::implicit_types;
+use parse::ParseError;
 
 /// Deepest nesting of types.
 pub const MAX_DEPTH: usize = 32;
@@ -174,7 +178,7 @@ impl MessageType {
     /// nested types, each below a line of 80 `=` and a line `MSG: package/Type`.
     pub fn parse(root: &TypeName, text: &str) -> Result<Self, SchemaError> {
         let mut definitions = HashMap::new();
-        for (name, part) in super::schema::parts(root, text)? {
+        for (name, part) in crate::definition::schema::parts(root, text)? {
             let definition = Definition::parse(name.clone(), part)
                 .map_err(|error| SchemaError::Definition(name.clone(), error))?;
             if definitions.len() == MAX_TYPES {

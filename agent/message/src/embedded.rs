@@ -3,8 +3,8 @@
 //! Plain text, one file per package; `embedded/README.md` names their origin, licences and format.
 //! A definition is parsed only on request.
 
-use super::definition::{Kind, TypeName};
-use super::dialect::Dialect;
+use crate::definition::{Kind, TypeName};
+use crate::dialect::Dialect;
 
 /// Prefix of a definition's heading.
 const HEADING: &str = "== ";
@@ -139,9 +139,9 @@ fn definitions(text: &'static str) -> impl Iterator<Item = Embedded> {
 mod tests {
     use std::collections::{BTreeMap, BTreeSet};
 
-    use super::super::definition::Definition;
-    use super::super::{Library, NotFound, Sources};
     use super::*;
+    use crate::definition::Definition;
+    use crate::{Library, NotFound, Sources};
 
     const HASHES: &str = include_str!("../../testing/data/message/type_hashes.txt");
     const ANNOUNCED: &str = include_str!("../../testing/data/message/announced.txt");

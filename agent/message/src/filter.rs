@@ -1,7 +1,7 @@
 //! Conditions on messages: a subset of Python's expressions over `m`, for `--filter`.
 //!
 //! Supports attributes, indices, numbers, strings, comparisons (also chained), `in`, `and`, `or`,
-//! `not`, arithmetic, lists, and the functions `abs`, `all`, `any`, `bool`, `float`, `int`, `len`,
+//! `not`, arithmetic, and lists. Functions: `abs`, `all`, `any`, `bool`, `float`, `int`, `len`,
 //! `max`, `min`, `str` and `sum`. Assignments, definitions, imports and loops do not exist: an
 //! expression terminates, needs little memory, and changes nothing.
 

@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 
 use sha2::{Digest as _, Sha256};
 
-use super::definition::{Element, MessageType, Shape, Structure};
+use crate::definition::{Element, MessageType, Shape, Structure};
 
 /// `type_description_interfaces/msg/FieldType`: offset of an array type's number from its
 /// element's.

@@ -1,7 +1,7 @@
 //! ROS messages without ROS: definitions of types, their hashes, and the text of a payload.
 //!
-//! - [`Library`] finds the definition of a type in directories, in an installed ROS or among the
-//!   embedded ones, by name and announced hash, and returns a [`MessageType`].
+//! - [`Library`] finds a type's definition by name and announced hash, in directories, an installed
+//!   ROS or the embedded definitions, and returns a [`MessageType`].
 //! - [`decode()`] decodes a CDR payload of that type into a [`Value`] tree that borrows from it.
 //! - [`yaml`], [`csv`] and [`python`] print values as `ros2 topic echo` prints them; [`Truncation`]
 //!   limits their length. [`filter`] evaluates an expression over a message.
@@ -27,31 +27,24 @@
 pub mod csv;
 pub mod decode;
 pub mod definition;
-mod definition_source;
 mod dialect;
 mod digits;
 mod embedded;
 pub mod filter;
 mod hash;
-mod idl;
-mod implicit_types;
 pub mod library;
 mod name;
-mod numpy;
-mod parse;
 pub mod python;
-mod schema;
-mod search;
 pub mod truncation;
 pub mod value;
 pub mod yaml;
 
 pub use decode::{DecodeError, Decoded, Limits, decode};
+pub use definition::parse::{ParseError, Problem};
 pub use definition::{
     Definition, Element, Field, Kind, MessageType, NotClosed, Shape, Structure, TypeName,
 };
 pub use dialect::Dialect;
 pub use library::{Library, NotFound, Sources};
-pub use parse::{ParseError, Problem};
 pub use truncation::Truncation;
 pub use value::{Array, Items, Message, Scalar, Value};

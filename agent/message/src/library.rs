@@ -3,17 +3,20 @@
 //! Two machines may have different definitions of one name. If discovery announces a type's hash,
 //! the definition must match it, whichever source has it; a mismatching one is never used.
 
+mod definition_source;
+mod search;
+
 use std::collections::HashMap;
 use std::ffi::OsStr;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use super::definition::{MessageType, NotClosed, TypeName};
-use super::definition_source::DefinitionSource;
-use super::dialect::Dialect;
-use super::parse::ParseError;
-use super::search::Search;
+use crate::definition::parse::ParseError;
+use crate::definition::{MessageType, NotClosed, TypeName};
+use crate::dialect::Dialect;
+use crate::library::definition_source::DefinitionSource;
+use crate::library::search::Search;
 
 /// Directory of ROS installations, one subdirectory per distribution.
 const INSTALLED: &str = "/opt/ros";
@@ -248,8 +251,8 @@ mod tests {
 
     use tempfile::TempDir;
 
-    use super::super::parse::MAX_TEXT;
     use super::*;
+    use crate::definition::parse::MAX_TEXT;
 
     /// An installed ROS with these files: path `a/msg/B.msg` and text.
     fn prefix(files: &[(&str, &str)]) -> TempDir {

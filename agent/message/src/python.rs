@@ -3,12 +3,13 @@
 //! ROS keeps arrays of a fixed length in numpy arrays, sequences of numbers in `array.array` and
 //! everything else in lists; each has its own format.
 
+mod numpy;
+
 use std::fmt::{LowerExp, Write as _};
 use std::str::FromStr;
 
-use super::digits;
-use super::numpy;
-use super::value::{Array, Items, Message, Scalar, ScalarKind, Value};
+use crate::digits;
+use crate::value::{Array, Items, Message, Scalar, ScalarKind, Value};
 
 /// Returns `str()` of a value: the output of `--field` unless it selects a message.
 pub fn str(value: &Value<'_>) -> String {

@@ -1,8 +1,8 @@
 //! Truncation of messages: the options shared by all outputs of `echo`, and the text in place of
 //! omitted values (`rosidl_runtime_py`'s).
 
-use super::definition::{Element, Shape};
-use super::value::Array;
+use crate::definition::{Element, Shape};
+use crate::value::Array;
 
 /// Limits of the printed arrays and strings.
 #[derive(Debug, Clone, Copy, Default)]

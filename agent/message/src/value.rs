@@ -7,7 +7,7 @@ use std::borrow::Cow;
 
 use ros2probe_wire::cursor::Endianness;
 
-use super::definition::{Element, Field, Shape, Structure};
+use crate::definition::{Element, Field, Shape, Structure};
 
 /// Value of a field.
 #[derive(Debug, Clone, PartialEq)]

@@ -8,9 +8,9 @@ use std::sync::LazyLock;
 
 use regex::Regex;
 
-use super::python;
-use super::truncation::Truncation;
-use super::value::{Array, Items, Message, Scalar, Value};
+use crate::python;
+use crate::truncation::Truncation;
+use crate::value::{Array, Items, Message, Scalar, Value};
 
 /// Spaces per level.
 const STEP: usize = 2;

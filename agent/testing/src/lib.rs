@@ -1,9 +1,11 @@
 //! Shared code of the tests, benchmarks and examples of `ros2probe`; not shipped.
 //!
-//! [`harness`] starts agents and DDS peers in network namespaces, [`local_agent`] starts an agent
-//! on a capture without any privilege, [`forged`] sends RTPS that no real participant would, and
-//! [`model`] writes the same for a model in virtual time. If a tool is missing, these fail and name
-//! the package to install.
+//! - [`harness`] starts agents and DDS peers in network namespaces.
+//! - [`local_agent`] starts an agent on a capture without any privilege.
+//! - [`forged`] sends RTPS that no real participant would.
+//! - [`model`] writes the same for a model in virtual time.
+//!
+//! If a tool is missing, these fail and name the package to install.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

@@ -4,7 +4,7 @@
 //! their directories under `seeds`.
 //!
 //! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
-//! panics, no list exceeds its bound, nothing is kept that does not exist in the input, and the
+//! panics, no list exceeds its bound, and nothing is kept that does not exist in the input. The
 //! kernel filter's walk agrees with the oracle (`wire/tests/oracle`).
 
 use ros2probe_wire::discovery::{self, Discovery, Role};

@@ -1,8 +1,8 @@
 //! CPU allowance for listing directories and opening ports.
 //!
-//! A process that constantly creates and deletes files makes the tap list directories without end,
-//! and files that are not ports make it open them without end. Both wait when the allowance is used
-//! up. It reads no clock.
+//! A process that constantly creates and deletes files makes the tap list directories without end.
+//! Files that are not ports make it open them without end. Both wait when the allowance is used up.
+//! It reads no clock.
 
 /// Most CPU nanoseconds saved, so that a starting robot is found at once.
 pub const SAVINGS: u64 = 1_000_000_000;

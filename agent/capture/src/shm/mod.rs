@@ -1,9 +1,9 @@
 //! Traffic between processes of one host through Fast DDS's shared memory, read and never written.
 //!
 //! A separate thread polls the ports (see [`tap`]), so that its sleeps and process scans do not
-//! delay the capture, and the capture does not delay it. The view is sampled: messages overwritten
-//! before a poll are not seen, but sequence numbers show that they existed. The thread opens files
-//! for reading, takes no lock, registers nowhere and wakes no process.
+//! delay the capture, nor the capture its polls. The view is sampled: messages overwritten before a
+//! poll are not seen, but sequence numbers show that they existed. The thread opens files for
+//! reading, takes no lock, registers nowhere and wakes no process.
 
 pub mod cell;
 pub mod classifier;

@@ -1,7 +1,7 @@
 //! How long the tap sleeps between two polls.
 //!
-//! Waking up dominates the cost of a poll. So it polls again soon after finding many messages, ever
-//! more slowly after finding none, and extends every sleep until it stays within its share of a
+//! Waking up dominates the cost of a poll. So it polls again soon after finding many messages, and
+//! ever more slowly after finding none. It extends every sleep until it stays within its share of a
 //! CPU. It reads no clock.
 
 use std::time::Duration;

@@ -203,8 +203,8 @@ pub fn is_library(name: &str) -> bool {
     version.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
-/// Returns the holder of the lock in a line of [`LOCKS`], if it is of the kind that Fast DDS takes
-/// for its ports and segments.
+/// Returns the holder of the lock in a line of [`LOCKS`], if Fast DDS takes this kind for its ports
+/// and segments.
 fn holder(line: &str) -> Option<u32> {
     let mut fields = line.split_ascii_whitespace().skip(1);
     // An arrow precedes a lock that a process waits for.

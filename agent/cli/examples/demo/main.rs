@@ -1,7 +1,7 @@
 //! `make demo`: a robot and an operator's host in separate network namespaces, the agent on the
 //! robot, and a live summary of its metrics. The machine's own network is not touched. The metrics,
-//! the control API and the page are relayed to ports of this machine, so that `rp`, `curl` and a
-//! browser reach them as on a real host.
+//! the control API and the page are relayed to ports of this machine: `rp`, `curl` and a browser
+//! reach them as on a real host.
 //!
 //! It reads only `/metrics`, which is public.
 

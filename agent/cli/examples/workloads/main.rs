@@ -1,6 +1,6 @@
-//! `make bench`: the cost of observing. Each workload runs between two hosts without an observer,
-//! with the agent (host hook, then packet sockets), and with an additional Cyclone DDS subscriber
-//! in C++, in turns. The table shows CPU time and memory of the observer, and the total of all
+//! `make bench`: the cost of observing. Each workload runs between two hosts in turns: without an
+//! observer, with the agent (host hook, then packet sockets), and with an additional Cyclone DDS
+//! subscriber in C++. The table shows CPU time and memory of the observer, and the total of all
 //! processes.
 //!
 //! Before that it measures the agent's footprint (`footprint`) and the cost of open pages (`tabs`).

@@ -184,7 +184,7 @@ pub(crate) fn topic(agent: &Agent, domain_id: u32, name: &str) -> Result<Option<
 pub(crate) struct Types {
     library: Library,
     writers: HashMap<String, Option<Arc<MessageType>>>,
-    /// A type without a definition is said once.
+    /// A type without a definition is reported once.
     undefined: Vec<String>,
 }
 

@@ -5,7 +5,7 @@ use std::io;
 
 use tokio::signal::unix::{SignalKind, signal};
 
-/// What the original answers to Ctrl-C wherever nothing else is said.
+/// What the original answers to Ctrl-C by default.
 pub(crate) const INTERRUPTED: u8 = 2;
 
 /// From now on Ctrl-C ends the process with this code.

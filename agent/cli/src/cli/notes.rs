@@ -20,7 +20,7 @@ use super::shared::names_of;
 
 /// After so long without a message the reason is asked for.
 pub(crate) const SILENT: Duration = Duration::from_secs(5);
-/// Missing messages of a topic are told at most this often.
+/// Missing messages of a topic are reported at most this often.
 const PAUSE: Duration = Duration::from_secs(5);
 /// What being sampled means where messages are printed.
 pub(crate) const NOT_ALL_PRINTED: &str = "not every message is printed";

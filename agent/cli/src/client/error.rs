@@ -8,13 +8,13 @@ use ros2probe_api::problem::{Code, Problem, URN};
 /// Why there is no answer.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// Nobody listens on this host.
+    /// No agent listens on this host.
     #[error(
         "no agent is running here: start one with `sudo systemctl start ros2probe`, or in a \
          terminal with `sudo rp run`; to read a capture, use `--replay FILE`"
     )]
     NoAgent,
-    /// Somebody listens, but not for this user.
+    /// An agent listens, but not for this user.
     #[error(
         "the agent's socket {} is accessible only to root and the group ros2probe: `sudo usermod \
          -aG ros2probe $USER`, then log in again", path.display()
@@ -23,7 +23,7 @@ pub enum ClientError {
         /// The socket.
         path: PathBuf,
     },
-    /// Nobody answers where one was expected.
+    /// No agent answers where one was expected.
     #[error("no agent answers at {place}: {}", because(source))]
     Unreachable {
         /// Where.

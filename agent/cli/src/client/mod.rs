@@ -2,7 +2,7 @@
 //! address, on another robot by `--host` and a token. A capture is replayed into an agent within
 //! this process, which is asked the same way.
 //!
-//! It asks and decodes; what answers mean is said elsewhere. It never reads a clock for what it
+//! It asks and decodes; other modules know what answers mean. It never reads a clock for what it
 //! shows, and keeps nothing between requests.
 
 mod error;
@@ -60,7 +60,7 @@ impl Agent {
     /// # Errors
     /// There is none, its token cannot be read, or the capture cannot.
     pub fn reach(target: &Target) -> Result<Self, ClientError> {
-        Self::find(target, Pace::Whole, false)
+        Self::find(target, Pace::ToEnd, false)
     }
 
     /// As [`Self::reach`], but a capture is replayed only to `--from`, else not at all, and goes on
@@ -78,7 +78,7 @@ impl Agent {
     /// # Errors
     /// As [`Self::reach`].
     pub fn reach_measured(target: &Target, speed: Option<Speed>) -> Result<Self, ClientError> {
-        Self::find(target, speed.map_or(Pace::Whole, Pace::Live), true)
+        Self::find(target, speed.map_or(Pace::ToEnd, Pace::Live), true)
     }
 
     /// As [`Self::reach_stream`], but all topics of a capture are measured.

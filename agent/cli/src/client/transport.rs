@@ -101,14 +101,14 @@ impl Transport {
         match self {
             Self::Socket(path) => {
                 let stream = self.in_time(UnixStream::connect(path)).await?;
-                self.ask(stream, request).await
+                self.exchange(stream, request).await
             }
             Self::Address(address) => {
                 let stream = self.in_time(TcpStream::connect(address)).await?;
                 let _ = stream.set_nodelay(true);
-                self.ask(stream, request).await
+                self.exchange(stream, request).await
             }
-            Self::ReplayAgent(replayed) => self.ask(replayed.connect(), request).await,
+            Self::ReplayAgent(replayed) => self.exchange(replayed.connect(), request).await,
         }
     }
 
@@ -147,7 +147,7 @@ impl Transport {
         })
     }
 
-    async fn ask<S>(
+    async fn exchange<S>(
         &self,
         stream: S,
         request: Request<Full<Bytes>>,

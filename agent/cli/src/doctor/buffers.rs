@@ -31,7 +31,7 @@ const LARGE: u64 = 64 << 10;
 const USUAL: u64 = 4 * MEBIBYTE;
 const MESSAGES_IN_BUFFER: u64 = 2;
 const MESSAGES_IN_REASSEMBLY: u64 = 16;
-/// Lost messages out of which somebody should do something today.
+/// Share of lost messages that is a problem.
 const MANY: f64 = 0.01;
 /// Topics that are named.
 const NAMED: usize = 3;

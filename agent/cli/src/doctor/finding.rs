@@ -91,7 +91,7 @@ pub enum RemedyTarget {
     Command,
     /// The agent's configuration file.
     Configuration,
-    /// Settings of somebody else, which the comment names.
+    /// Settings of another program, which the comment names.
     Elsewhere,
 }
 

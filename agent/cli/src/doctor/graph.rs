@@ -1,5 +1,5 @@
 //! What the agent found, as far as it bears on what it can show: who is there, whose names are
-//! lacking, and which topics go by ways that nobody, or nobody whole, can see.
+//! lacking, and which topics use transports that cannot be observed, or only in part.
 
 use std::collections::BTreeMap;
 

@@ -1,7 +1,7 @@
 //! This host as far as checks look at it: files below a root, and what the kernel tells this process.
 //!
 //! Every file is read through [`Files`], bounded, so that a test can give a directory. Nothing is
-//! written and nobody is asked over a network.
+//! written and nothing is sent over a network.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};

@@ -1,7 +1,7 @@
 //! `rp doctor`: what this host will show and what not, and what to do about it.
 //!
 //! A module for each area gives findings; this one decides which areas there are to look at and in
-//! what order they are told. It looks and changes nothing; where no agent runs and it may, it loads
+//! what order they are reported. It looks and changes nothing; where no agent runs and it may, it loads
 //! the agent's kernel programs for a moment, since only a trial tells whether they can be had.
 
 pub mod agent;

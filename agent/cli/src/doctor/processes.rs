@@ -214,7 +214,7 @@ impl Processes {
         if groups.len() < 2 {
             return None;
         }
-        // The few are what somebody looks for: they come first.
+        // Small groups come first: they stand out.
         let mut groups: Vec<_> = groups.into_iter().collect();
         groups.sort_by_key(|(_, group)| group.len());
         let named: Vec<_> = groups

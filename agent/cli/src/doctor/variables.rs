@@ -42,7 +42,7 @@ pub enum Range {
     Subnet,
     /// Nodes of their own host.
     Localhost,
-    /// Nobody.
+    /// No host.
     Off,
     /// What the implementation's own settings say.
     System,

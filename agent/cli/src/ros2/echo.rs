@@ -19,7 +19,7 @@ use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::yaml::{self, Style};
 use ros2probe_message::{Decoded, Limits, MessageType, Truncation, Value, csv, decode, python};
 
-/// Writers whose unreadable messages are told apart.
+/// Writers whose unreadable messages are counted apart.
 const MAX_WRITERS: usize = 256;
 /// `service_msgs/msg/ServiceEventInfo`, in the order of its constants.
 const EVENTS: [&str; 4] = [
@@ -357,7 +357,7 @@ fn info_around(sample: &Sample) -> String {
     )
 }
 
-/// The first number of an event is its kind, of which people are told the name.
+/// The first number of an event is its kind, which is printed as its name.
 fn with_name_of_event(document: String) -> String {
     for (number, name) in EVENTS.iter().enumerate() {
         let start = format!("info:\n  event_type: {number}\n");

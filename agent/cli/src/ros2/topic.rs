@@ -87,7 +87,7 @@ fn types(types: &[Cow<'_, str>]) -> String {
 }
 
 /// `topic type` and `service type` and `action type`: one to a line; `None` where there is none,
-/// which is said by the exit code alone.
+/// which the exit code alone reports.
 #[must_use]
 pub fn type_of<'a>(
     name: &str,

@@ -1,5 +1,5 @@
 //! What `rp top` shows and how keys change it: keys and facts come in, the model and a few wishes
-//! go out. It draws nothing, asks nobody and reads no clock.
+//! go out. It draws nothing, sends no request and reads no clock.
 
 use std::collections::{BTreeMap, HashMap};
 use std::time::{Duration, Instant};

@@ -13,7 +13,7 @@ const KEPT: usize = 1_000;
 /// One event.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Line {
-    /// Somebody should know.
+    /// Worth attention.
     pub is_warning: bool,
     /// `14:02:11 WARN message.lost /points count=3`.
     pub text: String,

@@ -1,4 +1,4 @@
-//! Topics that are measured because somebody pressed a key: until the program ends, by a connection
+//! Topics that are measured at the press of a key: until the program ends, by a connection
 //! that goes with the process however it ends, or also after that, by a watch.
 
 use std::collections::BTreeMap;
@@ -67,7 +67,7 @@ impl MeasureRequests {
                 Ok(()) => format!("{name}: the watch is removed"),
                 Err(error) => {
                     let status = format!("{name}: {error}");
-                    // Somebody else may have removed it; else it is still there.
+                    // Another client may have removed it; else it is still there.
                     if !error.is(Code::NoSuchWatch) {
                         self.all.insert(key.clone(), MeasureRequest::Watch(path));
                     }
@@ -139,7 +139,7 @@ struct Stream {
 }
 
 impl Stream {
-    /// Reads what comes, which nobody wants to see, and opens it again when it breaks.
+    /// Reads and discards what comes, and opens the stream again when it breaks.
     fn run(self) {
         while !self.is_over() {
             match self.agent.stream(&self.path) {

@@ -2,7 +2,7 @@
 //!
 //! It shows what the agent's API says and decides nothing by itself. Names from the network reach the
 //! terminal escaped (`text`); the terminal is given back clean however it ends (`terminal`). Topics
-//! that it has measured are measured no longer once it has gone, unless somebody wanted that.
+//! that it has measured are measured no longer once it has gone, unless `W` keeps them.
 
 mod app;
 mod details;
@@ -37,7 +37,7 @@ const TICK: Duration = Duration::from_millis(500);
 const CALM: Duration = Duration::from_millis(100);
 /// Keys and facts that wait for a terminal that takes its time; who has more to say waits, too.
 const MAX_WAITING: usize = 64;
-/// Lines of the header in text that nobody scrolls.
+/// Lines of the header in text without scrolling.
 const MAX_HEADER: usize = 16;
 
 /// What is shown at first.
@@ -81,7 +81,7 @@ pub fn once(agent: &Agent, options: &Options) -> Result<String, ClientError> {
     Ok(text)
 }
 
-/// The table in the terminal, asked for anew every `interval`, until somebody ends it; the exit code.
+/// The table in the terminal, requested anew every `interval`, until a key ends it; returns the exit code.
 ///
 /// # Errors
 /// There is no terminal, or no thread can be started.

@@ -192,7 +192,7 @@ impl Poll {
     }
 
     fn send(&self, fact: Fact) {
-        // Whoever reads it ends the process when it ends.
+        // The reader ends the process when it ends.
         let _ = self.inputs.send(Input::Fact(fact));
     }
 }

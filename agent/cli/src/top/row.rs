@@ -31,17 +31,17 @@ pub enum Standing {
     Violated,
     /// Published, and nothing comes.
     Silent,
-    /// Watched by its name, and nobody publishes.
+    /// Watched by its name, without a publisher.
     NotPublished,
     /// Messages cannot be seen, for a reason that is known.
     Unseen,
-    /// Published to nobody.
+    /// Published without a subscriber.
     NoSubscriber,
     /// Measured without expectations, and nothing came lately.
     Quiet,
     /// Messages flow, and as expected.
     Ok,
-    /// Nobody asked for it to be measured.
+    /// No watch or subscription has it measured.
     Unwatched,
     /// Its last endpoint has gone.
     Gone,
@@ -94,7 +94,7 @@ pub struct Row {
     pub subscriptions: usize,
     /// How it stands.
     pub standing: Standing,
-    /// What somebody should look at, in a word each.
+    /// What deserves attention, in a word each.
     pub problems: Vec<&'static str>,
 }
 
@@ -314,7 +314,7 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "qos_incompatible" => say("qos"),
             "type_conflict" => say("type"),
             "type_hash_conflict" => say("hash"),
-            // Usual: a tool that publishes for whoever may come.
+            // Usual: a tool that publishes without a subscriber.
             "unheard_publisher" | "unfed_subscriber" | "" => {}
             _ => say("graph"),
         }

@@ -2,7 +2,7 @@
 //! ASCII leaves here, so that no name can move a cursor, colour a line or hide itself, and every
 //! character is one column wide.
 
-/// Longer names are cut: nobody reads them, and a terminal line is short.
+/// Longer names are cut: a terminal line is short.
 const MAX_CHARACTERS: usize = 256;
 
 /// Text from outside, with everything escaped that is not printable ASCII.

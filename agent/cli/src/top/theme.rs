@@ -20,7 +20,7 @@ pub enum Kind {
     Plain,
     /// Names what is below.
     Heading,
-    /// Somebody should look at it.
+    /// Deserves attention.
     Problem,
     /// Of less interest.
     Faint,

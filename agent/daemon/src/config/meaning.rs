@@ -58,8 +58,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
 const READERS: &[(u32, Read)] = &[(1, read_1)];
 type Read = fn(&str, &Node) -> Result<Config, Mistakes>;
 
-/// What reads the version that the file names; the first where it names none. Of a newer one nothing
-/// else is said: what it means by its other keys is not known here.
+/// What reads the version that the file names; the first if it names none. For a newer
+/// version this is the only mistake: the meaning of its other keys is unknown here.
 fn reader(document: &Node, mistakes: &mut Mistakes) -> Option<Read> {
     let newest = READERS.last().map_or(0, |(version, _)| *version);
     let Some((version, position)) = document.version() else {

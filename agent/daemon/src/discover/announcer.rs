@@ -19,10 +19,10 @@ pub(super) struct Announcer {
     pub(super) reader: EntityId,
     pub(super) role: Role,
     /// First and last number, by HEARTBEAT.
-    pub(super) there: Option<RangeInclusive<u64>>,
-    pub(super) came: BTreeSet<u64>,
+    pub(super) available: Option<RangeInclusive<u64>>,
+    pub(super) received: BTreeSet<u64>,
     /// Asked for last.
-    wanted: BTreeSet<u64>,
+    requested: BTreeSet<u64>,
 }
 
 impl Announcer {
@@ -35,37 +35,37 @@ impl Announcer {
             writer,
             reader,
             role,
-            there: None,
-            came: BTreeSet::new(),
-            wanted: BTreeSet::new(),
+            available: None,
+            received: BTreeSet::new(),
+            requested: BTreeSet::new(),
         }
     }
 
     /// Numbers that are there and have not come, lowest first.
     pub(super) fn missing(&self) -> impl Iterator<Item = u64> + '_ {
-        let (first, last) = match &self.there {
+        let (first, last) = match &self.available {
             Some(range) => (*range.start(), *range.end()),
             None => (1, 0),
         };
         let first = first.max(1);
         let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
-        (first..=last).filter(|number| !self.came.contains(number))
+        (first..=last).filter(|number| !self.received.contains(number))
     }
 
     /// The next numbers to ask for, as many as one request holds.
-    pub(super) fn want(&mut self) -> BTreeSet<u64> {
+    pub(super) fn next_request(&mut self) -> BTreeSet<u64> {
         let first = self.missing().next().unwrap_or(0);
         let wanted: BTreeSet<_> = self
             .missing()
             .take_while(|number| number - first < MOST_NUMBERS)
             .collect();
-        self.wanted.clone_from(&wanted);
+        self.requested.clone_from(&wanted);
         wanted
     }
 
     /// Whether all that was asked for has come.
-    pub(super) fn has_come(&self) -> bool {
-        self.wanted.is_subset(&self.came)
+    pub(super) fn is_answered(&self) -> bool {
+        self.requested.is_subset(&self.received)
     }
 
     /// A GAP: these will never come.
@@ -76,6 +76,6 @@ impl Announcer {
             .missing()
             .filter(|number| irrelevant.contains(number) || listed.contains(number))
             .collect();
-        self.came.extend(skipped);
+        self.received.extend(skipped);
     }
 }

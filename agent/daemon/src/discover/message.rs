@@ -1,7 +1,7 @@
 //! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
 //!
 //! The only encoder in the product. It can announce a bare participant, one reader of
-//! `ros_discovery_info`, ask for samples, and say goodbye; nothing else, and in nobody else's name.
+//! `ros_discovery_info`, ask for samples, and say goodbye; nothing else, and only in its own name.
 
 use std::net::SocketAddrV4;
 
@@ -23,7 +23,7 @@ const SPDP_READER: EntityId = EntityId([0x00, 0x01, 0x00, 0xc7]);
 /// Where the discovery of every domain meets (RTPS 2.5, 9.6.1.4).
 const MULTICAST: [u8; 4] = [239, 255, 0, 1];
 /// SPDP writer, SEDP publications reader, SEDP subscriptions writer and reader. Fast DDS takes a
-/// goodbye only from whoever has the first.
+/// goodbye only from participants that have the first.
 const BUILTIN_ENDPOINTS: u32 = 0x39;
 /// Should the goodbye be lost.
 const LEASE_SECONDS: u32 = 3;
@@ -139,7 +139,7 @@ impl Message {
     /// ACKNACK: of this writer, everything before `base` is here and these numbers are missing. At
     /// most [`MOST_NUMBERS`] from `base` on can be asked for; others are left out.
     #[must_use]
-    pub fn ask(
+    pub fn acknack(
         self,
         reader: EntityId,
         writer: EntityId,
@@ -156,7 +156,7 @@ impl Message {
     /// NACK_FRAG: of this sample, these fragments are missing (RTPS 2.5, 9.4.5.14). Asked for a
     /// sample, Cyclone DDS repeats its first fragment and waits for this.
     #[must_use]
-    pub fn ask_fragments(
+    pub fn nack_frag(
         self,
         reader: EntityId,
         writer: EntityId,
@@ -387,7 +387,7 @@ mod tests {
             let writer = EntityId::SEDP_PUBLICATIONS_WRITER;
             let numbers = missing.iter().copied();
             let bytes = message()
-                .ask(PUBLICATIONS_READER, writer, base, numbers, 7)
+                .acknack(PUBLICATIONS_READER, writer, base, numbers, 7)
                 .bytes();
             let record = walked(&bytes)[0].record;
             (record, missing_of(&record).iter().collect())
@@ -408,7 +408,7 @@ mod tests {
             );
         }
         let bytes = message()
-            .ask_fragments(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
+            .nack_frag(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
             .bytes();
         // Behind the header and INFO_DST (RTPS 2.5, 9.4.5.14).
         let nack_frag = [

@@ -23,7 +23,7 @@ use self::message::{LocalParticipant, VENDOR};
 use self::session::{Outgoing, Session, Target};
 use ros2probe_model::snapshot::ParticipantFacts;
 
-/// How often the session is told the time while nothing comes.
+/// How often the session advances while nothing comes.
 const SLICE: Duration = Duration::from_millis(5);
 /// After the goodbye, what is still under way is let in: a closed port would make the kernel answer.
 const LINGER: Duration = Duration::from_millis(50);

@@ -96,7 +96,10 @@ impl HeardParticipant {
         Self {
             prefix: facts.guid.prefix,
             domain_id: facts.domain_id.0,
-            vendor: facts.vendor.to_string(),
+            vendor: facts
+                .vendor
+                .name()
+                .map_or_else(|| facts.vendor.to_string(), str::to_owned),
             process: name.as_deref().map(str::to_owned),
             process_id: *id,
             host: host.as_deref().map(str::to_owned),

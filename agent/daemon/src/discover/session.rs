@@ -150,7 +150,7 @@ impl Session {
         ];
         if self.wants_nodes {
             let message = self.message();
-            let message = message.ask(NODES_READER, EntityId::UNKNOWN, 1, [1], 1);
+            let message = message.acknack(NODES_READER, EntityId::UNKNOWN, 1, [1], 1);
             plan.push(self.to_user("node request", message));
         }
         plan.push(self.to_discovery("goodbye", self.message().goodbye(self.local)));
@@ -190,9 +190,9 @@ impl Session {
             self.end(&mut outgoing);
             return outgoing;
         }
-        self.ask(now, &mut outgoing);
-        self.ask_for_nodes(now, &mut outgoing);
-        self.ask_for_fragments(now, &mut outgoing);
+        self.request_announcements(now, &mut outgoing);
+        self.request_nodes(now, &mut outgoing);
+        self.request_fragments(now, &mut outgoing);
         if self.is_complete(now) {
             self.end(&mut outgoing);
         }
@@ -271,7 +271,7 @@ impl Session {
             Body::Heartbeat(heartbeat) => {
                 let range = heartbeat.first()..=heartbeat.last();
                 if let Some(announcer) = announcer {
-                    announcer.there = Some(range);
+                    announcer.available = Some(range);
                     self.heard.get_or_insert(now);
                 } else if !entity.is_builtin()
                     && (self.user_writers.len() < MOST_WRITERS
@@ -290,7 +290,7 @@ impl Session {
             Body::Sample(sample) => {
                 let number = sample.sequence_number();
                 let came = match &announcer {
-                    Some(announcer) => announcer.came.contains(&number),
+                    Some(announcer) => announcer.received.contains(&number),
                     None => matches!(self.nodes, Nodes::Listed(_)),
                 };
                 if came || announcer.is_none() && Some(entity) != self.nodes_writer() {
@@ -350,8 +350,8 @@ impl Session {
         let Some(announcer) = announcers.into_iter().find(|it| it.writer == entity) else {
             return;
         };
-        if announcer.came.len() < usize::try_from(MOST_ANNOUNCEMENTS).unwrap_or(usize::MAX) {
-            announcer.came.insert(number);
+        if announcer.received.len() < usize::try_from(MOST_ANNOUNCEMENTS).unwrap_or(usize::MAX) {
+            announcer.received.insert(number);
         }
         match discovery::endpoint(announcer.role, vendor, payload, qos) {
             Ok(Discovery::Alive(endpoint)) if endpoint.guid.prefix == self.target.prefix => {
@@ -389,13 +389,13 @@ impl Session {
 
     /// Asks for announcements: once both writers have said what there is, again when all that was
     /// asked for has come and there is more, or when it does not come.
-    fn ask(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+    fn request_announcements(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         let Some(heard) = self.heard else { return };
-        let both = self.publications.there.is_some() && self.subscriptions.there.is_some();
+        let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
         let due = match self.asked {
             None => both || since(heard, now) >= GATHER,
             Some(asked) => {
-                let came = self.publications.has_come() && self.subscriptions.has_come();
+                let came = self.publications.is_answered() && self.subscriptions.is_answered();
                 came || since(asked, now) >= TIMEOUT
             }
         };
@@ -404,7 +404,7 @@ impl Session {
         if !due || self.missing() == 0 || self.sent.packets + reserved >= MOST_PACKETS {
             return;
         }
-        let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::want);
+        let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::next_request);
         self.requests += 1;
         let message = self.request(wanted.map(|wanted| {
             let base = wanted.first().copied().unwrap_or(0);
@@ -415,7 +415,7 @@ impl Session {
     }
 
     /// Asks for the list of nodes: the last sample of the writer that tells it.
-    fn ask_for_nodes(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+    fn request_nodes(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         if !self.wants_nodes || !matches!(self.nodes, Nodes::Open { .. }) {
             return;
         }
@@ -429,13 +429,15 @@ impl Session {
             self.nodes = Nodes::Missing;
             return;
         }
-        let message = self.message().ask(NODES_READER, writer, last, [last], 1);
+        let message = self
+            .message()
+            .acknack(NODES_READER, writer, last, [last], 1);
         self.nodes = Nodes::Requested(now);
         self.send(self.to_user("node request", message), outgoing);
     }
 
     /// Asks for the rest of samples of which fragments came and others did not follow.
-    fn ask_for_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
+    fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
         let due = |(_, at): &(&(EntityId, u64), &Timestamp)| since(**at, now) >= GATHER;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
         if stuck.is_empty() || self.partial.values().any(|at| since(*at, now) < GATHER) {
@@ -456,7 +458,7 @@ impl Session {
                 let guid = Guid::new(self.target.prefix, *writer);
                 let missing = self.discovery_fragments.missing(guid, *number);
                 self.requests += 1;
-                message = message.ask_fragments(reader, *writer, *number, missing, self.requests);
+                message = message.nack_frag(reader, *writer, *number, missing, self.requests);
                 asked = true;
             }
             if !asked || self.sent.packets + 1 >= MOST_PACKETS {
@@ -520,7 +522,7 @@ impl Session {
         for (announcer, (base, numbers)) in both.into_iter().zip(wanted) {
             if base > 0 {
                 let (reader, writer) = (announcer.reader, announcer.writer);
-                message = message.ask(reader, writer, base, numbers, self.requests.max(1));
+                message = message.acknack(reader, writer, base, numbers, self.requests.max(1));
             }
         }
         message

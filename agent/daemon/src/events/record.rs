@@ -89,7 +89,7 @@ pub enum AgentEvent {
         messages: u64,
         /// Messages that were sent and are not in it.
         missing: u64,
-        /// What ended it, if nobody asked.
+        /// Why it ended, if no client ended it.
         reason: Option<String>,
     },
     /// What came before an incident was written, or could not be.
@@ -112,7 +112,7 @@ pub enum AgentEvent {
     },
 }
 
-/// One event as it is told.
+/// One event as streams and exports carry it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Record {
     /// Its number in this run of the agent.
@@ -207,7 +207,7 @@ impl Occurrence {
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
-            // Usual while nodes start, and with tools that publish for whoever may come.
+            // Usual while nodes start, and with tools that publish without a subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
                 finding,
                 Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
@@ -253,6 +253,7 @@ impl Occurrence {
 type Values = Vec<(&'static str, Option<Value>)>;
 
 fn robot(kind: &EventKind, at: Timestamp) -> Values {
+    let ago = |last| Value::Real(seconds(at, last));
     match kind {
         EventKind::Participant {
             change,
@@ -278,16 +279,12 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             message_type,
         } => {
             let naming = naming(topic);
-            let role = match role {
-                Role::Writer => "writer",
-                Role::Reader => "reader",
-            };
             let kind = naming.as_ref().map(|naming| text(naming.kind.label()));
             vec![
                 domain(*domain_id),
                 ("topic", Some(text(&series(naming.as_ref(), topic)))),
                 ("kind", kind),
-                ("role", Some(text(role))),
+                ("role", Some(text(self::role(*role)))),
                 ("endpoint", written(guid)),
                 ("message_type", Some(text(message_type))),
                 cause(change),
@@ -325,15 +322,12 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             topic,
             watch,
             last_message,
-        } => {
-            let ago = last_message.map(|last| Value::Real(seconds(at, last)));
-            vec![
-                domain(*domain_id),
-                ("topic", Some(text(topic))),
-                ("watch", Some(text(watch))),
-                ("last_message_seconds_ago", ago),
-            ]
-        }
+        } => vec![
+            domain(*domain_id),
+            ("topic", Some(text(topic))),
+            ("watch", Some(text(watch))),
+            ("last_message_seconds_ago", last_message.map(ago)),
+        ],
         EventKind::Diagnosis { finding, .. } => self::finding(finding),
     }
 }
@@ -347,6 +341,13 @@ fn cause(change: &churn::Event) -> (&'static str, Option<Value>) {
     use churn::Event::{Cascaded, Disposed, Expired};
     let went = matches!(change, Disposed | Expired | Cascaded);
     ("cause", went.then(|| text(change.label())))
+}
+
+const fn role(role: Role) -> &'static str {
+    match role {
+        Role::Writer => "writer",
+        Role::Reader => "reader",
+    }
 }
 
 fn loss(loss: &LossBurst) -> Values {

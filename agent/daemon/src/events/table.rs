@@ -27,7 +27,7 @@ pub struct Definition {
 pub enum Severity {
     /// What happens on a healthy robot.
     Info,
-    /// Somebody should know.
+    /// Worth attention.
     Warn,
     /// The agent does not see all.
     Error,

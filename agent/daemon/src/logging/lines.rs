@@ -83,7 +83,7 @@ impl<W: Write + AsFd> Lines<W> {
 }
 
 impl<W: Write + AsFd> Write for Lines<W> {
-    /// Takes a line; whatever becomes of it is no error of whoever had something to say.
+    /// Takes a line; its fate is no error of the caller.
     fn write(&mut self, line: &[u8]) -> io::Result<usize> {
         let written = self.catch_up().and_then(|()| self.line(line));
         self.is_stuck = written.is_err();

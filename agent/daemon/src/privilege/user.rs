@@ -18,7 +18,7 @@ const NAME: &str = "ros2probe";
 /// Who the agent is.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Identity {
-    /// Not root, and nobody else now.
+    /// Not root; the user stays.
     AsStarted,
     /// The package's user.
     Own,

@@ -1,7 +1,7 @@
 //! One recording: samples in, a bag and a report out.
 //!
-//! No thread and no clock of its own: whoever owns it feeds it from a subscription or from an agent's
-//! stream, and time comes with what it is fed. The first error of the storage ends it; what was
+//! No thread and no clock of its own: its owner feeds it from a subscription or from an agent's
+//! stream, and time comes with the items. The first error of the storage ends it; what was
 //! taken before is in the bag, and what is not is counted.
 
 mod unrecorded;
@@ -438,7 +438,7 @@ impl<'a> Recorder<'a> {
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
         };
-        // A loss may be told before the first message, and without a type.
+        // A loss may come before the first message, and without a type.
         if !message_type.is_empty() && taken.description.type_name != **message_type {
             if !self
                 .report

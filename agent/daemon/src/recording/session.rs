@@ -17,8 +17,8 @@ use crate::subscriptions::{Item, NextItem};
 use ros2probe_bag::{Compressed, Error, FileCompression, Progress};
 
 /// How long orders wait at most.
-const LOOK: Duration = Duration::from_millis(100);
-/// How often whoever watches is told.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// How often the state of a recording is reported.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// How long what was sent before the end is waited for.
 const FAREWELL: Duration = Duration::from_secs(2);
@@ -109,7 +109,7 @@ pub fn record<E>(
             }
             Err(error) => break (Some(error), None),
         }
-        let got = match next(LOOK) {
+        let got = match next(POLL_INTERVAL) {
             Ok(got) => got,
             Err(error) => break (None, Some(error)),
         };
@@ -243,7 +243,7 @@ impl CompressionTask {
                 break;
             }
             completion.compressing(self.progress.read(), self.bytes);
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
         }
         let is_given_up = self.progress.is_given_up();
         match self.join() {

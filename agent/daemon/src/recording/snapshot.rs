@@ -302,7 +302,7 @@ impl SnapshotTask {
             Ok(_) => self.ring.clear(),
             // There was one before this.
             Err(Refusal::Exists(_)) => {}
-            // All of it is still in memory: what there is of the bag helps nobody, and would be
+            // All of it is still in memory: the part of a bag is of no use, and would be
             // joined by the next one.
             Err(_) => {
                 let _ = std::fs::remove_dir_all(&directory);

@@ -43,7 +43,7 @@ const CLOCK_NANOSECONDS: u64 = 100_000_000;
 /// A clock that is so far behind what was told was set back.
 const SET_BACK: u64 = 1_000_000_000;
 
-/// Why the working thread ended although nobody asked it to.
+/// Why the working thread ended by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
     /// The host's interfaces can no longer be captured.
@@ -206,7 +206,7 @@ impl Run {
         Ok(())
     }
 
-    /// Where a replay has to stop for a moment: where subscribers are told the time, or where a
+    /// Where a replay has to stop for a moment: where subscriptions receive the time, or where a
     /// second ends.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
         let published_until =
@@ -252,7 +252,7 @@ impl Run {
     /// against them. Where many topics meet many globs, packets are taken in between, and lists that
     /// change meanwhile wait.
     fn take_watches(&mut self) -> bool {
-        if self.ask() {
+        if self.apply_lists() {
             if let Some(watchlist) = self.watches.take_changed() {
                 self.subscriptions.retain(watchlist.watches());
                 self.observer.input(Input::Watchlist(watchlist));
@@ -263,7 +263,7 @@ impl Run {
                 self.sample_requests = Some(sample_requests);
             }
         }
-        self.ask()
+        self.apply_lists()
     }
 
     /// Confirms wishes whose verdicts the kernel has, before the next packets.
@@ -277,8 +277,9 @@ impl Run {
         }
     }
 
-    /// Goes on with what new lists say of each topic; whether that is done. A replay waits for it.
-    fn ask(&mut self) -> bool {
+    /// Applies new lists of watches and subscriptions to further topics; returns whether all are done.
+    /// A replay waits for it.
+    fn apply_lists(&mut self) -> bool {
         while !self.observer.apply_more_lists() {
             if let Source::Live(_) = self.source {
                 return false;

@@ -17,7 +17,7 @@ use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, lin
 use ros2probe_capture::reassembly::{Limits, Reassembly};
 use ros2probe_model::observer::Observer;
 
-/// How often a terminal is told how far it is.
+/// How often progress is printed on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
 /// A packet this far from the last one is gone to at once, not step by step.
 const FAR: u64 = 3600 * 1_000_000_000;
@@ -132,7 +132,7 @@ impl Replay {
         Self { until, ..self }
     }
 
-    /// Tells nobody how far it is: the terminal is used for something else.
+    /// Prints no progress: the terminal is used for something else.
     #[must_use]
     pub fn quiet(self) -> Self {
         Self {
@@ -141,7 +141,7 @@ impl Replay {
         }
     }
 
-    /// Waits at some moment until it is told to go on.
+    /// Waits at some moment until it is resumed.
     #[must_use]
     pub fn pausing_at(self, pause: PausePoint) -> Self {
         Self {
@@ -308,7 +308,7 @@ impl Replay {
         }
     }
 
-    /// It has come to where it waits and nobody was told yet.
+    /// It has come to its pause, which was not reported yet.
     #[must_use]
     pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
@@ -350,7 +350,7 @@ impl Replay {
         self.began
     }
 
-    /// Which part of the file was read, 0 to 1; `None` where that cannot be told.
+    /// Which part of the file was read, 0 to 1; `None` if that is unknown.
     #[must_use]
     pub fn part_read(&self) -> Option<f64> {
         if self.finished {

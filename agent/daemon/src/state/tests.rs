@@ -10,8 +10,8 @@ fn directory() -> (tempfile::TempDir, StateDirectory) {
 
 fn unusable(directory: &StateDirectory) -> String {
     match directory.load() {
-        Loaded::Unusable { reason, aside } => {
-            assert!(aside.unwrap().ends_with("discovery.json.corrupt"));
+        Loaded::Unusable { reason, moved_to } => {
+            assert!(moved_to.unwrap().ends_with("discovery.json.corrupt"));
             reason
         }
         other => panic!("{other:?}"),

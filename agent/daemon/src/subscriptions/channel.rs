@@ -18,7 +18,7 @@ use ros2probe_model::selection::SampleRequest;
 
 /// What a queued entry costs besides a payload.
 const OVERHEAD: usize = 256;
-/// Losses that wait to be told one by one, by writer and reason; more are told together.
+/// Losses that wait to be reported one by one, by writer and reason; more are reported together.
 const MISSED: usize = 1024;
 /// How often a source that waits for a reader looks whether the agent ends.
 const LOOK: Duration = Duration::from_millis(50);

@@ -3,7 +3,7 @@
 //!
 //! Between the capture thread and each reader lies a queue, bounded in bytes, all of them together
 //! as well. A reader that is slow loses the oldest samples of the topics that hold most of its queue
-//! and is told how many, or, on a replay, is waited for. The capture of a live host never waits.
+//! and receives their number. A replay waits for it instead; the capture of a live host never does.
 
 mod backlog;
 mod channel;
@@ -47,13 +47,13 @@ pub struct Caps {
 /// What becomes of samples for which a queue has no room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Overflow {
-    /// The oldest of the topic that holds most bytes go, and the reader is told.
+    /// The oldest of the topic that holds most bytes go; the reader receives their number.
     DropOldest,
     /// The source waits for the reader. For replays alone.
     Wait,
 }
 
-/// What somebody asks for.
+/// What a subscription asks for.
 #[derive(Clone, Debug)]
 pub struct Request {
     /// Which topics; also those that appear later.

@@ -17,7 +17,7 @@ use base64::engine::general_purpose::STANDARD;
 use subtle::ConstantTimeEq as _;
 use tokio::sync::Semaphore;
 
-/// Of a password that nobody has: an unknown name takes as long as a known one.
+/// Hash of no password: an unknown name takes as long as a known one.
 const NOBODY: &str = "$2y$10$QOauhQNbBCuQDKes6eFzPeMqBSjb7Mr5DUmpZ/VcEd00UAV/LDeSi";
 
 /// Who may come in.

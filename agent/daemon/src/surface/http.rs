@@ -67,7 +67,7 @@ pub enum ListenError {
     Tls(#[from] super::tls::TlsError),
 }
 
-/// A bound listener that nobody answers yet.
+/// A bound listener that does not answer yet.
 #[derive(Debug)]
 pub struct Server {
     listener: std::net::TcpListener,

@@ -1,5 +1,5 @@
 //! TCP listeners whose clients cannot make the kernel hold much for them: what waits to be read by a
-//! slow one counts for the agent's `MemoryMax`, up to 4 MB a connection if nobody says less.
+//! slow one counts for the agent's `MemoryMax`, up to 4 MB a connection by default.
 
 use std::io;
 use std::net::{SocketAddr, TcpListener};

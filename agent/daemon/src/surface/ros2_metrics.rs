@@ -36,7 +36,7 @@ type Values = fn(&Measurement) -> &Histogram;
 pub(super) struct TopicRow<'a> {
     domain_id: u32,
     name: Cow<'a, str>,
-    /// `None`: watched by name, but nobody has announced it.
+    /// `None`: watched by name, but not announced.
     pub(super) facts: Option<&'a TopicFacts>,
     watched: bool,
     /// A watch asks for series per delivery.
@@ -454,7 +454,7 @@ fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
         return Ok(());
     };
     let [domain_id, topic] = row.labels();
-    // Subscribers' wishes describe the topic only while nobody publishes.
+    // Subscriptions describe the topic only while it has no publisher.
     let endpoints = if facts.publishers.is_empty() {
         &facts.subscriptions
     } else {

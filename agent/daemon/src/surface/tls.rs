@@ -48,7 +48,7 @@ pub enum TlsError {
     /// Certificate and key do not fit.
     #[error("certificate and key (`tls_server_config`) cannot be used")]
     Unfit(#[from] rustls::Error),
-    /// Nobody could be verified.
+    /// No client could be verified.
     #[error("client_ca_file (`tls_server_config`) cannot be used")]
     Authorities(#[from] VerifierBuilderError),
 }

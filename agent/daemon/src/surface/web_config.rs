@@ -165,7 +165,7 @@ impl TlsShape {
     }
 }
 
-/// `$2y$10$` and 53 letters; the cost is bounded, since whoever comes may have it spent.
+/// `$2y$10$` and 53 letters; the cost is bounded, since every client can cause it.
 fn check_hash(hash: &str) -> Result<(), String> {
     let unfit = "is not a bcrypt hash, as printed by `htpasswd -nBC 10 NAME`";
     let mut parts = hash.split('$');

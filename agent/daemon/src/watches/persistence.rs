@@ -44,7 +44,7 @@ pub enum LoadedWatches {
         /// Why.
         reason: String,
         /// Where it lies, if it could be moved.
-        aside: Option<PathBuf>,
+        moved_to: Option<PathBuf>,
     },
 }
 
@@ -99,7 +99,9 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     let document = match directory.read(&FORM) {
         Found::Nothing => return LoadedWatches::Nothing,
         Found::Newer(newer) => return LoadedWatches::Newer(newer),
-        Found::Unusable { reason, aside } => return LoadedWatches::Unusable { reason, aside },
+        Found::Unusable { reason, moved_to } => {
+            return LoadedWatches::Unusable { reason, moved_to };
+        }
         Found::This(document) => document,
     };
     let watches = if document.watches.len() > Limit::Watches.row().range.1 {
@@ -115,7 +117,7 @@ pub fn load(directory: &StateDirectory) -> LoadedWatches {
     match watches {
         Ok(watches) => LoadedWatches::These(watches),
         Err(reason) => match directory.set_aside::<Document>(FILE, reason) {
-            Found::Unusable { reason, aside } => LoadedWatches::Unusable { reason, aside },
+            Found::Unusable { reason, moved_to } => LoadedWatches::Unusable { reason, moved_to },
             Found::Nothing | Found::This(_) | Found::Newer(_) => LoadedWatches::Nothing,
         },
     }
@@ -350,11 +352,11 @@ mod tests {
             watches: globs.map(|watch| Line::from(&watch)).collect(),
         };
         directory.replace(FILE, &document).unwrap();
-        let LoadedWatches::Unusable { reason, aside } = load(&directory) else {
+        let LoadedWatches::Unusable { reason, moved_to } = load(&directory) else {
             panic!("it was read");
         };
         assert!(reason.contains("it has 1000 globs of"), "{reason}");
-        assert_eq!(aside, Some(place.path().join("watches.json.corrupt")));
+        assert_eq!(moved_to, Some(place.path().join("watches.json.corrupt")));
         assert_eq!(load(&directory), LoadedWatches::Nothing);
     }
 

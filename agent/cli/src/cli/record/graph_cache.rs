@@ -37,18 +37,18 @@ impl<'a> GraphCache<'a> {
     pub(super) fn of(&mut self, names: &[String]) -> Vec<DiscoveredTopic> {
         let is_old = self.at.is_none_or(|at| at.elapsed() > GRAPH_AGE);
         if is_old || names.iter().any(|name| !self.known.contains_key(name)) {
-            self.ask();
+            self.refresh();
         }
         let known = names.iter().map(|name| self.known.get(name).cloned());
         known.map(Option::unwrap_or_default).collect()
     }
 
     pub(super) fn latest_snapshot(&mut self) -> GraphSnapshot {
-        self.ask();
+        self.refresh();
         self.graph.clone()
     }
 
-    fn ask(&mut self) {
+    fn refresh(&mut self) {
         let graph = self
             .agent
             .get_within::<TopicList<'_>>("/topics?hidden=true", GRAPH_TIMEOUT);

@@ -1,6 +1,6 @@
 //! The times between messages of one topic, as `ros2 topic hz` reports them.
 //!
-//! Arrival is when the message was captured, not when somebody came to read it.
+//! Arrival is when the message was captured, not when it was read.
 
 use super::window::Window;
 use super::{NANOSECOND, SECOND};

@@ -246,7 +246,7 @@ impl Rates {
     }
 
     /// A message of a topic. It counts once the clock has passed it: messages by different ways,
-    /// as by network and by shared memory, are told in no order.
+    /// as by network and by shared memory, come in no order.
     ///
     /// # Errors
     /// When its delay is asked for and it has no header.

@@ -28,6 +28,7 @@ fn details(number: usize) -> TopicDetails<'static> {
     serde_json::from_value(robot_answer()["topics"][number].clone()).unwrap()
 }
 
+/// One answer as JSON: long because it has a topic of each kind.
 fn robot_answer() -> Value {
     let measured = |rate: f64, size: f64, lost: u64| {
         json!({

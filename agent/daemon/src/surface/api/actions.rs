@@ -76,7 +76,7 @@ pub(super) fn parties<'a>(parts: &[&'a TopicFacts]) -> Parties<'a> {
     parties
 }
 
-/// `None` once nobody is there any more.
+/// `None` without any endpoint.
 fn view<'a>(
     domain_id: u32,
     name: String,

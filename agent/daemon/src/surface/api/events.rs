@@ -1,7 +1,7 @@
 //! `GET /events`: what happens, as server-sent events (WHATWG HTML, 9.2).
 //!
 //! Each stream has its own place in the log of events and reads as fast as its client does; it
-//! holds nobody up. What is overwritten before a slow client came to it is told as `lagged`. Streams
+//! delays no other. `lagged` reports what is overwritten before a slow client came to it. Streams
 //! are limited in number and end when the agent ends.
 
 use std::borrow::Cow;

@@ -127,7 +127,7 @@ impl Drawing {
         }
     }
 
-    /// A service or action, unless nobody is there any more.
+    /// A service or action, unless it has no endpoint.
     fn joint(&mut self, kind: VertexKind, domain_id: u32, name: &str, parties: &Parties<'_>) {
         if parties.is_empty() {
             return;

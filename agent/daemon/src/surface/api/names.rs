@@ -99,7 +99,7 @@ fn topic(facts: &TopicFacts) -> Option<TopicName<'_>> {
     })
 }
 
-/// `None` once nobody is there any more.
+/// `None` without any endpoint.
 fn service<'a>(domain_id: u32, name: &'a str, halves: &Halves<'a>) -> Option<ServiceName<'a>> {
     let ends = |topic: Option<&TopicFacts>| {
         topic.map_or((0, 0), |topic| {

@@ -46,7 +46,8 @@ const COMMON: [(&str, &str); 6] = [
         super::messages::definition,
         super::messages::follow
     ),
-    components(schemas(ProblemBody)),
+    // The schema of a type parameter is not collected by itself.
+    components(schemas(ProblemBody, super::messages::MessageLine)),
     tags(
         (name = "watch", description = "Watches, changed while the agent runs."),
         (name = "events", description = "Events, as they happen."),

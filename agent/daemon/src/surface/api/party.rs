@@ -40,7 +40,7 @@ impl Side {
             (TopicKind::ServiceRequest, true) | (TopicKind::ServiceReply, false) => {
                 Some(Self::Client)
             }
-            // Whoever reads feedback may be a client, or only curious.
+            // A reader of feedback may be a client, or a tool.
             (TopicKind::ActionFeedback | TopicKind::ActionStatus, true) => Some(Self::Server),
             _ => None,
         }

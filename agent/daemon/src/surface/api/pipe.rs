@@ -1,6 +1,6 @@
 //! The API within one process: requests come through pipes in memory instead of sockets.
 //!
-//! Whoever holds the other ends is the process itself, so only what protects from floods remains.
+//! The process itself holds the other ends, so only the protection from floods remains.
 
 use std::io;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ impl Listener for Pipes {
     async fn accept(&mut self) -> (DuplexStream, ()) {
         match self.0.recv().await {
             Some(pipe) => (pipe, ()),
-            // Nobody will ask any more; the server ends with its runtime.
+            // No further request can come; the server ends with its runtime.
             None => std::future::pending().await,
         }
     }

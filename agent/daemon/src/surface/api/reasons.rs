@@ -1,6 +1,6 @@
 //! Why a topic is silent or cannot be seen: every reason that is known, in words and as a code.
 //!
-//! Reasons come from facts that are told elsewhere too; nothing is guessed from a missing number
+//! Reasons come from facts that other answers show too; nothing is guessed from a missing number
 //! alone.
 
 use super::index::Index;
@@ -73,7 +73,7 @@ impl<'a> Circumstances<'a> {
                 say(code, detail);
             }
             Some(measured) if is_connected && measured.rate_hz == 0.0 => {
-                if let Some((code, detail)) = self.aside(topic) {
+                if let Some((code, detail)) = self.off_network(topic) {
                     say(code, detail);
                 } else if self.is_elsewhere(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
@@ -149,7 +149,7 @@ impl<'a> Circumstances<'a> {
     }
 
     /// How messages pass, if no pair of publisher and subscriber uses the network.
-    fn aside(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
+    fn off_network(&self, topic: &TopicFacts) -> Option<(ReasonCode, String)> {
         let passages = topic.transports.iter();
         let most = passages.clone().max_by_key(|count| count.pairs)?;
         if passages

@@ -1,7 +1,7 @@
 //! `/recordings`: bags that the agent writes, begun, paused and ended by clients.
 //!
 //! They lie below the directory that the configuration names; a name is a file name and nothing
-//! else. Whoever wants a bag elsewhere records with `rp bag record`.
+//! else. `rp bag record` writes bags elsewhere.
 
 use std::sync::Arc;
 use std::time::{Duration, UNIX_EPOCH};

@@ -11,7 +11,7 @@ use ros2probe_api::health::Reloaded;
 
 use super::problem::{Code, Problem, ProblemBody};
 
-/// Asks whoever owns the configuration.
+/// Requests reloads of the owner of the configuration.
 #[derive(Clone, Debug)]
 pub struct Reloader(mpsc::Sender<Answer>);
 
@@ -39,7 +39,7 @@ pub fn channel() -> (Reloader, Reloads) {
 }
 
 impl Reloads {
-    /// Waits until somebody asks; `None` when nobody can any more.
+    /// Waits for a request; `None` once none can come.
     pub async fn next(&mut self) -> Option<Answer> {
         self.0.recv().await
     }

@@ -2,7 +2,7 @@
 //! stays. The topics are measured meanwhile, whether they are watched or not.
 //!
 //! Each stream is a subscription with a bounded queue: a client that reads slowly misses messages
-//! and is told, on a replay it is waited for. It holds nobody else up.
+//! and receives their number; a replay waits for it. It delays no other client.
 
 use std::collections::HashSet;
 use std::time::Duration;

@@ -72,7 +72,7 @@ pub enum OpenError {
     },
 }
 
-/// Bound listeners that nobody answers yet.
+/// Bound listeners that do not answer yet.
 #[derive(Debug, Default)]
 pub struct Server {
     token: Option<Token>,
@@ -233,7 +233,7 @@ where
     Ok(())
 }
 
-/// What a client is told for whom there is no place.
+/// The answer to a client beyond the limit of connections.
 fn full(connections: usize) -> Refusal {
     let detail =
         format!("{connections} connections are open, which is the limit (limits.api_clients)");

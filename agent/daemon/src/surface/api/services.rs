@@ -99,7 +99,7 @@ pub(super) fn sorted<'a>(types: impl Iterator<Item = &'a str>) -> Vec<Cow<'a, st
     types.into_iter().map(Cow::Borrowed).collect()
 }
 
-/// `None` once nobody is there any more.
+/// `None` without any endpoint.
 fn view<'a>(
     domain_id: u32,
     name: &'a str,

@@ -259,7 +259,7 @@ fn answer(
     let done =
         done.map_err(|refused| problem(&refused, &watch.pattern, watch.domain_id.map(|id| id.0)))?;
     let in_force = context.watches.in_force();
-    // Gone again already: somebody else removes while this one adds.
+    // Gone again already: another client removes while this one adds.
     let entry = in_force
         .find(&watch.pattern, watch.domain_id.map(|id| id.0))
         .cloned();

@@ -275,7 +275,7 @@ fn value(label: &Label<'_>) -> Value {
     match label {
         Label::Text(label) => {
             let mut text = String::new();
-            // As on the page: nobody on the network decides how large a request is. Writing to
+            // As on the page: no text of the network decides how large a request is. Writing to
             // memory does not fail.
             let _ = write_capped(&mut text, label);
             Value::StringValue(text)

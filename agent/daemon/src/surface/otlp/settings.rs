@@ -13,7 +13,7 @@ use super::exports::Signal;
 use super::resource::{Host, resource};
 use crate::config::{Compression, Endpoint, OtlpSettings, otlp_endpoint};
 
-/// How often metrics are exported, and how long an answer may take, where nobody says.
+/// How often metrics are exported, and how long an answer may take, by default.
 const INTERVAL: Duration = Duration::from_secs(15);
 const TIMEOUT: Duration = Duration::from_secs(10);
 /// Longest file of headers.
@@ -150,7 +150,7 @@ impl Variables<'_> {
     }
 }
 
-/// As the specification asks: what is no number is told and not used.
+/// As the specification asks, a value that is no number is reported and not used.
 fn number(name: &str, value: &str) -> Option<Duration> {
     let milliseconds = value.parse().ok().filter(|value| *value > 0);
     if milliseconds.is_none() {

@@ -213,29 +213,18 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             topic,
             writer,
             reason,
-        } => {
-            let why = lacks(reason.label(), "subscription");
-            let text = format!("{} publishes {}, and {why}", ends.who(*writer), topic.name);
-            let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
-            Finding {
-                writer: Some(writer.to_string()),
-                ..finding(kind, alone(reason.label()), &about, text)
-            }
-        }
+        } => Finding {
+            writer: Some(writer.to_string()),
+            ..unmatched(kind, topic, *writer, reason.label(), ends, PUBLISHER)
+        },
         Diagnosis::UnfedSubscriber {
             topic,
             reader,
             reason,
-        } => {
-            let why = lacks(reason.label(), "publisher");
-            let who = ends.who(*reader);
-            let text = format!("{who} subscribes to {}, and {why}", topic.name);
-            let about = format!("{}|{}|{reader}", topic.domain_id, topic.dds_name);
-            Finding {
-                reader: Some(reader.to_string()),
-                ..finding(kind, alone(reason.label()), &about, text)
-            }
-        }
+        } => Finding {
+            reader: Some(reader.to_string()),
+            ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER)
+        },
         Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
             let listed: Vec<_> = domains.iter().map(DomainId::to_string).collect();
             let text = format!("{node} is in several domains: {}", listed.join(", "));
@@ -248,6 +237,25 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             .with_remedy("start all of its processes with the same ROS_DOMAIN_ID")
         }
     }
+}
+
+/// What an endpoint does, and its counterpart.
+const PUBLISHER: [&str; 2] = ["publishes", "subscription"];
+const SUBSCRIBER: [&str; 2] = ["subscribes to", "publisher"];
+
+/// An endpoint without a counterpart.
+fn unmatched(
+    kind: &'static str,
+    topic: &TopicKey,
+    endpoint: Guid,
+    reason: &str,
+    ends: &Ends<'_>,
+    [verb, counterpart]: [&str; 2],
+) -> Finding {
+    let (who, why) = (ends.who(endpoint), lacks(reason, counterpart));
+    let text = format!("{who} {verb} {}, and {why}", topic.name);
+    let about = format!("{}|{}|{endpoint}", topic.domain_id, topic.dds_name);
+    finding(kind, alone(reason), &about, text)
 }
 
 /// A writer and a reader whose QoS differs.

@@ -66,7 +66,8 @@ pub(super) struct Wanted {
 #[schema(value_type = Object)]
 pub(super) struct JsonText(Box<RawValue>);
 
-pub(super) type Line = messages::Line<Message<JsonText>>;
+pub(super) type MessageLine = Message<JsonText>;
+pub(super) type Line = messages::Line<MessageLine>;
 
 /// One client's stream.
 struct Stream {
@@ -75,7 +76,7 @@ struct Stream {
     pause: Duration,
     /// When the last message was shown, and when anything was.
     shown: Option<Instant>,
-    said: Instant,
+    written: Instant,
     newest: Option<Arc<Sample>>,
     skipped: u64,
     /// Messages that are not known, with the latest reason.
@@ -179,7 +180,7 @@ pub(super) async fn follow(
         subscription,
         pause: Duration::from_secs_f64(1.0 / hertz),
         shown: None,
-        said: Instant::now(),
+        written: Instant::now(),
         newest: None,
         skipped: 0,
         missed: None,
@@ -225,15 +226,15 @@ impl Pieces for Stream {
         }
         let mut lines = Vec::new();
         while lines.is_empty() {
-            let due = self.shown.map_or(self.said, |shown| shown + self.pause);
+            let due = self.shown.map_or(self.written, |shown| shown + self.pause);
             let due = if self.newest.is_some() {
                 due
             } else {
-                self.said + BEAT
+                self.written + BEAT
             };
             tokio::select! {
                 biased;
-                () = sleep_until(due) => self.say(&mut lines).await,
+                () = sleep_until(due) => self.show(&mut lines).await,
                 () = self.context.stop.cancelled() => self.end("the agent ends", &mut lines).await,
                 item = self.subscription.next() => match item {
                     Some(Item::End(reason)) => self.end(reason, &mut lines).await,
@@ -242,7 +243,7 @@ impl Pieces for Stream {
                 },
             }
         }
-        self.said = Instant::now();
+        self.written = Instant::now();
         Some(lines.into())
     }
 }
@@ -269,7 +270,7 @@ impl Stream {
     async fn end(&mut self, reason: &'static str, lines: &mut Vec<u8>) {
         self.ended = true;
         if self.newest.is_some() {
-            self.say(lines).await;
+            self.show(lines).await;
         }
         write_line(
             lines,
@@ -280,7 +281,7 @@ impl Stream {
     }
 
     /// Shows the newest message, or that the stream lives.
-    async fn say(&mut self, lines: &mut Vec<u8>) {
+    async fn show(&mut self, lines: &mut Vec<u8>) {
         if let Some(missed) = self.missed.take() {
             write_line(lines, &Line::Missed(missed));
         }

@@ -1,12 +1,12 @@
 //! A type's definition as one text, in the form of bags (encoding `ros2msg` of MCAP's registry).
 //!
 //! Uses the order of `rosbag2_cpp`: the type's own text, then each nested message once, below a
-//! line of `=`, sorted within a file and each followed by its own nested messages.
+//! line of `=`. Those of a file are sorted, each followed by its own nested messages.
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-use super::definition::{
+use crate::definition::{
     Definition, Element, Kind, MessageType, SchemaError, Shape, Structure, TypeName,
 };
 
@@ -105,7 +105,7 @@ fn heading(text: &mut String, kind: &str, name: &str) {
 }
 
 /// Returns the lines of a `.msg` file with these fields.
-pub(super) fn members(structure: &Structure) -> String {
+pub(crate) fn members(structure: &Structure) -> String {
     let mut text = String::new();
     for field in &structure.fields {
         let _ = match &field.element {
@@ -140,7 +140,7 @@ pub(super) fn members(structure: &Structure) -> String {
 }
 
 /// Returns the definitions in a schema's text, each with the type that it defines.
-pub(super) fn parts<'a>(
+pub(crate) fn parts<'a>(
     root: &TypeName,
     text: &'a str,
 ) -> Result<Vec<(TypeName, &'a str)>, SchemaError> {
@@ -186,8 +186,8 @@ mod tests {
     use proptest::prelude::*;
     use proptest::sample::select;
 
-    use super::super::{Field, Library, Sources};
     use super::*;
+    use crate::{Field, Library, Sources};
 
     const STAMPED: &str = "\
 # This represents a Point with reference coordinate frame and timestamp

@@ -6,10 +6,12 @@
 
 use std::collections::HashMap;
 
-use super::definition::{Definition, Element, Field, Kind, Shape, Structure, TypeName};
-use super::name::is_identifier;
-use super::parse::{MAX_FIELDS, MAX_TEXT, ParseError, Problem, SEPARATOR, parts, shortened};
-use super::schema;
+use crate::definition::parse::{
+    MAX_FIELDS, MAX_TEXT, ParseError, Problem, SEPARATOR, parts, shortened,
+};
+use crate::definition::schema;
+use crate::definition::{Definition, Element, Field, Kind, Shape, Structure, TypeName};
+use crate::name::is_identifier;
 
 /// Deepest nesting of modules; ROS uses two.
 const MAX_MODULES: usize = 16;
@@ -17,7 +19,7 @@ const MAX_MODULES: usize = 16;
 const NO_MEMBER: &str = "structure_needs_at_least_one_member";
 
 /// Parses an `.idl` file. The text of the definition is that of the equivalent `.msg` file.
-pub(super) fn definition(name: TypeName, text: &str) -> Result<Definition, ParseError> {
+pub(crate) fn definition(name: TypeName, text: &str) -> Result<Definition, ParseError> {
     if text.len() > MAX_TEXT {
         return Err(ParseError {
             line: 1,

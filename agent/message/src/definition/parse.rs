@@ -6,15 +6,15 @@
 
 use std::collections::BTreeSet;
 
-use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
-use super::name::is_identifier;
+use crate::definition::{Element, Field, Kind, Shape, Structure, TypeName};
+use crate::name::is_identifier;
 
 /// Longest file accepted, in bytes: the longest in use has 30 kB.
-pub(super) const MAX_TEXT: usize = 1 << 18;
+pub(crate) const MAX_TEXT: usize = 1 << 18;
 /// Most fields per type.
-pub(super) const MAX_FIELDS: usize = 4096;
+pub(crate) const MAX_FIELDS: usize = 4096;
 /// Separates a service's request and response, and the parts of an action.
-pub(super) const SEPARATOR: &str = "---";
+pub(crate) const SEPARATOR: &str = "---";
 
 /// Why a definition cannot be parsed, and where.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -73,7 +73,7 @@ pub enum Problem {
 }
 
 /// Returns the types in a file: one for a message, two for a service, three for an action.
-pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseError> {
+pub(crate) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseError> {
     if text.len() > MAX_TEXT {
         return Err(ParseError {
             line: 1,
@@ -119,7 +119,7 @@ pub(super) fn file(name: &TypeName, text: &str) -> Result<Vec<Structure>, ParseE
 }
 
 /// Returns the name suffixes of the types in a file.
-pub(super) fn parts(kind: Kind) -> &'static [&'static str] {
+pub(crate) fn parts(kind: Kind) -> &'static [&'static str] {
     match kind {
         Kind::Message => &[""],
         Kind::Service => &["_Request", "_Response"],
@@ -270,7 +270,7 @@ fn size(text: &str) -> Result<u32, Problem> {
 }
 
 /// Returns the text shortened for an error.
-pub(super) fn shortened(text: &str) -> String {
+pub(crate) fn shortened(text: &str) -> String {
     text.chars().take(60).collect()
 }
 

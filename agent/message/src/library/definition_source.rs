@@ -6,18 +6,18 @@ use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use super::definition::{Definition, TypeName};
-use super::dialect::Dialect;
-use super::embedded;
-use super::library::NotFound;
-use super::parse::{MAX_TEXT, ParseError, Problem};
+use crate::definition::parse::{MAX_TEXT, ParseError, Problem};
+use crate::definition::{Definition, TypeName};
+use crate::dialect::Dialect;
+use crate::embedded;
+use crate::library::NotFound;
 
 /// Extension of the file that defines a type without a `.msg`, `.srv` or `.action` file.
 const IDL: &str = "idl";
 
 /// A source.
 #[derive(Debug)]
-pub(super) enum DefinitionSource {
+pub(crate) enum DefinitionSource {
     /// A directory named by the user.
     Directory(PathBuf),
     /// The prefix of an installed ROS.
@@ -27,14 +27,14 @@ pub(super) enum DefinitionSource {
 }
 
 impl DefinitionSource {
-    pub(super) fn describe(&self) -> String {
+    pub(crate) fn describe(&self) -> String {
         match self {
             Self::Directory(path) | Self::Prefix(path) => format!("in {}", path.display()),
             Self::Embedded(_) => "that comes with ros2probe".to_owned(),
         }
     }
 
-    pub(super) fn has(&self, name: &TypeName) -> bool {
+    pub(crate) fn has(&self, name: &TypeName) -> bool {
         match self {
             Self::Embedded(dialect) => embedded::find(name, *dialect).is_some(),
             Self::Directory(_) | Self::Prefix(_) => self.file(name).is_some(),
@@ -63,7 +63,7 @@ impl DefinitionSource {
         })
     }
 
-    pub(super) fn read(&self, name: &TypeName) -> Result<Option<Definition>, NotFound> {
+    pub(crate) fn read(&self, name: &TypeName) -> Result<Option<Definition>, NotFound> {
         let (path, text) = match self {
             Self::Embedded(dialect) => match embedded::find(name, *dialect) {
                 Some(text) => (PathBuf::from(name.to_string()), text.to_owned()),

@@ -1,9 +1,9 @@
 //! The types that services and actions imply, in addition to those in their files.
 
-use super::definition::{Element, Field, Kind, Shape, Structure, TypeName};
+use crate::definition::{Element, Field, Kind, Shape, Structure, TypeName};
 
 /// Returns the types that `rosidl_parser` composes.
-pub(super) fn implicit_types(name: &TypeName) -> Vec<Structure> {
+pub(crate) fn implicit_types(name: &TypeName) -> Vec<Structure> {
     let mut structures = Vec::new();
     match name.kind() {
         Kind::Message => {}

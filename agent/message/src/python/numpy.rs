@@ -2,9 +2,9 @@
 //!
 //! Implements numpy's rules for numbers in one dimension only, with the default options.
 
-use super::digits;
-use super::python;
-use super::value::{Scalar, ScalarKind, Scalars};
+use crate::digits;
+use crate::python;
+use crate::value::{Scalar, ScalarKind, Scalars};
 
 /// `numpy.get_printoptions()`: precision, threshold, edgeitems, linewidth.
 const PRECISION: usize = 8;

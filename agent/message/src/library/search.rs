@@ -5,9 +5,9 @@
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
-use super::definition::{Definition, MessageType, NotClosed, TypeName};
-use super::definition_source::DefinitionSource;
-use super::library::{MAX_SOURCES, NotFound};
+use crate::definition::{Definition, MessageType, NotClosed, TypeName};
+use crate::library::definition_source::DefinitionSource;
+use crate::library::{MAX_SOURCES, NotFound};
 
 /// Most attempts to assemble a type with the announced hash.
 const MAX_TRIES: usize = 256;
@@ -20,7 +20,7 @@ const MAX_HELD: usize = 16 << 20;
 type Read = Result<Option<Arc<Definition>>, NotFound>;
 
 /// One search for one type.
-pub(super) struct Search<'a> {
+pub(crate) struct Search<'a> {
     sources: &'a [DefinitionSource],
     root: &'a TypeName,
     /// The sources of each file, and the number of queries.
@@ -32,7 +32,7 @@ pub(super) struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    pub(super) fn new(sources: &'a [DefinitionSource], root: &'a TypeName) -> Self {
+    pub(crate) fn new(sources: &'a [DefinitionSource], root: &'a TypeName) -> Self {
         let (having, read) = Default::default();
         Self {
             sources,
@@ -47,7 +47,7 @@ impl<'a> Search<'a> {
     /// Returns the first type that can be assembled, or that matches the hash. Usually all parts
     /// are from one source and those after it. A workspace over another ROS than the nodes' may
     /// need the type from one source and the rest from another.
-    pub(super) fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
+    pub(crate) fn run(&mut self, announced: Option<&str>) -> Result<MessageType, NotFound> {
         let mut firsts = BTreeSet::new();
         for file in self.root.files() {
             firsts.extend(self.sources_of(&file)?);
