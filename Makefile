@@ -12,8 +12,8 @@ HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_'
 # Nothing here is optimized or hidden from Miri: few random cases, and its own directory.
 MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE" PROPTEST_CASES=4 \
     CARGO_TARGET_DIR=$(TARGET)/miri cargo "+$$(.ci/prerequisites.sh --nightly)" miri test
-# Floods and what is tried with every change of a byte would take hours there, and queues wake their
-# readers through sockets that it does not have.
+# Floods and tests that change every byte would take hours under Miri, and queues wake their readers
+# through sockets, which it does not support.
 MIRI_WIRE := cursor:: walk:: record:: rtps:: testing:: --skip never
 MIRI_CAPTURE := ring::block ring::turns shm::cell shm::port shm::segment shm::inbox
 MIRI_THREADS := ring::turns

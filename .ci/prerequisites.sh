@@ -253,8 +253,8 @@ ros2() {
     as_root bash "$installer"
 }
 
-# Prints each test that `make test` omits, with the reason, to standard error, and the arguments that
-# omit tests which this system cannot run to standard output.
+# Prints each test that `make test` omits, with the reason, to standard error. Prints the arguments
+# that omit tests which this system cannot run to standard output.
 left_out() {
     local version elsewhere="started by another test"
     # `make test` runs these if the corpus exists.

@@ -1,10 +1,10 @@
 // Layered layout of a directed graph, left to right, with boxes.
 //
-// Cycles are broken by a depth-first search, ranks are the longest paths pulled together, long edges
-// bend through one dummy a rank, barycentre sweeps reduce crossings, and least squares with
+// A depth-first search breaks cycles, ranks are the longest paths pulled together, and long edges
+// bend through one dummy per rank. Barycentre sweeps reduce crossings, and least squares with
 // separations (pooled adjacent violators) give y. The same input gives the same picture. Positions
-// in `previous` give the initial order, which only a clear gain in crossings replaces, so that a
-// picture keeps its order while the graph changes.
+// in `previous` give the initial order; only a clear gain in crossings replaces it. So a picture
+// keeps its order while the graph changes.
 
 /**
  * @typedef {{id: string, w: number, h: number, parent?: string|null, title?: number}} Vertex

@@ -503,7 +503,7 @@ fn sequence_set<B: Bytes>(
     }
 }
 
-/// What to do with a submessage before the interest map is consulted.
+/// Verdict on a submessage before the interest map is consulted.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 #[repr(u32)]
 pub enum Fate {

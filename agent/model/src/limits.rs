@@ -89,7 +89,7 @@ const PARTICIPANTS: Row = Row {
     default: 1_000,
     range: (1, 100_000),
     what: "DDS participants",
-    reached: "a silent one makes room (silent for 5 s if it is younger than 2 s, else for 90 s), \
+    reached: "a silent one makes room (silent for 5 s if it lived less than 2 s, else for 90 s), \
               or the one with the lowest priority for a newcomer with a higher one; otherwise \
               the newcomer is rejected",
     metric: "ros2probe_table_evictions_total",

@@ -28,7 +28,7 @@ const ALLOWED: &[(&str, &[&str])] = &[
         "daemon",
         &["wire", "model", "capture", "message", "bag", "api", "page"],
     ),
-    // The package is called ros2probe. It asks a running agent through the API alone; the daemon
+    // The package is called ros2probe. It reaches a running agent only through the API; the daemon
     // composes a replay, listens for `rp discover` and examines this host for `rp doctor`.
     ("cli", &["message", "bag", "api", "daemon"]),
 ];

@@ -146,7 +146,7 @@ mod tests {
         fn fill(&self, index: usize, bytes: &[u8]) {
             // SAFETY: within the memory.
             let block = unsafe { self.0.byte_add(index * BLOCK) };
-            // SAFETY: likewise.
+            // SAFETY: within the block, behind its start.
             let word = unsafe { block.byte_add(STATUS) };
             // SAFETY: aligned, and accessed as an atomic by both sides.
             let status = unsafe { AtomicU32::from_ptr(word.cast().as_ptr()) };

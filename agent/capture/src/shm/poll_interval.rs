@@ -41,7 +41,7 @@ const OVERDRAFT: f64 = 0.25;
 /// Longest sleep, at any cost.
 const LONGEST: f64 = 50e-3;
 
-/// What the tap is needed for.
+/// Purpose of the tap at a given time.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Need {
     /// Nothing that can pass here is measured, and no name is missing. Newcomers are noticed.

@@ -28,9 +28,12 @@ const RIGHTLY_EMPTY: [(&str, &str); 12] = [
         "robot: Dropped by the agent E",
         "packet rings are of the source `wire`",
     ),
-    ("robot: Who does not talk to whom B", "a topic has one type"),
     (
-        "robot: Who does not talk to whom C",
+        "robot: Endpoints that cannot communicate B",
+        "a topic has one type",
+    ),
+    (
+        "robot: Endpoints that cannot communicate C",
         "a type has one definition",
     ),
     ("robot: Names in conflict A", "names are taken once"),

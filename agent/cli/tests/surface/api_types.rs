@@ -43,7 +43,7 @@ fn get<T: DeserializeOwned + Serialize>(agent: &LocalAgent, path: &str) -> T {
 /// A replay that goes on for longer than the test, with a place for bags.
 fn agent(capture: &str, configuration: &Path) -> LocalAgent {
     let configuration = configuration.to_str().unwrap();
-    let arguments = ["--speed", "0.2", "--config", configuration];
+    let arguments = ["--speed", "0.5", "--config", configuration];
     let mut agent = LocalAgent::replay(&mut rp(), &page::data(capture), &arguments);
     agent.wait_for_log("ready");
     agent
@@ -51,10 +51,7 @@ fn agent(capture: &str, configuration: &Path) -> LocalAgent {
 
 #[test]
 fn answers_of_a_running_robot_read_as_their_types_and_write_the_same_again() {
-    for capture in [
-        "cyclonedds/points-besteffort-lossy-2ns",
-        "cyclonedds/samehost-any",
-    ] {
+    for capture in ["cyclonedds/lifecycle-2ns", "fastrtps-udp/lifecycle-2ns"] {
         let directory = tempfile::tempdir().unwrap();
         let file = directory.path().join("ros2probe.yaml");
         let bags = directory.path().join("bags");
@@ -102,10 +99,8 @@ fn recordings(agent: &LocalAgent) {
     let written: WrittenSnapshot = asked(agent, "POST", "/snapshots/last", (), 201);
     assert!(written.messages > 0);
     let list: SnapshotList = get(agent, "/snapshots");
-    assert_eq!(
-        (&*list.snapshots[0].name, list.snapshots[0].written),
-        ("last", 1)
-    );
+    assert_eq!(list.snapshots[0].name, "last");
+    assert_eq!(list.snapshots.len(), 1);
 }
 
 /// The topic of which most messages come.

@@ -123,7 +123,7 @@ fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
     let web = Web::new("tls_server_config: {cert_file: a.crt, key_file: a.key}\n");
     let said = refused(&web);
     assert!(
-        said.contains("built without") && said.contains("--features tls"),
+        said.contains("this build lacks") && said.contains("--features tls"),
         "{said}"
     );
 }

@@ -370,7 +370,7 @@ mod tests {
             topics: strings(&["chatter"]),
             ..FilterOptions::default()
         };
-        assert!(error(relative).contains("`chatter` is no topic"));
+        assert!(error(relative).contains("`chatter` is not a topic"));
         for wrong in ["(", r"(a)\1", "a{1000000}"] {
             let regex = Some(wrong.to_owned());
             let options = FilterOptions {

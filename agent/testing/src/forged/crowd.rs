@@ -1,5 +1,4 @@
-//! A robot whose graph changes constantly, and the truth about it: which entities exist, and which
-//! left in what way.
+//! A robot whose graph changes constantly, and the truth about it: its entities, and how others left.
 //!
 //! Participants send what DDS implementations send, at a bounded rate. The sender's knowledge is
 //! exact: a lease that it could not renew in time is one that expired.

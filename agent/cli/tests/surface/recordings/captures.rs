@@ -131,7 +131,7 @@ fn a_link_type_that_cannot_be_read_is_no_empty_robot() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {said}");
         assert!(
-            said.contains("link type is 127 (802.11 with radiotap header)"),
+            said.contains("link type 127 (802.11 with radiotap header)"),
             "{said}"
         );
         assert!(output.stdout.is_empty(), "{arguments:?}");
