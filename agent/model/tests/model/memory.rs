@@ -6,6 +6,7 @@ use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
+use crate::allocator;
 use ros2probe_bag::{Options, Storage, TopicDescription, Writer};
 use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
@@ -33,7 +34,6 @@ fn resident() -> usize {
 fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     const DELIVERIES: u64 = 500;
     const ROUNDS: u64 = 6;
-    let _alone = ALONE.lock().unwrap();
     let mut worlds: Vec<_> = (0..ROUNDS).map(|_| Host::new()).collect();
     let address = worlds[0].reader(BOB, 7411);
     let at = |socket: u64| Seen {
@@ -43,7 +43,7 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     for world in &mut worlds {
         world.data(at(1), 1);
     }
-    let before = resident();
+    let before = allocator::held();
     for world in &mut worlds {
         // Busy for longer than a gap stays open, then idle.
         for number in 2..=150 {
@@ -53,7 +53,7 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
         (0..20).for_each(|_| world.wait(1000));
         assert_eq!(world.deliveries().len() as u64, DELIVERIES);
     }
-    let each = (resident() - before) / usize::try_from(DELIVERIES * ROUNDS).unwrap();
+    let each = (allocator::held() - before) / usize::try_from(DELIVERIES * ROUNDS).unwrap();
     assert!((300..1536).contains(&each), "{each} bytes");
     println!("{each} bytes a delivery");
 }
