@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::names::{DdsName, TopicName, TypeName};
 
@@ -44,7 +44,7 @@ pub struct Sample {
     /// Who wrote it.
     pub writer: Guid,
     /// Its number among those of this writer.
-    pub sequence_number: u64,
+    pub sequence_number: SequenceNumber,
     /// INFO_TS: when it was written, by the writer's clock.
     pub source_timestamp: Option<Timestamp>,
     /// Seconds and nanoseconds of its header, where the type begins with one.
@@ -66,9 +66,9 @@ pub struct Missed {
     /// Who wrote them.
     pub writer: Guid,
     /// Number of the first.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Number of the last.
-    pub last: u64,
+    pub last: SequenceNumber,
     /// How many those are.
     pub samples: u64,
     /// Why.

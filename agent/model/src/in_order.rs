@@ -10,8 +10,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::dispatch::{Dispatch, Sample};
 use super::size::Size;
@@ -36,9 +36,9 @@ pub struct Progress {
     /// Rises when the writer begins anew under its GUID, and its numbers with it.
     pub incarnation: u32,
     /// All below came, or no reader waits for them.
-    pub complete: u64,
+    pub complete: SequenceNumber,
     /// No reader waits for any below this.
-    pub awaited: u64,
+    pub awaited: SequenceNumber,
     /// The writer retransmits.
     pub reliable: bool,
     /// And has readers that acknowledge, or may begin to.
@@ -59,15 +59,15 @@ pub struct Due {
 /// The samples that wait for lower numbers.
 #[derive(Debug, Default)]
 pub struct InOrder {
-    waiting: BTreeMap<u64, Due>,
+    waiting: BTreeMap<SequenceNumber, Due>,
     bytes: usize,
     incarnation: Option<u32>,
     /// The number that is waited for, and since when.
-    hole: (u64, Timestamp),
+    hole: (SequenceNumber, Timestamp),
     /// Of the latest sample that was given.
     last: Timestamp,
     /// Numbers that were counted before the writer was announced, and were not given.
-    earlier: BTreeSet<u64>,
+    earlier: BTreeSet<SequenceNumber>,
     announced: Timestamp,
 }
 
@@ -116,13 +116,13 @@ impl InOrder {
     }
 
     /// These were counted before the writer was announced, which it was at `now`.
-    pub fn announced(&mut self, earlier: BTreeSet<u64>, now: Timestamp) {
+    pub fn announced(&mut self, earlier: BTreeSet<SequenceNumber>, now: Timestamp) {
         (self.earlier, self.announced) = (earlier, now);
     }
 
     /// Whether this sample was counted before the announcement and has not been given.
     #[must_use]
-    pub fn lacks(&self, number: u64) -> bool {
+    pub fn lacks(&self, number: SequenceNumber) -> bool {
         self.earlier.contains(&number)
     }
 
@@ -151,7 +151,7 @@ impl InOrder {
     }
 
     /// Samples from before the announcement that will not come again.
-    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<u64> {
+    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
         }
@@ -172,7 +172,7 @@ impl InOrder {
         now: Timestamp,
         room: usize,
         give: &mut impl FnMut(Due),
-    ) -> Option<u64> {
+    ) -> Option<SequenceNumber> {
         self.begin(progress.incarnation, now, give);
         let first = self
             .earlier
@@ -195,7 +195,7 @@ impl InOrder {
         if is_late || self.waiting.len() > WAITING || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
             self.give_all(now, give);
-            return last.map(|last| last.saturating_add(1));
+            return last.map(|last| last.next());
         }
         None
     }

@@ -5,7 +5,7 @@
 //! what it finds is for the caller to count.
 
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
-use ros2probe_wire::{RtpsTime, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
 use super::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
@@ -27,7 +27,7 @@ pub struct Reception {
 #[derive(Clone, Copy, Debug)]
 pub struct Whole {
     /// Its sequence number.
-    pub number: u64,
+    pub number: SequenceNumber,
     /// Payload bytes, encapsulation included.
     pub bytes: u64,
     /// Not a disposal: those take a sequence number and are no message.
@@ -65,14 +65,14 @@ pub enum Decision {
     /// They never came.
     Lost {
         /// The first.
-        first: u64,
+        first: SequenceNumber,
         /// The last.
-        last: u64,
+        last: SequenceNumber,
         /// Fragments of it came; then it is one sample.
         incomplete: bool,
     },
     /// The writer will not send it.
-    Irrelevant(u64),
+    Irrelevant(SequenceNumber),
 }
 
 impl Reception {
@@ -96,7 +96,7 @@ impl Reception {
 
     /// Whether fragments of this sample came and others are missing.
     #[must_use]
-    pub fn is_partial(&self, number: u64) -> bool {
+    pub fn is_partial(&self, number: SequenceNumber) -> bool {
         self.samples.is_partial(number)
     }
 
@@ -198,7 +198,7 @@ impl Reception {
     /// This sample exists, whether it came or not.
     pub fn exists(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         now: Timestamp,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
@@ -225,9 +225,9 @@ impl Reception {
     }
 
     /// Another view takes over: samples of which a part came are its, and no losses. Their numbers.
-    pub fn abandon(&mut self) -> Vec<u64> {
+    pub fn abandon(&mut self) -> Vec<SequenceNumber> {
         let mut partial = Vec::new();
-        for number in self.sequence.settled()..self.sequence.next() {
+        for number in self.sequence.settled().until(self.sequence.next()) {
             if self.samples.is_partial(number) && !self.sequence.has(number) {
                 self.sequence.know(number);
                 partial.push(number);
@@ -239,12 +239,12 @@ impl Reception {
     /// Nobody is there any more for what has not come since the last sample that came.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
-        for number in (sequence.settled()..sequence.next()).rev() {
+        for number in sequence.settled().until(sequence.next()).rev() {
             if sequence.has(number) {
                 return;
             }
             self.samples.forget(number, budget);
-            sequence.excuse(number, number + 1);
+            sequence.excuse(number, number.next());
         }
     }
 
@@ -336,7 +336,7 @@ impl Reception {
         let number = fragments.sequence_number();
         let now = Timestamp(fragments.record().time);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2): beyond is none.
-        if self.sequence.has(number) || number > u64::MAX >> 1 {
+        if self.sequence.has(number) || number > SequenceNumber::MAX {
             return Outcome::Duplicate;
         }
         let progress = self.samples.fragment(fragments, now, budget);
@@ -346,14 +346,14 @@ impl Reception {
             Progress::TooMany => {
                 self.sequence.begin(number);
                 self.exists(number, now, budget, decide);
-                self.sequence.excuse(number, number.saturating_add(1));
+                self.sequence.excuse(number, number.next());
                 return Outcome::Open;
             }
             Progress::Partial | Progress::Complete(_) => {}
         }
         // A sample that is joined in the middle does not count as one that was sent; the writer's
         // first one cannot be.
-        let joined = u64::from(fragments.starting() != 1 && number > 1);
+        let joined = u64::from(fragments.starting() != 1 && number.0 > 1);
         self.sequence.begin(number.saturating_add(joined));
         self.exists(number, now, budget, decide);
         let Progress::Complete(facts) = progress else {
@@ -412,7 +412,7 @@ fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Dec
             return Decision::Irrelevant(number);
         }
         Settled::Lost(number) => (number, number),
-        Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
+        Settled::LostRun(start, end) => (start, end.previous()),
         // A sample of which fragments came was sent: no excuse holds.
         Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
         Settled::Irrelevant(number) => return Decision::Irrelevant(number),

@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{GuidPrefix, Timestamp};
+use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
 
 use super::receivers::{GraphView, Matched};
 use super::route::Direction;
@@ -51,7 +51,7 @@ pub struct KnownRoute {
     /// Samples have come by this route.
     pub has_data: bool,
     /// What had left by when.
-    left: VecDeque<(Timestamp, u64)>,
+    left: VecDeque<(Timestamp, SequenceNumber)>,
 }
 
 impl Routes {
@@ -227,7 +227,7 @@ impl KnownRoute {
     }
 
     /// Up to this number everything has left by now.
-    pub fn mark(&mut self, number: u64, now: Timestamp) {
+    pub fn mark(&mut self, number: SequenceNumber, now: Timestamp) {
         let is_due = self
             .left
             .back()
@@ -242,7 +242,7 @@ impl KnownRoute {
 
     /// Up to which number everything had left then.
     #[must_use]
-    pub fn left_by(&self, at: Timestamp) -> Option<u64> {
+    pub fn left_by(&self, at: Timestamp) -> Option<SequenceNumber> {
         let mut left = self.left.iter().rev();
         left.find(|(moment, _)| *moment <= at)
             .map(|(_, number)| *number)
@@ -272,10 +272,10 @@ mod tests {
             left: VecDeque::new(),
         };
         let at = |tenths: u64| Timestamp((1000 + tenths) * SECOND / 10);
-        (0..1000).for_each(|tenths| known.mark(tenths * 3, at(tenths)));
+        (0..1000).for_each(|tenths| known.mark(SequenceNumber(tenths * 3), at(tenths)));
         assert_eq!(known.left_by(at(500)), None);
-        assert_eq!(known.left_by(at(905)), Some(2700));
-        assert_eq!(known.left_by(at(2000)), Some(2970));
+        assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));
+        assert_eq!(known.left_by(at(2000)), Some(SequenceNumber(2970)));
         assert!(known.left.len() <= MOMENTS);
     }
 }

@@ -6,7 +6,7 @@
 //! [`super::sequence`]; the caller asks there first.
 
 use ros2probe_wire::record::DataFrag;
-use ros2probe_wire::{RtpsTime, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::size::Size;
 
@@ -51,13 +51,13 @@ pub struct Samples {
     /// Of samples that begin earlier, fragments may have been left out.
     sure_from: Timestamp,
     /// The last one that did.
-    last_uncertain: u64,
+    last_uncertain: SequenceNumber,
 }
 
 /// One unfinished sample.
 #[derive(Debug)]
 struct Partial {
-    number: u64,
+    number: SequenceNumber,
     size: u32,
     fragment_size: u32,
     seen: u32,
@@ -193,7 +193,7 @@ impl Samples {
 
     /// Whether fragments of this sample came and others are missing.
     #[must_use]
-    pub fn is_partial(&self, number: u64) -> bool {
+    pub fn is_partial(&self, number: SequenceNumber) -> bool {
         self.place(number).is_some()
     }
 
@@ -204,14 +204,19 @@ impl Samples {
 
     /// Whether this one is under way and may lack fragments that nobody lost.
     #[must_use]
-    pub fn is_doubtful(&self, number: u64) -> bool {
+    pub fn is_doubtful(&self, number: SequenceNumber) -> bool {
         number <= self.last_uncertain && self.is_partial(number)
     }
 
     /// The oldest sample from `first` on that still gets fragments: it and what follows is not
     /// decided yet.
     #[must_use]
-    pub fn growing(&self, now: Timestamp, window: u64, first: u64) -> Option<u64> {
+    pub fn growing(
+        &self,
+        now: Timestamp,
+        window: u64,
+        first: SequenceNumber,
+    ) -> Option<SequenceNumber> {
         let growing = self
             .partial
             .iter()
@@ -220,7 +225,7 @@ impl Samples {
     }
 
     /// Forgets this one; true if it was under way.
-    pub fn forget(&mut self, number: u64, budget: &mut Budget) -> bool {
+    pub fn forget(&mut self, number: SequenceNumber, budget: &mut Budget) -> bool {
         let index = self.place(number);
         if let Some(index) = index {
             self.close(index, budget);
@@ -229,7 +234,7 @@ impl Samples {
     }
 
     /// Forgets those with a lower number than this.
-    pub fn forget_below(&mut self, number: u64, budget: &mut Budget) {
+    pub fn forget_below(&mut self, number: SequenceNumber, budget: &mut Budget) {
         while let Some(index) = self.partial.iter().position(|each| each.number < number) {
             self.close(index, budget);
         }
@@ -265,7 +270,7 @@ impl Samples {
         }
     }
 
-    fn place(&self, number: u64) -> Option<usize> {
+    fn place(&self, number: SequenceNumber) -> Option<usize> {
         self.partial.iter().position(|each| each.number == number)
     }
 
@@ -298,7 +303,7 @@ impl Samples {
     }
 
     /// Gives up the one that has waited longest, the newcomer only when it is alone.
-    fn evict(&mut self, newcomer: u64, budget: &mut Budget) {
+    fn evict(&mut self, newcomer: SequenceNumber, budget: &mut Budget) {
         let candidates = self.partial.iter().enumerate();
         let oldest = candidates.min_by_key(|(_, each)| (each.number == newcomer, each.latest));
         if let Some(index) = oldest.map(|(index, _)| index) {
@@ -356,7 +361,7 @@ mod tests {
             (0, 300),
         ] {
             let partial = || Partial {
-                number: 1,
+                number: SequenceNumber(1),
                 size: 0,
                 fragment_size: 0,
                 seen: 0,
@@ -490,8 +495,14 @@ mod tests {
     fn stalled_samples_expire() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
-        assert_eq!(samples.growing(Timestamp(150), 100, 0), Some(4));
-        assert_eq!(samples.growing(Timestamp(250), 100, 0), None);
+        assert_eq!(
+            samples.growing(Timestamp(150), 100, SequenceNumber(0)),
+            Some(SequenceNumber(4))
+        );
+        assert_eq!(
+            samples.growing(Timestamp(250), 100, SequenceNumber(0)),
+            None
+        );
         assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);
         assert_eq!(budget.bytes, 0);
     }

@@ -14,8 +14,8 @@ mod unconfirmed;
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::MILLISECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::size::Size;
 use bitmap::Bitmap;
@@ -54,29 +54,29 @@ const WORDS: usize = MAX_WINDOW as usize / 64;
 #[derive(Debug, Default)]
 pub struct Sequence {
     /// The first one seen; what lies before does not count. 0 = none seen yet.
-    first: u64,
+    first: SequenceNumber,
     /// All below are decided.
-    settled: u64,
+    settled: SequenceNumber,
     /// All that are known to exist are below this.
-    next: u64,
+    next: SequenceNumber,
     /// The writer has none below this any more: the highest firstSN of its HEARTBEATs.
-    available: u64,
+    available: SequenceNumber,
     /// A value that `available` had, and since when.
-    withdrawn: Option<(Timestamp, u64)>,
+    withdrawn: Option<(Timestamp, SequenceNumber)>,
     /// All readers that acknowledge have all below this, or will not get them.
-    acknowledged: u64,
+    acknowledged: SequenceNumber,
     /// All below came, or no reader waits for them; as far as was looked.
-    complete: u64,
+    complete: SequenceNumber,
     /// How often it began.
     incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some moments, oldest first.
-    checkpoints: VecDeque<(Timestamp, u64)>,
+    checkpoints: VecDeque<(Timestamp, SequenceNumber)>,
     gaps: VecDeque<Gap>,
     newest_source: Timestamp,
     /// The sample of that time.
-    newest: u64,
+    newest: SequenceNumber,
     /// Consecutive samples after it that are older.
     older: u8,
     stale: u32,
@@ -106,8 +106,8 @@ pub enum RunMembership {
 /// One run of missing numbers, for telling reordering from retransmission.
 #[derive(Clone, Copy, Debug)]
 struct Gap {
-    start: u64,
-    end: u64,
+    start: SequenceNumber,
+    end: SequenceNumber,
     noticed: Timestamp,
     requested: bool,
 }
@@ -141,11 +141,11 @@ pub enum RepairMode {
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Settled {
     /// Never came.
-    Lost(u64),
+    Lost(SequenceNumber),
     /// Excused by the writer.
-    Irrelevant(u64),
+    Irrelevant(SequenceNumber),
     /// So many in one go, beyond what the window holds.
-    LostRun(u64, u64),
+    LostRun(SequenceNumber, SequenceNumber),
 }
 
 impl Sequence {
@@ -191,12 +191,12 @@ impl Sequence {
     /// Whether any sample was seen.
     #[must_use]
     pub const fn started(&self) -> bool {
-        self.first != 0
+        self.first.0 != 0
     }
 
     /// One past the highest number known to exist.
     #[must_use]
-    pub const fn next(&self) -> u64 {
+    pub const fn next(&self) -> SequenceNumber {
         self.next
     }
 
@@ -208,19 +208,19 @@ impl Sequence {
 
     /// Whether this sample was received whole before.
     #[must_use]
-    pub fn has(&self, number: u64) -> bool {
+    pub fn has(&self, number: SequenceNumber) -> bool {
         self.started() && (number < self.floor() || number < self.next && self.received.get(number))
     }
 
     /// Takes in one whole sample, after [`Self::recognise`].
     pub fn receive(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         repair_mode: RepairMode,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
-        if !is_number(number) {
+        if !number.is_valid() {
             return Arrival::Duplicate;
         }
         if !self.started() {
@@ -258,7 +258,7 @@ impl Sequence {
     }
 
     /// Takes in a sample's source time.
-    pub fn sourced(&mut self, number: u64, source: Timestamp) {
+    pub fn sourced(&mut self, number: SequenceNumber, source: Timestamp) {
         if number <= self.newest {
             return;
         }
@@ -270,36 +270,41 @@ impl Sequence {
     }
 
     /// A sample of this number exists, for some of its fragments came.
-    pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    pub fn exists(
+        &mut self,
+        number: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
         let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
-        if self.started() && is_ahead && is_number(number) {
+        if self.started() && is_ahead && number.is_valid() {
             self.extend(number, number + 1, now, settled);
         }
     }
 
     /// Numbers count from here on; does nothing once begun.
-    pub fn begin(&mut self, number: u64) {
-        if !self.started() && number > 0 && number < u64::MAX >> 1 {
+    pub fn begin(&mut self, number: SequenceNumber) {
+        if !self.started() && number > SequenceNumber::ZERO && number < SequenceNumber::MAX {
             self.restart(number);
         }
     }
 
     /// All below are decided.
     #[must_use]
-    pub const fn settled(&self) -> u64 {
+    pub const fn settled(&self) -> SequenceNumber {
         self.settled
     }
 
     /// When it was noticed that this one was missing, as far as that is remembered.
     #[must_use]
-    pub fn missed_since(&self, number: u64) -> Option<Timestamp> {
+    pub fn missed_since(&self, number: SequenceNumber) -> Option<Timestamp> {
         let mut gaps = self.gaps.iter().rev();
         let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
         gap.map(|gap| gap.noticed)
     }
 
     /// This one came another way: it is no loss here, and no sample either.
-    pub fn know(&mut self, number: u64) {
+    pub fn know(&mut self, number: SequenceNumber) {
         if self.started() && number >= self.floor() && number < self.next {
             self.received.set(number);
         }
@@ -312,9 +317,13 @@ impl Sequence {
             return;
         }
         if other.next > self.next && other.next - self.next <= FAR {
-            self.extend(other.next - 1, other.next, now, settled);
+            self.extend(other.next.previous(), other.next, now, settled);
         }
-        for number in self.floor().max(other.floor())..self.next.min(other.next) {
+        for number in self
+            .floor()
+            .max(other.floor())
+            .until(self.next.min(other.next))
+        {
             if other.received.get(number) {
                 self.received.set(number);
             }
@@ -323,13 +332,13 @@ impl Sequence {
 
     /// Lowest number that counts.
     #[must_use]
-    pub const fn first(&self) -> u64 {
+    pub const fn first(&self) -> SequenceNumber {
         self.first
     }
 
     /// All below came, or no reader waits for them: the writer left them out or has them no longer,
     /// readers acknowledged them, or they are settled.
-    pub fn complete(&mut self) -> u64 {
+    pub fn complete(&mut self) -> SequenceNumber {
         let decided = self.settled.max(self.available).max(self.floor());
         self.complete = self.complete.max(decided);
         while self.complete < self.next
@@ -341,13 +350,13 @@ impl Sequence {
     }
 
     /// Nothing below `number` is waited for any more.
-    pub fn skip(&mut self, number: u64) {
+    pub fn skip(&mut self, number: SequenceNumber) {
         self.complete = self.complete.max(number.min(self.next));
     }
 
     /// The writer will send none below this again.
     #[must_use]
-    pub fn awaited(&self) -> u64 {
+    pub fn awaited(&self) -> SequenceNumber {
         self.available.max(self.acknowledged)
     }
 
@@ -363,7 +372,7 @@ impl Sequence {
         &mut self,
         now: Timestamp,
         (window, grace): (u64, u64),
-        hold: Option<u64>,
+        hold: Option<SequenceNumber>,
         settled: &mut impl FnMut(Settled),
     ) {
         if !self.started() {
@@ -406,11 +415,11 @@ impl Sequence {
     }
 
     /// Numbers below this are not remembered.
-    fn floor(&self) -> u64 {
+    fn floor(&self) -> SequenceNumber {
         self.next.saturating_sub(self.received.len())
     }
 
-    fn restart(&mut self, number: u64) {
+    fn restart(&mut self, number: SequenceNumber) {
         *self = Self {
             first: number,
             settled: number,
@@ -427,7 +436,13 @@ impl Sequence {
     }
 
     /// Raises `next` to `end`; `start..end` came, what lies before it is a gap.
-    fn extend(&mut self, start: u64, end: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    fn extend(
+        &mut self,
+        start: SequenceNumber,
+        end: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
         if start > self.next {
             self.note_gap(self.next, start, now);
         }
@@ -452,7 +467,7 @@ impl Sequence {
         self.last_advance = now;
     }
 
-    fn note_gap(&mut self, start: u64, end: u64, now: Timestamp) {
+    fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: Timestamp) {
         if self.gaps.len() >= GAPS {
             self.gaps.pop_front();
         }
@@ -464,7 +479,12 @@ impl Sequence {
         });
     }
 
-    fn was_retransmitted(&self, number: u64, repair_mode: RepairMode, now: Timestamp) -> bool {
+    fn was_retransmitted(
+        &self,
+        number: SequenceNumber,
+        repair_mode: RepairMode,
+        now: Timestamp,
+    ) -> bool {
         let gap = self
             .gaps
             .iter()
@@ -479,8 +499,8 @@ impl Sequence {
         }
     }
 
-    fn settle(&mut self, limit: u64, settled: &mut impl FnMut(Settled)) {
-        for number in self.settled..limit.min(self.next) {
+    fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
+        for number in self.settled.until(limit.min(self.next)) {
             if !self.received.get(number) {
                 let excused = self.excused.get(number);
                 settled(if excused {
@@ -492,11 +512,6 @@ impl Sequence {
         }
         self.settled = self.settled.max(limit.min(self.next));
     }
-}
-
-/// Whether it can be a sequence number: those are signed (RTPS 2.5, 9.3.2).
-const fn is_number(number: u64) -> bool {
-    number > 0 && number <= u64::MAX >> 1
 }
 
 #[cfg(test)]

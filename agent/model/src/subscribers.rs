@@ -17,7 +17,7 @@ mod lifecycle;
 mod submessages;
 
 use ros2probe_wire::record::{Body, Sample, flag};
-use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::acknowledgement::Acknowledgements;
 use super::delivery::{Delivery, DeliveryContext, Receiver, Totals, seconds};
@@ -168,7 +168,7 @@ impl Subscribers {
     pub fn acknowledgements(
         &self,
         writer: Guid,
-        next: u64,
+        next: SequenceNumber,
         now: Timestamp,
     ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
         self.acknowledgements.facts(writer, next, now)
@@ -229,12 +229,12 @@ impl Subscribers {
 
     /// All readers that acknowledge have all samples below this number; `None` if none does.
     #[must_use]
-    pub fn acknowledged_below(&self) -> Option<u64> {
+    pub fn acknowledged_below(&self) -> Option<SequenceNumber> {
         self.acknowledgements.floor(|_| true)
     }
 
     /// The writer's newest sample is this one.
-    pub fn wrote(&mut self, number: u64, at: Timestamp) {
+    pub fn wrote(&mut self, number: SequenceNumber, at: Timestamp) {
         self.acknowledgements.wrote(number, at);
     }
 
@@ -456,7 +456,7 @@ impl Subscribers {
     }
 
     /// Lets deliveries that may be the same receiver's know of each other's samples.
-    fn share(&mut self, place: usize, next: u64, whole: Option<u64>) {
+    fn share(&mut self, place: usize, next: SequenceNumber, whole: Option<SequenceNumber>) {
         let Some(delivery) = self.deliveries.get(place) else {
             return;
         };
@@ -472,11 +472,11 @@ impl Subscribers {
             return;
         }
         let end = delivery.next().min(next.saturating_add(LOOK_BACK));
-        if next == 0 || end <= next + 1 {
+        if next == SequenceNumber::ZERO || end <= next + 1 {
             return;
         }
-        let missing = (next..end).filter(|number| delivery.misses(*number));
-        let has = |number: &u64| {
+        let missing = next.until(end).filter(|number| delivery.misses(*number));
+        let has = |number: &SequenceNumber| {
             let mut others = self.deliveries.iter().filter(|each| is_open(each));
             others.any(|other| other.misses(*number) || other.has(*number))
         };

@@ -9,7 +9,7 @@ mod sampled_view;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
+use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber, Timestamp};
 
 use super::dispatch::MissedReason;
 use super::histogram::Histogram;
@@ -64,7 +64,7 @@ pub struct MeasurementContext<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counted {
     /// Its sequence number.
-    pub number: u64,
+    pub number: SequenceNumber,
     /// Payload bytes, encapsulation included.
     pub bytes: u64,
     /// INFO_TS.
@@ -177,7 +177,7 @@ impl Writer {
 
     /// One past the highest number known to exist.
     #[must_use]
-    pub const fn next(&self) -> u64 {
+    pub const fn next(&self) -> SequenceNumber {
         self.reception.sequence().next()
     }
 
@@ -301,7 +301,7 @@ impl Writer {
         }
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
             // The newest one is excused too, which means nothing once it is received.
             sequence.excuse(next, sequence.next());
         }
@@ -309,7 +309,7 @@ impl Writer {
     }
 
     /// Its readers have all below `base`.
-    pub fn acknowledged(&mut self, base: u64) {
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
         self.reception.sequence_mut().acknowledged(base);
     }
 
@@ -319,7 +319,7 @@ impl Writer {
         let reliable = self.traits.reliable && !self.is_sampled(now);
         // A repair may pass by shared memory, too, as long as a sample is looked for there.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
-        let unseen = unseen.filter(|_| waits).unwrap_or(u64::MAX);
+        let unseen = unseen.filter(|_| waits).unwrap_or(SequenceNumber(u64::MAX));
         let sequence = self.reception.sequence_mut();
         if !waits {
             sequence.skip(sequence.next());
@@ -334,7 +334,7 @@ impl Writer {
     }
 
     /// Nothing below `number` is waited for any more.
-    pub fn skip(&mut self, number: u64) {
+    pub fn skip(&mut self, number: SequenceNumber) {
         self.reception.sequence_mut().skip(number);
     }
 

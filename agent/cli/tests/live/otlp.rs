@@ -14,7 +14,7 @@ use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::rotel::{Item, Rotel, exports};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 const MESSAGES: u64 = 1_200;
 
@@ -154,7 +154,7 @@ fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() 
         .find_map(|event| event.guid.clone());
     let writer = guid(&writer.context("the publisher says its GUID")?)?;
     let sampled: Vec<u64> = (1..=MESSAGES)
-        .filter(|number| Message::identity(writer, *number) >> 55 & 1 == 1)
+        .filter(|number| Message::identity(writer, SequenceNumber(*number)) >> 55 & 1 == 1)
         .collect();
     ensure!(
         sampled.len() as u64 > MESSAGES / 3,
@@ -174,7 +174,10 @@ fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() 
         let received = received.get(number).context("not received")?;
         ensure!(field(sent, "Trace ID")? == field(received, "Trace ID")?);
         ensure!(field(sent, "ID")? == field(received, "Parent ID")?);
-        let trace = format!("{:032x}", Message::identity(writer, *number));
+        let trace = format!(
+            "{:032x}",
+            Message::identity(writer, SequenceNumber(*number))
+        );
         ensure!(field(sent, "Trace ID")? == trace);
     }
     Ok(())

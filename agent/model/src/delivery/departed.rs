@@ -1,6 +1,6 @@
 //! Samples that left this host for a receiver on it: whether they arrive, or count as lost.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::{Delivery, DeliveryContext, FIRST_MOMENTS, SILENCE, UNDER_WAY};
 
@@ -9,9 +9,9 @@ impl Delivery {
     /// does not arrive at a receiver that was `alive` afterwards is lost.
     pub fn expect(
         &mut self,
-        newest: u64,
+        newest: SequenceNumber,
         alive: Option<Timestamp>,
-        left_by: impl Fn(Timestamp) -> Option<u64>,
+        left_by: impl Fn(Timestamp) -> Option<SequenceNumber>,
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
@@ -33,7 +33,7 @@ impl Delivery {
     }
 
     /// Nothing more will come of what has left for here.
-    pub fn expect_no_more(&mut self, newest: u64, context: &mut DeliveryContext<'_>) {
+    pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
             self.exists(newest, context);
         }
@@ -41,9 +41,9 @@ impl Delivery {
 
     /// What was written until its reader appeared is for no reader here: `next` and when it last
     /// rose are those before the record that is taken in.
-    pub(super) fn excuse_unheard(&mut self, (next, advanced): (u64, Timestamp)) {
+    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, Timestamp)) {
         let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < self.opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
             sequence.excuse(next, sequence.next());
         }
     }

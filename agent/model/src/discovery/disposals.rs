@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::facts::Origin;
 use crate::size::Size;
@@ -19,7 +19,7 @@ const UNDER_WAY: u64 = 4 * STALE_WITHIN;
 #[derive(Debug, Default)]
 pub(super) struct Disposals {
     /// What, when, and by which sender's which sample.
-    latest: VecDeque<(Guid, Timestamp, GuidPrefix, u64)>,
+    latest: VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>,
 }
 
 impl Disposals {

@@ -9,7 +9,7 @@ use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::{Locator, VendorId};
-use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::priority::Priority;
@@ -40,7 +40,7 @@ pub struct Origin {
     /// Who sent it, perhaps on somebody else's behalf.
     pub sender: GuidPrefix,
     /// Its number among those of its writer.
-    pub sequence_number: u64,
+    pub sequence_number: SequenceNumber,
     /// Destination address, IPv4-mapped for IPv4.
     pub destination: [u8; 16],
     /// Destination port.
@@ -106,7 +106,7 @@ pub struct Participant {
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
     /// The `ros_discovery_info` sample that told the nodes.
-    pub(super) nodes_from: Option<(Guid, u64)>,
+    pub(super) nodes_from: Option<(Guid, SequenceNumber)>,
 }
 
 /// One node.

@@ -1,9 +1,9 @@
 //! Which run of numbers is the writer's: the live one, or one that further datagrams confirm.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::unconfirmed::{CONFIRMATIONS, Run};
-use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled, is_number};
+use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled};
 
 impl Sequence {
     /// Looks at number and source time of a sample before anything else does: a writer that jumps,
@@ -11,12 +11,12 @@ impl Sequence {
     /// unconfirmed.
     pub fn recognise(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         source: Option<Timestamp>,
         reach: u64,
         now: Timestamp,
     ) -> RunMembership {
-        if !is_number(number) {
+        if !number.is_valid() {
             return RunMembership::Live;
         }
         if self.is_unconfirmed(number, source, reach) {
@@ -48,8 +48,13 @@ impl Sequence {
 
     /// Whether a sample of this number and source time does not belong to the live run.
     #[must_use]
-    pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
-        if !self.started() || !is_number(number) {
+    pub fn is_unconfirmed(
+        &self,
+        number: SequenceNumber,
+        source: Option<Timestamp>,
+        reach: u64,
+    ) -> bool {
+        if !self.started() || !number.is_valid() {
             return false;
         }
         if number >= self.next {
@@ -69,14 +74,14 @@ impl Sequence {
     }
 
     /// Marks a unconfirmed sample as whole. Returns whether that is new.
-    pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
+    pub fn complete_unconfirmed(&mut self, number: SequenceNumber) -> bool {
         let unconfirmed = self.unconfirmed.as_mut();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
     }
 
     /// Whether a unconfirmed sample came whole.
     #[must_use]
-    pub fn has_unconfirmed(&self, number: u64) -> bool {
+    pub fn has_unconfirmed(&self, number: SequenceNumber) -> bool {
         let unconfirmed = self.unconfirmed.as_ref();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
     }
@@ -100,7 +105,7 @@ impl Sequence {
         let Some((first, _)) = run.numbers.first() else {
             return run;
         };
-        let jump = first.checked_sub(self.next);
+        let jump = first.0.checked_sub(self.next.0);
         // What was hardly seen before lost nothing that is far from it.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,

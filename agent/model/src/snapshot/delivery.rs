@@ -5,7 +5,7 @@ use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use crate::measurement::Delivered;
 use crate::names::NodeName;
@@ -110,7 +110,7 @@ pub struct AcknowledgementFacts {
     /// The reader's node.
     pub node: Option<NodeName>,
     /// All samples up to this one are acknowledged; 0 = none.
-    pub acknowledged: u64,
+    pub acknowledged: SequenceNumber,
     /// Samples that the reader asked for in its last ACKNACK.
     pub missing: u64,
     /// Samples asked for again since the start, every request counted.
