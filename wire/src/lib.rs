@@ -43,4 +43,5 @@ pub use cursor::{Cursor, Endianness, Reason, WireError};
 pub use domain::DomainId;
 pub use guid::{EntityId, Guid, GuidPrefix};
 pub use record::Record;
+pub use rtps::SequenceNumber;
 pub use time::{Duration, RtpsTime, Timestamp};

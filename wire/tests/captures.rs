@@ -37,7 +37,7 @@ struct Found {
     participants: HashMap<Guid, ParticipantAnnouncement>,
     endpoints: HashMap<Guid, EndpointAnnouncement>,
     gone: Vec<(String, u32)>,
-    entities: Vec<((String, i64), ParticipantEntities)>,
+    entities: Vec<((String, u64), ParticipantEntities)>,
     writers: HashMap<Guid, Writer>,
     discovery_info_writers: HashSet<Guid>,
 }
@@ -45,7 +45,7 @@ struct Found {
 #[derive(Default)]
 struct Writer {
     submessages: u64,
-    sequence_numbers: HashSet<i64>,
+    sequence_numbers: HashSet<u64>,
     payload_sizes: BTreeMap<String, u64>,
     sample_size: Option<u32>,
 }

@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::record::{AckNack, SequenceNumberSet, flag};
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
@@ -23,7 +23,7 @@ pub struct Acknowledgements {
     /// Readers, sorted by GUID.
     readers: Vec<Reader>,
     /// Sequence numbers and the times at which they were first seen, sorted by number.
-    times: VecDeque<(u64, Timestamp)>,
+    times: VecDeque<(SequenceNumber, Timestamp)>,
     /// Readers that were not added because the list was full.
     pub refused: u64,
 }
@@ -32,7 +32,7 @@ pub struct Acknowledgements {
 struct Reader {
     guid: Guid,
     /// All samples below this number are acknowledged.
-    base: u64,
+    base: SequenceNumber,
     missing: u64,
     requested: u64,
     acknacks: u64,
@@ -86,13 +86,13 @@ impl Acknowledgements {
 
     /// Returns the number below which all of these readers have acknowledged everything; `None` if
     /// none of them has sent an ACKNACK.
-    pub fn floor(&self, is_meant: impl Fn(Guid) -> bool) -> Option<u64> {
+    pub fn floor(&self, is_meant: impl Fn(Guid) -> bool) -> Option<SequenceNumber> {
         let meant = self.readers.iter().filter(|reader| is_meant(reader.guid));
         meant.map(|reader| reader.base).min()
     }
 
     /// Records the writer's newest sample and its time.
-    pub fn wrote(&mut self, number: u64, at: Timestamp) {
+    pub fn wrote(&mut self, number: SequenceNumber, at: Timestamp) {
         if self.readers.is_empty() {
             return;
         }
@@ -122,19 +122,19 @@ impl Acknowledgements {
     pub fn facts(
         &self,
         writer: Guid,
-        next: u64,
+        next: SequenceNumber,
         now: Timestamp,
     ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
         self.readers.iter().map(move |reader| AcknowledgementFacts {
             writer,
             reader: reader.guid,
             node: None,
-            acknowledged: reader.base.saturating_sub(1),
+            acknowledged: reader.base.previous(),
             missing: reader.missing,
             requested: reader.requested,
             acknacks: reader.acknacks,
-            lag_samples: next.saturating_sub(reader.base.max(1)),
-            lag_seconds: self.lag(reader.base.max(1), next, now),
+            lag_samples: next.steps_since(reader.base.max(SequenceNumber(1))),
+            lag_seconds: self.lag(reader.base.max(SequenceNumber(1)), next, now),
             last_seen: reader.last_seen,
         })
     }
@@ -143,7 +143,7 @@ impl Acknowledgements {
         clippy::cast_precision_loss,
         reason = "nanoseconds of a delay stay exact to 104 days"
     )]
-    fn lag(&self, base: u64, next: u64, now: Timestamp) -> Option<f64> {
+    fn lag(&self, base: SequenceNumber, next: SequenceNumber, now: Timestamp) -> Option<f64> {
         if base >= next {
             return Some(0.0);
         }
@@ -179,7 +179,7 @@ impl Reader {
     const fn new(guid: Guid) -> Self {
         Self {
             guid,
-            base: 0,
+            base: SequenceNumber::ZERO,
             missing: 0,
             requested: 0,
             acknacks: 0,
@@ -238,7 +238,7 @@ mod tests {
 
     fn facts(all: &Acknowledgements, next: u64, seconds: u64) -> Vec<AcknowledgementFacts> {
         let now = Timestamp(seconds * 1_000_000_000);
-        all.facts(guid(9), next, now).collect()
+        all.facts(guid(9), SequenceNumber(next), now).collect()
     }
 
     #[test]
@@ -247,16 +247,16 @@ mod tests {
         put(&mut all, &acknack(1, 1, 0, 0));
         put(&mut all, &acknack(2, 1, 0, 0));
         for number in 1..=100 {
-            all.wrote(number, Timestamp(number * 1_000_000_000));
+            all.wrote(SequenceNumber(number), Timestamp(number * 1_000_000_000));
         }
         put(&mut all, &acknack(2, 101, 0, 0));
         put(&mut all, &acknack(1, 41, 3, 0b101 << 29));
         let [hangs, keeps_up] = &facts(&all, 101, 110)[..] else {
             panic!("two readers")
         };
-        assert_eq!((hangs.acknowledged, hangs.missing), (40, 2));
+        assert_eq!((hangs.acknowledged.0, hangs.missing), (40, 2));
         assert_eq!((hangs.lag_samples, hangs.lag_seconds), (60, Some(69.0)));
-        assert_eq!((keeps_up.acknowledged, keeps_up.missing), (100, 0));
+        assert_eq!((keeps_up.acknowledged.0, keeps_up.missing), (100, 0));
         assert_eq!((keeps_up.lag_samples, keeps_up.lag_seconds), (0, Some(0.0)));
     }
 
@@ -265,7 +265,7 @@ mod tests {
         let mut all = Acknowledgements::default();
         put(&mut all, &acknack(1, 1, 0, 0));
         for number in 1..=360_000 {
-            all.wrote(number, Timestamp(number * 10_000_000));
+            all.wrote(SequenceNumber(number), Timestamp(number * 10_000_000));
         }
         assert!(all.times.len() <= TIMES);
         put(&mut all, &acknack(1, 180_001, 0, 0));

@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, HashMap};
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::size::Size;
 
@@ -26,9 +26,9 @@ const LEAST: usize = 4096;
 /// All unfinished samples.
 #[derive(Debug)]
 pub struct Assembly {
-    parts: HashMap<(Guid, u64), Part>,
+    parts: HashMap<(Guid, SequenceNumber), Part>,
     /// The same samples in the order in which they began.
-    ages: BTreeMap<u64, (Guid, u64)>,
+    ages: BTreeMap<u64, (Guid, SequenceNumber)>,
     begun: u64,
     bytes: usize,
     limit: usize,
@@ -145,19 +145,19 @@ impl Assembly {
 
     /// Returns whether all bytes of this sample have arrived.
     #[must_use]
-    pub fn is_whole(&self, writer: Guid, number: u64) -> bool {
+    pub fn is_whole(&self, writer: Guid, number: SequenceNumber) -> bool {
         let part = self.parts.get(&(writer, number));
         part.is_some_and(|part| part.head.len() == part.size)
     }
 
     /// Removes a sample that was counted and returns its bytes, or `None` if some are missing.
-    pub fn take(&mut self, writer: Guid, number: u64) -> Option<Bytes> {
+    pub fn take(&mut self, writer: Guid, number: SequenceNumber) -> Option<Bytes> {
         let part = self.remove((writer, number))?;
         (part.head.len() == part.size).then(|| part.head.into())
     }
 
     /// Drops this sample.
-    pub fn forget(&mut self, writer: Guid, number: u64) {
+    pub fn forget(&mut self, writer: Guid, number: SequenceNumber) {
         self.remove((writer, number));
     }
 
@@ -171,7 +171,7 @@ impl Assembly {
         self.retain(|_, part| part.touched.0.saturating_add(FORGET) > now.0);
     }
 
-    fn retain(&mut self, mut keep: impl FnMut(&(Guid, u64), &Part) -> bool) {
+    fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
         let (ages, bytes) = (&mut self.ages, &mut self.bytes);
         self.parts.retain(|key, part| {
             let keeps = keep(key, part);
@@ -183,7 +183,7 @@ impl Assembly {
         });
     }
 
-    fn remove(&mut self, key: (Guid, u64)) -> Option<Part> {
+    fn remove(&mut self, key: (Guid, SequenceNumber)) -> Option<Part> {
         let part = self.parts.remove(&key)?;
         self.ages.remove(&part.age);
         self.bytes -= part.bytes() + OVERHEAD;
@@ -335,7 +335,7 @@ mod tests {
                 let record = fragment(writer(1), 5, first, count, sample, fragment_size as u32);
                 put(&mut assembly, &record, &bytes, 0);
             }
-            prop_assert_eq!(assembly.take(writer(1), 5).map(|bytes| bytes.to_vec()), Some(whole));
+            prop_assert_eq!(assembly.take(writer(1), SequenceNumber(5)).map(|bytes| bytes.to_vec()), Some(whole));
             prop_assert_eq!((assembly.bytes, assembly.ages.len()), (0, 0));
         }
     }
@@ -354,9 +354,9 @@ mod tests {
                 put(&mut assembly, &record, &two[from..to(2000)], 0);
             }
         }
-        assert_eq!(assembly.take(writer(1), 9).unwrap(), one);
-        assert_eq!(assembly.take(writer(2), 9).unwrap(), two);
-        assert_eq!(assembly.take(writer(2), 9), None);
+        assert_eq!(assembly.take(writer(1), SequenceNumber(9)).unwrap(), one);
+        assert_eq!(assembly.take(writer(2), SequenceNumber(9)).unwrap(), two);
+        assert_eq!(assembly.take(writer(2), SequenceNumber(9)), None);
     }
 
     #[test]
@@ -381,7 +381,7 @@ mod tests {
             &[0; 999],
             0,
         );
-        assert_eq!(assembly.take(writer(1), 1), None);
+        assert_eq!(assembly.take(writer(1), SequenceNumber(1)), None);
         assert_eq!(assembly.bytes, 0);
         put(
             &mut assembly,
@@ -435,7 +435,7 @@ mod tests {
             &[1; 2999],
             0,
         );
-        assert_eq!(assembly.take(writer(1), 1), None);
+        assert_eq!(assembly.take(writer(1), SequenceNumber(1)), None);
     }
 
     #[test]
@@ -458,14 +458,14 @@ mod tests {
         }
         assert!(assembly.evictions > 49_000);
         let newest = assembly.parts.keys().map(|(_, number)| *number).max();
-        assert_eq!(newest, Some(49_999));
+        assert_eq!(newest, Some(SequenceNumber(49_999)));
         // A sample that is larger than the budget is dropped as it grows.
         for start in 1..3000 {
             let record = fragment(writer(2), 1, start, 1, 3_000_000, 1000);
             put(&mut assembly, &record, &[0; 1000], 0);
             assert!(assembly.bytes <= 1 << 20);
         }
-        assert_eq!(assembly.take(writer(2), 1), None);
+        assert_eq!(assembly.take(writer(2), SequenceNumber(1)), None);
     }
 
     #[test]

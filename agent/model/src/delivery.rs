@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::journal::Journal;
 use super::loss::LossCause;
@@ -184,13 +184,13 @@ impl Delivery {
 
     /// Returns the highest sequence number known to exist, plus one.
     #[must_use]
-    pub const fn next(&self) -> u64 {
+    pub const fn next(&self) -> SequenceNumber {
         self.reception.sequence().next()
     }
 
     /// Returns whether this sample is known to exist but has not arrived.
     #[must_use]
-    pub fn misses(&self, number: u64) -> bool {
+    pub fn misses(&self, number: SequenceNumber) -> bool {
         let sequence = self.reception.sequence();
         sequence.started()
             && number >= sequence.first()
@@ -200,12 +200,12 @@ impl Delivery {
 
     /// Returns whether this sample has arrived.
     #[must_use]
-    pub fn has(&self, number: u64) -> bool {
+    pub fn has(&self, number: SequenceNumber) -> bool {
         self.reception.sequence().has(number)
     }
 
     /// Records that this sample arrived by another route that may lead to the same receiver.
-    pub fn know(&mut self, number: u64, totals: &mut Totals) {
+    pub fn know(&mut self, number: SequenceNumber, totals: &mut Totals) {
         self.reception.sequence_mut().know(number);
         if self.loss_causes.resolve(number) {
             self.tally.pending = self.tally.pending.saturating_sub(1);
@@ -266,7 +266,7 @@ impl Delivery {
             context.budget.evictions += 1;
         }
         let number = sample.sequence_number();
-        let is_tail = !sample.is_start() && number > 1;
+        let is_tail = !sample.is_start() && number.0 > 1;
         let (reception, budget, mut accounting) = self.split(context);
         let is_confirmed =
             reception.recognise(sample, budget, &mut |decision| accounting.take(decision));
@@ -284,7 +284,7 @@ impl Delivery {
     }
 
     /// Records that the kernel failed to reassemble some IP fragments of this sample.
-    pub fn not_reassembled(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
+    pub fn not_reassembled(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         self.uses_network = true;
         let sequence = self.reception.sequence();
         if !sequence.started() || number > sequence.next().saturating_add(REACH) {
@@ -305,7 +305,7 @@ impl Delivery {
     /// sample arrives and none is requested, the samples may use shared memory.
     pub fn heartbeat(&mut self, heartbeat: Heartbeat<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(heartbeat.record());
-        let end = heartbeat.last().saturating_add(1);
+        let end = heartbeat.last().next();
         self.reception.sequence_mut().begin(end);
         if !self.uses_network {
             return;
@@ -334,7 +334,7 @@ impl Delivery {
     }
 
     /// Records that all readers have every sample below `base`.
-    pub fn acknowledged(&mut self, base: u64) {
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
         self.reception.sequence_mut().acknowledged(base);
     }
 
@@ -365,10 +365,10 @@ impl Delivery {
         // Long runs are not caused by single fragments, and no retransmission repairs them.
         let (long, short): (Vec<_>, Vec<_>) = runs
             .into_iter()
-            .partition(|(first, last)| last - first > LONG_RUN);
-        let pending: BTreeSet<u64> = short
+            .partition(|(first, last)| *last - *first > LONG_RUN);
+        let pending: BTreeSet<SequenceNumber> = short
             .into_iter()
-            .flat_map(|(first, last)| first..=last)
+            .flat_map(|(first, last)| first.until(last.next()))
             .filter(|number| !self.has(*number) && !other.has(*number))
             .collect();
         self.tally.add(&other.tally);
@@ -394,7 +394,10 @@ impl Delivery {
         // Decisions of the other delivery are final.
         let sequence = self.reception.sequence_mut();
         let settled = settled.min(sequence.next());
-        (sequence.settled()..settled).for_each(|number| sequence.know(number));
+        sequence
+            .settled()
+            .until(settled)
+            .for_each(|number| sequence.know(number));
     }
 
     const fn is_reliable(&self, context: &DeliveryContext<'_>) -> bool {
@@ -496,9 +499,9 @@ impl Delivery {
     }
 
     /// Restarts the delivery after a long range of numbers that were not for this receiver.
-    fn begin_anew(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
+    fn begin_anew(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
-        let is_far = number.saturating_sub(sequence.next()) > EXCUSED;
+        let is_far = number.steps_since(sequence.next()) > EXCUSED;
         if sequence.started() && is_far && sequence.last_advance() < self.opened {
             let (reception, budget, mut accounting) = self.split(context);
             reception.settle(budget, &mut |decision| accounting.take(decision));
@@ -506,7 +509,12 @@ impl Delivery {
         }
     }
 
-    fn record_cause(&mut self, number: u64, cause: LossCause, context: &mut DeliveryContext<'_>) {
+    fn record_cause(
+        &mut self,
+        number: SequenceNumber,
+        cause: LossCause,
+        context: &mut DeliveryContext<'_>,
+    ) {
         let sequence = self.reception.sequence();
         if sequence.has(number) || number < sequence.settled().max(sequence.first()) {
             return;
@@ -518,7 +526,7 @@ impl Delivery {
         }
     }
 
-    fn exists(&mut self, number: u64, context: &mut DeliveryContext<'_>) {
+    fn exists(&mut self, number: SequenceNumber, context: &mut DeliveryContext<'_>) {
         let now = context.now;
         let (reception, budget, mut accounting) = self.split(context);
         reception.exists(number, now, budget, &mut |decision| {

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::route::Destination;
 use super::size::Size;
@@ -21,7 +21,7 @@ pub struct Departures {
 
 #[derive(Clone, Copy, Debug)]
 struct Departure {
-    number: u64,
+    number: SequenceNumber,
     destination: Destination,
     at: Timestamp,
 }
@@ -44,7 +44,7 @@ impl Departures {
     }
 
     /// Records that the sample left completely for this destination.
-    pub fn note(&mut self, number: u64, destination: Destination, at: Timestamp) {
+    pub fn note(&mut self, number: SequenceNumber, destination: Destination, at: Timestamp) {
         if self.latest.len() >= LIMIT {
             self.latest.pop_front();
         }
@@ -57,7 +57,7 @@ impl Departures {
 
     /// Returns the time at which the sample left for this destination.
     #[must_use]
-    pub fn find(&self, number: u64, destination: Destination) -> Option<Timestamp> {
+    pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<Timestamp> {
         let mut latest = self.latest.iter().rev();
         let found = latest.find(|each| each.number == number && each.destination == destination);
         found.map(|departure| departure.at)
@@ -78,11 +78,18 @@ mod tests {
         for number in 1..=1000 {
             let source = Timestamp(number);
             assert!(departures.is_first(source) && !departures.is_first(source));
-            departures.note(number, destination(1), Timestamp(number));
-            departures.note(number, destination(2), Timestamp(number + 5));
+            departures.note(SequenceNumber(number), destination(1), Timestamp(number));
+            departures.note(
+                SequenceNumber(number),
+                destination(2),
+                Timestamp(number + 5),
+            );
         }
-        assert_eq!(departures.find(1000, destination(2)), Some(Timestamp(1005)));
-        assert_eq!(departures.find(1, destination(1)), None);
+        assert_eq!(
+            departures.find(SequenceNumber(1000), destination(2)),
+            Some(Timestamp(1005))
+        );
+        assert_eq!(departures.find(SequenceNumber(1), destination(1)), None);
         assert!(departures.latest.len() <= LIMIT);
     }
 }

@@ -22,7 +22,7 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -88,7 +88,7 @@ struct PendingNodes {
     at: Timestamp,
     priority: Priority,
     writer: Guid,
-    sequence_number: u64,
+    sequence_number: SequenceNumber,
     nodes: Vec<Node>,
     bytes: usize,
 }

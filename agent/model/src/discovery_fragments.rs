@@ -6,8 +6,8 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use ros2probe_wire::Guid;
 use ros2probe_wire::record::DataFrag;
+use ros2probe_wire::{Guid, SequenceNumber};
 
 use super::size::Size;
 
@@ -31,7 +31,7 @@ pub struct DiscoveryFragments {
 #[derive(Debug)]
 struct Sample {
     writer: Guid,
-    number: u64,
+    number: SequenceNumber,
     size: u32,
     fragment_size: u32,
     fragments: BTreeMap<u32, Box<[u8]>>,
@@ -77,7 +77,7 @@ impl DiscoveryFragments {
     }
 
     /// Returns the missing fragments of a sample that has some, counted from 1.
-    pub fn missing(&self, writer: Guid, number: u64) -> impl Iterator<Item = u32> + '_ {
+    pub fn missing(&self, writer: Guid, number: SequenceNumber) -> impl Iterator<Item = u32> + '_ {
         let mut samples = self.samples.iter();
         let sample = samples.find(|each| (each.writer, each.number) == (writer, number));
         sample.into_iter().flat_map(|sample| {

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::names::{DdsName, TopicName, TypeName};
 
@@ -44,7 +44,7 @@ pub struct Sample {
     /// GUID of its writer.
     pub writer: Guid,
     /// Its sequence number, counted by the writer.
-    pub sequence_number: u64,
+    pub sequence_number: SequenceNumber,
     /// INFO_TS: time of writing, by the writer's clock.
     pub source_timestamp: Option<Timestamp>,
     /// Seconds and nanoseconds of its header, if the type begins with one.
@@ -65,9 +65,9 @@ pub struct Missed {
     /// GUID of their writer.
     pub writer: Guid,
     /// First sequence number.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Last sequence number.
-    pub last: u64,
+    pub last: SequenceNumber,
     /// Number of missing samples in this range.
     pub samples: u64,
     /// Reason.

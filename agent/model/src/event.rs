@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::churn;
 use super::diagnosis::Diagnosis;
@@ -133,9 +133,9 @@ pub struct LossBurst {
     /// Number of lost samples.
     pub count: u64,
     /// First lost sequence number.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Last lost sequence number; samples in between may have arrived.
-    pub last: u64,
+    pub last: SequenceNumber,
 }
 
 /// Events that share a bound.
@@ -258,7 +258,7 @@ impl Events {
 
     /// Adds a loss to the burst of its writer.
     pub fn lose(&mut self, loss: &Loss) {
-        let count = loss.last.saturating_sub(loss.first).saturating_add(1);
+        let count = loss.last.steps_since(loss.first).saturating_add(1);
         if let Some(burst) = self.bursts.get_mut(&loss.writer) {
             burst.at = burst.at.max(loss.at);
             burst.losses.count = burst.losses.count.saturating_add(count);
@@ -350,8 +350,8 @@ mod tests {
         Loss {
             at: Timestamp(at),
             writer,
-            first,
-            last,
+            first: SequenceNumber(first),
+            last: SequenceNumber(last),
         }
     }
 
@@ -384,6 +384,7 @@ mod tests {
             .map(|event| event.kind)
             .collect();
         let burst = |writer, (domain_id, name): (u32, &str), count, first, last| {
+            let (first, last) = (SequenceNumber(first), SequenceNumber(last));
             EventKind::Loss(LossBurst {
                 writer,
                 topic: Some((DomainId(domain_id), name.into())),

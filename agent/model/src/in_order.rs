@@ -11,8 +11,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::dispatch::{Dispatch, Sample};
 use super::size::Size;
@@ -37,9 +37,9 @@ pub struct Progress {
     /// Increases when the writer restarts its sequence numbers under the same GUID.
     pub incarnation: u32,
     /// All samples below arrived, or no reader waits for them.
-    pub complete: u64,
+    pub complete: SequenceNumber,
     /// No reader waits for any sample below this number.
-    pub awaited: u64,
+    pub awaited: SequenceNumber,
     /// Whether the writer retransmits.
     pub reliable: bool,
     /// Whether the writer has readers that acknowledge, or new ones that may.
@@ -60,15 +60,15 @@ pub struct Due {
 /// Samples that wait for lower numbers.
 #[derive(Debug, Default)]
 pub struct InOrder {
-    waiting: BTreeMap<u64, Due>,
+    waiting: BTreeMap<SequenceNumber, Due>,
     bytes: usize,
     incarnation: Option<u32>,
     /// The missing number, and since when it is waited for.
-    hole: (u64, Timestamp),
+    hole: (SequenceNumber, Timestamp),
     /// Time of the last dispatched sample.
     last: Timestamp,
     /// Numbers that were counted before the writer's announcement but not dispatched.
-    earlier: BTreeSet<u64>,
+    earlier: BTreeSet<SequenceNumber>,
     announced: Timestamp,
 }
 
@@ -117,13 +117,13 @@ impl InOrder {
     }
 
     /// Sets the numbers that were counted before the writer's announcement at `now`.
-    pub fn announced(&mut self, earlier: BTreeSet<u64>, now: Timestamp) {
+    pub fn announced(&mut self, earlier: BTreeSet<SequenceNumber>, now: Timestamp) {
         (self.earlier, self.announced) = (earlier, now);
     }
 
     /// Returns whether this sample was counted before the announcement and is not dispatched yet.
     #[must_use]
-    pub fn lacks(&self, number: u64) -> bool {
+    pub fn lacks(&self, number: SequenceNumber) -> bool {
         self.earlier.contains(&number)
     }
 
@@ -152,7 +152,7 @@ impl InOrder {
     }
 
     /// Returns samples from before the announcement that will not be retransmitted.
-    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<u64> {
+    pub fn forgone(&mut self, progress: &Progress, now: Timestamp) -> Vec<SequenceNumber> {
         if self.earlier.is_empty() {
             return Vec::new();
         }
@@ -173,7 +173,7 @@ impl InOrder {
         now: Timestamp,
         room: usize,
         give: &mut impl FnMut(Due),
-    ) -> Option<u64> {
+    ) -> Option<SequenceNumber> {
         self.begin(progress.incarnation, now, give);
         let first = self
             .earlier
@@ -196,7 +196,7 @@ impl InOrder {
         if is_late || self.waiting.len() > WAITING || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
             self.give_all(now, give);
-            return last.map(|last| last.saturating_add(1));
+            return last.map(|last| last.next());
         }
         None
     }

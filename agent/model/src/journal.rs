@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::dispatch::MissedReason;
 use super::event::Events;
@@ -40,9 +40,9 @@ pub struct Missing {
     /// GUID of the writer.
     pub writer: Guid,
     /// First sequence number.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Last sequence number.
-    pub last: u64,
+    pub last: SequenceNumber,
     /// Reason; an incomplete sample has an entry of its own.
     pub reason: MissedReason,
 }
@@ -112,7 +112,7 @@ impl Journal {
         if let Some(last) = self.missing.last_mut()
             && (last.writer, last.reason) == (missing.writer, missing.reason)
             && missing.reason != MissedReason::Incomplete
-            && last.last.checked_add(1) == Some(missing.first)
+            && last.last.precedes(missing.first)
         {
             last.last = missing.last;
         } else if self.missing.len() < LIMIT {
@@ -130,7 +130,7 @@ impl Journal {
         self.events.lose(&loss);
         if let Some(last) = self.losses.back_mut()
             && last.writer == loss.writer
-            && last.last.checked_add(1) == Some(loss.first)
+            && last.last.precedes(loss.first)
         {
             (last.last, last.at) = (loss.last, loss.at);
             return;
@@ -155,9 +155,8 @@ impl Journal {
             (writer, participant, socket, destination, cause)
         };
         let mut recent = self.delivery_losses.iter_mut().rev().take(RECENT);
-        let continued = recent.find(|entry| {
-            whose(entry) == whose(&loss) && entry.last.checked_add(1) == Some(loss.first)
-        });
+        let continued =
+            recent.find(|entry| whose(entry) == whose(&loss) && entry.last.precedes(loss.first));
         if let Some(entry) = continued {
             (entry.last, entry.at) = (loss.last, loss.at);
             return;

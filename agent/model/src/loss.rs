@@ -5,7 +5,7 @@
 
 use std::net::SocketAddr;
 
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 /// Where a sample was lost.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -26,9 +26,9 @@ pub struct Loss {
     /// GUID of the writer.
     pub writer: Guid,
     /// First lost sequence number.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Last lost sequence number.
-    pub last: u64,
+    pub last: SequenceNumber,
 }
 
 /// Consecutive samples that one receiver lost, reported once the cause is known.
@@ -47,9 +47,9 @@ pub struct DeliveryLoss {
     /// Cause of the loss.
     pub cause: LossCause,
     /// First lost sequence number.
-    pub first: u64,
+    pub first: SequenceNumber,
     /// Last lost sequence number.
-    pub last: u64,
+    pub last: SequenceNumber,
 }
 
 impl LossCause {

@@ -6,8 +6,8 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::loss::LossCause;
 use super::size::Size;
@@ -22,9 +22,9 @@ pub const REASSEMBLY: u64 = 35 * SECOND;
 /// Known causes and pending losses.
 #[derive(Debug, Default)]
 pub struct LossCauses {
-    known: BTreeMap<u64, KnownLoss>,
+    known: BTreeMap<SequenceNumber, KnownLoss>,
     /// Pending runs, by their first number.
-    pending: BTreeMap<u64, Run>,
+    pending: BTreeMap<SequenceNumber, Run>,
 }
 
 /// Where a sample, or part of it, was lost.
@@ -38,7 +38,7 @@ pub struct KnownLoss {
 
 #[derive(Clone, Copy, Debug)]
 struct Run {
-    last: u64,
+    last: SequenceNumber,
     until: Timestamp,
 }
 
@@ -55,7 +55,7 @@ impl LossCauses {
     }
 
     /// Records the loss of some or all of this sample. Returns whether an older one was dropped.
-    pub fn note(&mut self, number: u64, cause: LossCause, at: Timestamp) -> bool {
+    pub fn note(&mut self, number: SequenceNumber, cause: LossCause, at: Timestamp) -> bool {
         let known_loss = self.known.entry(number).or_insert(KnownLoss { cause, at });
         known_loss.cause = known_loss.cause.max(cause);
         let is_full = self.known.len() > SAMPLES;
@@ -66,7 +66,7 @@ impl LossCauses {
     }
 
     /// Removes a sample that arrived after all or was excused.
-    pub fn forget(&mut self, number: u64) -> Option<KnownLoss> {
+    pub fn forget(&mut self, number: SequenceNumber) -> Option<KnownLoss> {
         if self.known.is_empty() {
             return None;
         }
@@ -76,15 +76,15 @@ impl LossCauses {
     /// Splits `first..=last` into runs with the same cause; `None` for an unknown cause.
     pub fn explain(
         &mut self,
-        first: u64,
-        last: u64,
-        mut show: impl FnMut(u64, u64, Option<LossCause>),
+        first: SequenceNumber,
+        last: SequenceNumber,
+        mut show: impl FnMut(SequenceNumber, SequenceNumber, Option<LossCause>),
     ) {
         let mut next = first;
         while let Some((number, _)) = self.known.range(next..=last).next() {
             let number = *number;
             if number > next {
-                show(next, number - 1, None);
+                show(next, number.previous(), None);
             }
             if let Some(known_loss) = self.known.remove(&number) {
                 show(number, number, Some(known_loss.cause));
@@ -98,7 +98,7 @@ impl LossCauses {
     }
 
     /// Removes all samples below this number, which are decided.
-    pub fn settled(&mut self, below: u64) {
+    pub fn settled(&mut self, below: SequenceNumber) {
         if self
             .known
             .first_key_value()
@@ -110,9 +110,14 @@ impl LossCauses {
 
     /// Keeps the cause of these samples open until then. Returns a run that must be decided now to
     /// make room.
-    pub fn wait(&mut self, first: u64, last: u64, until: Timestamp) -> Option<(u64, u64)> {
+    pub fn wait(
+        &mut self,
+        first: SequenceNumber,
+        last: SequenceNumber,
+        until: Timestamp,
+    ) -> Option<(SequenceNumber, SequenceNumber)> {
         if let Some((_, run)) = self.pending.range_mut(..first).next_back()
-            && run.last.checked_add(1) == Some(first)
+            && run.last.precedes(first)
             && run.until == until
         {
             run.last = last;
@@ -129,7 +134,7 @@ impl LossCauses {
 
     /// Removes this sample from the pending ones and returns whether it was pending. If the split
     /// of its run would exceed the cap, the sample stays and its cause is decided with the others.
-    pub fn resolve(&mut self, number: u64) -> bool {
+    pub fn resolve(&mut self, number: SequenceNumber) -> bool {
         let Some((first, run)) = self.pending.range(..=number).next_back() else {
             return false;
         };
@@ -140,7 +145,7 @@ impl LossCauses {
         }
         self.pending.remove(&first);
         if first < number {
-            let last = number - 1;
+            let last = number.previous();
             self.pending.insert(first, Run { last, ..run });
         }
         if number < run.last {
@@ -150,7 +155,7 @@ impl LossCauses {
     }
 
     /// Removes and returns the runs whose waiting time is over.
-    pub fn due(&mut self, now: Timestamp) -> Vec<(u64, u64)> {
+    pub fn due(&mut self, now: Timestamp) -> Vec<(SequenceNumber, SequenceNumber)> {
         let mut due = Vec::new();
         self.pending.retain(|first, run| {
             let is_due = run.until <= now;
@@ -183,9 +188,10 @@ mod tests {
         first: u64,
         last: u64,
     ) -> Vec<(u64, u64, Option<LossCause>)> {
+        let (first, last) = (SequenceNumber(first), SequenceNumber(last));
         let mut runs = Vec::new();
         loss_causes.explain(first, last, |first, last, cause| {
-            runs.push((first, last, cause));
+            runs.push((first.0, last.0, cause));
         });
         runs
     }
@@ -193,10 +199,10 @@ mod tests {
     #[test]
     fn the_cause_nearest_to_the_reader_is_borne() {
         let mut loss_causes = LossCauses::default();
-        loss_causes.note(5, LossCause::Reassembly, at(1));
-        loss_causes.note(5, LossCause::SocketBuffer, at(2));
-        loss_causes.note(7, LossCause::SocketBuffer, at(2));
-        loss_causes.note(7, LossCause::Reassembly, at(3));
+        loss_causes.note(SequenceNumber(5), LossCause::Reassembly, at(1));
+        loss_causes.note(SequenceNumber(5), LossCause::SocketBuffer, at(2));
+        loss_causes.note(SequenceNumber(7), LossCause::SocketBuffer, at(2));
+        loss_causes.note(SequenceNumber(7), LossCause::Reassembly, at(3));
         let socket = Some(LossCause::SocketBuffer);
         assert_eq!(
             explained(&mut loss_causes, 4, 7),
@@ -208,34 +214,51 @@ mod tests {
     #[test]
     fn what_is_pending_is_resolved_one_by_one() {
         let mut loss_causes = LossCauses::default();
-        assert_eq!(loss_causes.wait(10, 12, at(5)), None);
-        assert_eq!(loss_causes.wait(13, 13, at(5)), None);
-        assert!(loss_causes.resolve(11) && !loss_causes.resolve(11) && !loss_causes.resolve(14));
+        assert_eq!(
+            loss_causes.wait(SequenceNumber(10), SequenceNumber(12), at(5)),
+            None
+        );
+        assert_eq!(
+            loss_causes.wait(SequenceNumber(13), SequenceNumber(13), at(5)),
+            None
+        );
+        assert!(
+            loss_causes.resolve(SequenceNumber(11))
+                && !loss_causes.resolve(SequenceNumber(11))
+                && !loss_causes.resolve(SequenceNumber(14))
+        );
         assert!(loss_causes.due(at(4)).is_empty());
-        assert_eq!(loss_causes.due(at(5)), [(10, 10), (12, 13)]);
+        assert_eq!(
+            loss_causes.due(at(5)),
+            [(10, 10), (12, 13)].map(|(first, last)| (SequenceNumber(first), SequenceNumber(last)))
+        );
         assert!(loss_causes.due(at(9)).is_empty());
     }
 
     #[test]
     fn both_lists_are_bounded_and_what_is_pushed_out_is_told() {
         let mut loss_causes = LossCauses::default();
-        let forgotten = (0..10_000)
-            .filter(|number| loss_causes.note(2 * number, LossCause::SocketBuffer, at(1)));
+        let forgotten = (0..10_000).filter(|number| {
+            loss_causes.note(SequenceNumber(2 * number), LossCause::SocketBuffer, at(1))
+        });
         assert_eq!(forgotten.count(), 10_000 - SAMPLES);
-        let told = (0..2000).filter_map(|number| loss_causes.wait(2 * number, 2 * number, at(1)));
+        let told = (0..2000).filter_map(|number| {
+            let number = SequenceNumber(2 * number);
+            loss_causes.wait(number, number, at(1))
+        });
         assert_eq!(told.count(), 2000 - RUNS);
     }
 
     #[test]
     fn resolving_every_other_sample_of_a_long_run_makes_no_more_runs_than_there_may_be() {
         let mut loss_causes = LossCauses::default();
-        loss_causes.wait(1, 100_000, at(1));
-        let resolved = (1..50_000).filter(|number| loss_causes.resolve(2 * number));
+        loss_causes.wait(SequenceNumber(1), SequenceNumber(100_000), at(1));
+        let resolved = (1..50_000).filter(|number| loss_causes.resolve(SequenceNumber(2 * number)));
         assert_eq!(resolved.count(), RUNS - 1);
         let [_, pending] = loss_causes.sizes();
         assert_eq!(pending.entries, pending.cap);
         // Removing the end of a run splits nothing, and a removed hole frees no entry.
-        assert!(loss_causes.resolve(1));
+        assert!(loss_causes.resolve(SequenceNumber(1)));
         let left = loss_causes.due(at(1)).into_iter();
         let left: u64 = left.map(|(first, last)| last - first + 1).sum();
         assert_eq!(left, 100_000 - RUNS as u64);

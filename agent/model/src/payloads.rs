@@ -8,7 +8,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{Guid, Timestamp, record};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
@@ -33,22 +33,22 @@ struct WantedWriter {
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
     /// Each request id, and the first number for that request.
-    begins: Vec<(u64, u64)>,
+    begins: Vec<(u64, SequenceNumber)>,
     /// Time since which payloads are requested.
     since: Timestamp,
     /// Number of the first sample that was dispatched with its payload.
-    first_whole: Option<u64>,
+    first_whole: Option<SequenceNumber>,
     order: InOrder,
 }
 
 /// Numbers of a writer that is not announced yet.
 #[derive(Debug, Default)]
 struct UnannouncedSamples {
-    numbers: BTreeSet<u64>,
+    numbers: BTreeSet<SequenceNumber>,
     /// Ids of the requests, and the first number that was counted during each.
-    begins: Vec<(u64, u64)>,
+    begins: Vec<(u64, SequenceNumber)>,
     /// Lower numbers that are not remembered: the first, the last, and their count.
-    before: Option<(u64, u64, u64)>,
+    before: Option<(SequenceNumber, SequenceNumber, u64)>,
 }
 
 /// Requested writers and the output queue.
@@ -189,7 +189,7 @@ impl Payloads {
         writer: Guid,
         topic: Topic,
         requested: &RequestIds,
-        (next, now): (u64, Timestamp),
+        (next, now): (SequenceNumber, Timestamp),
     ) {
         let before = self.writers.remove(&writer);
         let known = before.as_ref().filter(|known| *known.topic == topic);
@@ -253,7 +253,12 @@ impl Payloads {
     }
 
     /// Dispatches a counted sample. Returns the same as [`Self::turn`].
-    pub fn counted(&mut self, writer: Guid, counted: &Counted, progress: &Progress) -> Option<u64> {
+    pub fn counted(
+        &mut self,
+        writer: Guid,
+        counted: &Counted,
+        progress: &Progress,
+    ) -> Option<SequenceNumber> {
         let interested = self.writers.get_mut(&writer)?;
         let payload = match interested.payloads.is_empty() {
             true => None,
@@ -313,7 +318,7 @@ impl Payloads {
         writer: Guid,
         counted: &Counted,
         progress: &Progress,
-    ) -> Option<u64> {
+    ) -> Option<SequenceNumber> {
         let is_whole = self.assembly.is_whole(writer, counted.number);
         if self.wants_bytes(writer) && !is_whole {
             return None;
@@ -324,7 +329,7 @@ impl Payloads {
     /// Returns whether this sample was counted before its writer's announcement and is dispatched
     /// if it is retransmitted.
     #[must_use]
-    pub fn lacks(&self, writer: Guid, number: u64) -> bool {
+    pub fn lacks(&self, writer: Guid, number: SequenceNumber) -> bool {
         let interested = self.writers.get(&writer);
         interested.is_some_and(|interested| interested.order.lacks(number))
     }
@@ -333,7 +338,7 @@ impl Payloads {
     pub fn counted_of_unknown_writer(
         &mut self,
         writer: Guid,
-        number: u64,
+        number: SequenceNumber,
         sample_requests: impl Iterator<Item = u64>,
     ) {
         let earlier = self.unknown_writers.entry(writer).or_default();
@@ -386,7 +391,12 @@ impl Payloads {
 
     /// Dispatches the samples of this writer whose turn has come. If the order was given up,
     /// returns the number below which no sample is waited for.
-    pub fn turn(&mut self, writer: Guid, progress: &Progress, now: Timestamp) -> Option<u64> {
+    pub fn turn(
+        &mut self,
+        writer: Guid,
+        progress: &Progress,
+        now: Timestamp,
+    ) -> Option<SequenceNumber> {
         let (_, limit, _) = self.assembly.size();
         let room = (limit / 2).saturating_sub(self.waiting_bytes);
         let interested = self.writers.get_mut(&writer)?;
@@ -473,11 +483,11 @@ impl Payloads {
     }
 
     /// Reports samples that will not be retransmitted.
-    fn unannounced(&mut self, writer: Guid, numbers: &[u64]) {
+    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber]) {
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
-        let runs = numbers.chunk_by(|before, after| before + 1 == *after);
+        let runs = numbers.chunk_by(|before, after| before.precedes(*after));
         let missed: Vec<_> = runs
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
             .flat_map(|run| interested.missed(writer, run, MissedReason::Unannounced))
@@ -525,10 +535,10 @@ impl WantedWriter {
     fn missed(
         &self,
         writer: Guid,
-        (first, last): (u64, u64),
+        (first, last): (SequenceNumber, SequenceNumber),
         reason: MissedReason,
     ) -> Vec<Dispatch> {
-        let mut missed: Vec<(u64, Vec<u64>)> = Vec::new();
+        let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
         for (id, begin) in &self.begins {
             let first = first.max(*begin);
             match missed.iter_mut().find(|(known, _)| *known == first) {
@@ -537,7 +547,7 @@ impl WantedWriter {
                 None => {}
             }
         }
-        let dispatches = |(first, to): (u64, Vec<u64>)| Dispatch {
+        let dispatches = |(first, to): (SequenceNumber, Vec<u64>)| Dispatch {
             to: to.into(),
             outcome: SampleOutcome::Missed(Missed {
                 topic: Arc::clone(&self.topic),
@@ -552,7 +562,7 @@ impl WantedWriter {
     }
 
     /// Returns the report that a counted sample is missing for requests of its payload.
-    fn not_captured(&self, writer: Guid, number: u64) -> Dispatch {
+    fn not_captured(&self, writer: Guid, number: SequenceNumber) -> Dispatch {
         Dispatch {
             to: Arc::clone(&self.payloads),
             outcome: SampleOutcome::Missed(Missed {

@@ -10,7 +10,7 @@ use std::collections::{BTreeSet, HashMap};
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
 
 use super::delivery::Totals;
 use super::in_order::Progress;
@@ -232,7 +232,7 @@ impl Profiler {
     }
 
     /// Stops waiting for samples of this writer below `number`.
-    pub fn skip(&mut self, guid: Guid, number: u64) {
+    pub fn skip(&mut self, guid: Guid, number: SequenceNumber) {
         if let Some(measured) = self.writers.get_mut(&guid) {
             measured.unacknowledged = !measured.is_acknowledged();
             measured.writer.skip(number);
@@ -327,7 +327,7 @@ impl Profiler {
         if let Some(subscribers) = &mut measured.subscribers
             && measured.writer.next() > next
         {
-            subscribers.wrote(measured.writer.next() - 1, now);
+            subscribers.wrote(measured.writer.next().previous(), now);
         }
         counted.map_or(RecordOutcome::Measured, RecordOutcome::Counted)
     }

@@ -5,7 +5,7 @@
 //! the results.
 
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
-use ros2probe_wire::{RtpsTime, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
 use super::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
@@ -28,7 +28,7 @@ pub struct Reception {
 #[derive(Clone, Copy, Debug)]
 pub struct Whole {
     /// Its sequence number.
-    pub number: u64,
+    pub number: SequenceNumber,
     /// Payload bytes, including encapsulation.
     pub bytes: u64,
     /// False for a disposal, which has a sequence number but is no message.
@@ -66,14 +66,14 @@ pub enum Decision {
     /// The samples never arrived.
     Lost {
         /// First sequence number.
-        first: u64,
+        first: SequenceNumber,
         /// Last sequence number.
-        last: u64,
+        last: SequenceNumber,
         /// Whether fragments of it arrived; it is then a single sample.
         incomplete: bool,
     },
     /// The writer will not send the sample.
-    Irrelevant(u64),
+    Irrelevant(SequenceNumber),
 }
 
 impl Reception {
@@ -97,7 +97,7 @@ impl Reception {
 
     /// Returns whether this sample has some but not all of its fragments.
     #[must_use]
-    pub fn is_partial(&self, number: u64) -> bool {
+    pub fn is_partial(&self, number: SequenceNumber) -> bool {
         self.samples.is_partial(number)
     }
 
@@ -199,7 +199,7 @@ impl Reception {
     /// Records that this sample exists, whether it arrived or not.
     pub fn exists(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         now: Timestamp,
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
@@ -227,9 +227,9 @@ impl Reception {
 
     /// Hands over to another view: returns the numbers of unfinished samples, which are no losses
     /// here.
-    pub fn abandon(&mut self) -> Vec<u64> {
+    pub fn abandon(&mut self) -> Vec<SequenceNumber> {
         let mut partial = Vec::new();
-        for number in self.sequence.settled()..self.sequence.next() {
+        for number in self.sequence.settled().until(self.sequence.next()) {
             if self.samples.is_partial(number) && !self.sequence.has(number) {
                 self.sequence.know(number);
                 partial.push(number);
@@ -241,12 +241,12 @@ impl Reception {
     /// Excuses all samples after the last one that arrived, because the receiver is gone.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;
-        for number in (sequence.settled()..sequence.next()).rev() {
+        for number in sequence.settled().until(sequence.next()).rev() {
             if sequence.has(number) {
                 return;
             }
             self.samples.forget(number, budget);
-            sequence.excuse(number, number + 1);
+            sequence.excuse(number, number.next());
         }
     }
 
@@ -338,7 +338,7 @@ impl Reception {
         let number = fragments.sequence_number();
         let now = Timestamp(fragments.record().time);
         // Sequence numbers are signed (RTPS 2.5, 9.3.2), so larger values are invalid.
-        if self.sequence.has(number) || number > u64::MAX >> 1 {
+        if self.sequence.has(number) || number > SequenceNumber::MAX {
             return Outcome::Duplicate;
         }
         let progress = self.samples.fragment(fragments, now, budget);
@@ -348,14 +348,14 @@ impl Reception {
             Progress::TooMany => {
                 self.sequence.begin(number);
                 self.exists(number, now, budget, decide);
-                self.sequence.excuse(number, number.saturating_add(1));
+                self.sequence.excuse(number, number.next());
                 return Outcome::Open;
             }
             Progress::Partial | Progress::Complete(_) => {}
         }
         // The first captured sample does not count as sent if its first fragments were missed,
         // except for number 1.
-        let joined = u64::from(fragments.starting() != 1 && number > 1);
+        let joined = u64::from(fragments.starting() != 1 && number.0 > 1);
         self.sequence.begin(number.saturating_add(joined));
         self.exists(number, now, budget, decide);
         let Progress::Complete(facts) = progress else {
@@ -414,7 +414,7 @@ fn decision(settled: Settled, samples: &mut Samples, budget: &mut Budget) -> Dec
             return Decision::Irrelevant(number);
         }
         Settled::Lost(number) => (number, number),
-        Settled::LostRun(start, end) => (start, end.saturating_sub(1)),
+        Settled::LostRun(start, end) => (start, end.previous()),
         // A sample with fragments was sent, so no excuse applies.
         Settled::Irrelevant(number) if samples.is_partial(number) => (number, number),
         Settled::Irrelevant(number) => return Decision::Irrelevant(number),

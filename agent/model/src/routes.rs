@@ -6,7 +6,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{GuidPrefix, Timestamp};
+use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
 
 use super::receivers::{GraphView, Matched};
 use super::route::Direction;
@@ -52,7 +52,7 @@ pub struct KnownRoute {
     /// Whether samples, rather than only control messages, have used it.
     pub has_data: bool,
     /// Highest number that had left, at each remembered time.
-    left: VecDeque<(Timestamp, u64)>,
+    left: VecDeque<(Timestamp, SequenceNumber)>,
 }
 
 impl Routes {
@@ -228,7 +228,7 @@ impl KnownRoute {
     }
 
     /// Records that all samples up to this number have left by `now`.
-    pub fn mark(&mut self, number: u64, now: Timestamp) {
+    pub fn mark(&mut self, number: SequenceNumber, now: Timestamp) {
         let is_due = self
             .left
             .back()
@@ -243,7 +243,7 @@ impl KnownRoute {
 
     /// Returns the highest number that had left by this time.
     #[must_use]
-    pub fn left_by(&self, at: Timestamp) -> Option<u64> {
+    pub fn left_by(&self, at: Timestamp) -> Option<SequenceNumber> {
         let mut left = self.left.iter().rev();
         left.find(|(moment, _)| *moment <= at)
             .map(|(_, number)| *number)
@@ -273,10 +273,10 @@ mod tests {
             left: VecDeque::new(),
         };
         let at = |tenths: u64| Timestamp((1000 + tenths) * SECOND / 10);
-        (0..1000).for_each(|tenths| known.mark(tenths * 3, at(tenths)));
+        (0..1000).for_each(|tenths| known.mark(SequenceNumber(tenths * 3), at(tenths)));
         assert_eq!(known.left_by(at(500)), None);
-        assert_eq!(known.left_by(at(905)), Some(2700));
-        assert_eq!(known.left_by(at(2000)), Some(2970));
+        assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));
+        assert_eq!(known.left_by(at(2000)), Some(SequenceNumber(2970)));
         assert!(known.left.len() <= MOMENTS);
     }
 }

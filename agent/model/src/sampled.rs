@@ -7,8 +7,8 @@
 //! counted here too.
 //! the network counts here too: it adds to what was seen.
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::measurement::SampledFacts;
 use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
@@ -38,17 +38,17 @@ pub struct Sampled {
     /// Bit `i`: of that number everything was seen, or its last fragment without some others.
     finished: u128,
     /// The number to which these bits are relative.
-    next: u64,
+    next: SequenceNumber,
     /// No sample below this number is waited for.
-    settled: u64,
+    settled: SequenceNumber,
     /// Time of the last [`Self::tick`] that settled, and the next number at that time.
-    last_settled: (Timestamp, u64),
+    last_settled: (Timestamp, SequenceNumber),
     /// Runs of numbers that were settled without being seen.
-    unseen: Vec<(u64, u64)>,
+    unseen: Vec<(SequenceNumber, SequenceNumber)>,
     /// The latest number that arrived, presumably whole, and its time.
-    arrived: Option<(u64, Timestamp)>,
+    arrived: Option<(SequenceNumber, Timestamp)>,
     /// The stamp from the first fragment of a sample whose payload begins with a header.
-    head: Option<(u64, (i32, u32))>,
+    head: Option<(SequenceNumber, (i32, u32))>,
 }
 
 /// Changes caused by a record.
@@ -93,9 +93,9 @@ impl Sampled {
             unmeasured: 0,
             sighted: u128::MAX,
             finished: u128::MAX,
-            next: 0,
-            settled: 0,
-            last_settled: (now, 0),
+            next: SequenceNumber::ZERO,
+            settled: SequenceNumber::ZERO,
+            last_settled: (now, SequenceNumber::ZERO),
             unseen: Vec::new(),
             arrived: None,
             head: None,
@@ -152,13 +152,13 @@ impl Sampled {
 
     /// Returns whether this sample was sent and is still waited for.
     #[must_use]
-    pub fn awaits(&self, number: u64) -> bool {
+    pub fn awaits(&self, number: SequenceNumber) -> bool {
         let bit = self.bit(number, self.next);
         number >= self.settled && bit.is_some_and(|bit| self.finished & bit == 0)
     }
 
     /// Processes a sample that [`Self::awaits`] accepts, or a fragment of one, after [`Self::end`].
-    pub fn catch_up(&mut self, number: u64, seen: Seen) -> SampledUpdate {
+    pub fn catch_up(&mut self, number: SequenceNumber, seen: Seen) -> SampledUpdate {
         SampledUpdate {
             finished: self.sight(number, seen),
             ..SampledUpdate::default()
@@ -167,7 +167,7 @@ impl Sampled {
 
     /// Takes over counted samples that another view saw in part. `next` is the number after the
     /// newest.
-    pub fn take_over(&mut self, partial: &[u64], next: u64, now: Timestamp) {
+    pub fn take_over(&mut self, partial: &[SequenceNumber], next: SequenceNumber, now: Timestamp) {
         self.follow(next, now);
         for &number in partial {
             match self.bit(number, next) {
@@ -202,16 +202,17 @@ impl Sampled {
 
     /// Returns the lowest number that is waited for.
     #[must_use]
-    pub fn unseen(&self) -> Option<u64> {
-        let open = self.next.saturating_sub(self.settled);
+    pub fn unseen(&self) -> Option<SequenceNumber> {
+        let open = self.next.steps_since(self.settled);
         let open = u32::try_from(open).unwrap_or(u32::MAX);
         let open = 1_u128.checked_shl(open).map_or(u128::MAX, |bit| bit - 1);
         let highest = (!self.finished & open).checked_ilog2()?;
-        self.next.checked_sub(u64::from(highest) + 1)
+        let below = u64::from(highest) + 1;
+        self.next.0.checked_sub(below).map(SequenceNumber)
     }
 
     /// Removes and returns the runs of unseen numbers, as first and last number.
-    pub fn take_unseen(&mut self) -> Vec<(u64, u64)> {
+    pub fn take_unseen(&mut self) -> Vec<(SequenceNumber, SequenceNumber)> {
         std::mem::take(&mut self.unseen)
     }
 
@@ -233,7 +234,7 @@ impl Sampled {
     /// Returns whether nothing more of this sample is waited for; `next` is the number after the
     /// newest.
     #[must_use]
-    pub fn has(&self, number: u64, next: u64) -> bool {
+    pub fn has(&self, number: SequenceNumber, next: SequenceNumber) -> bool {
         number < next
             && self
                 .bit(number, next)
@@ -244,12 +245,12 @@ impl Sampled {
     /// numbers before it may have been missed.
     pub fn sample(
         &mut self,
-        (number, seen, source): (u64, Seen, Option<Timestamp>),
+        (number, seen, source): (SequenceNumber, Seen, Option<Timestamp>),
         reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
     ) -> SampledUpdate {
-        if number == 0 || number > u64::MAX >> 1 {
+        if !number.is_valid() {
             return SampledUpdate::default();
         }
         let before = sequence.next();
@@ -280,11 +281,11 @@ impl Sampled {
             self.arrived = None;
         }
         let end = run.numbers.iter().map(|(number, _)| *number).max();
-        let end = end.unwrap_or(0).max(number).saturating_add(1);
+        let end = end.unwrap_or_default().max(number).next();
         let samples = self.advance(end, true, now, sequence);
         let samples = self.confirm(&run, samples);
         self.span += samples;
-        let below = sequence.next().saturating_sub(number).saturating_sub(1);
+        let below = sequence.next().steps_since(number.next());
         let finished = self.sight(number, seen);
         let mut update = SampledUpdate {
             samples,
@@ -297,7 +298,7 @@ impl Sampled {
             update.arrived = true;
             update.interval = self
                 .arrived
-                .filter(|(arrived, _)| arrived.saturating_add(1) == number)
+                .filter(|(arrived, _)| arrived.next() == number)
                 .map(|(_, at)| now.nanoseconds_since(at).max(0));
             self.arrived = Some((number, now));
         }
@@ -306,8 +307,14 @@ impl Sampled {
 
     /// Records that samples up to `last` exist, from a HEARTBEAT or ACKNACK. Returns how many of
     /// them are new.
-    pub fn exist(&mut self, last: u64, reach: u64, now: Timestamp, sequence: &mut Sequence) -> u64 {
-        let end = last.saturating_add(1);
+    pub fn exist(
+        &mut self,
+        last: SequenceNumber,
+        reach: u64,
+        now: Timestamp,
+        sequence: &mut Sequence,
+    ) -> u64 {
+        let end = last.next();
         if !sequence.started() {
             return 0;
         }
@@ -333,16 +340,16 @@ impl Sampled {
     /// before them are new.
     pub fn skip(
         &mut self,
-        (start, end): (u64, u64),
+        (start, end): (SequenceNumber, SequenceNumber),
         reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
     ) -> u64 {
-        if start == 0 {
+        if start == SequenceNumber::ZERO {
             return 0;
         }
-        let samples = self.exist(start - 1, reach, now, sequence);
-        let ahead = end.saturating_sub(sequence.next());
+        let samples = self.exist(start.previous(), reach, now, sequence);
+        let ahead = end.steps_since(sequence.next());
         if sequence.started() && start <= sequence.next() && ahead <= reach {
             let skipped = self.advance(end, false, now, sequence);
             let bits = u32::try_from(skipped).unwrap_or(u32::MAX);
@@ -354,7 +361,11 @@ impl Sampled {
     }
 
     /// Keeps the stamp of a sample's first fragment, or returns the stamp that was kept.
-    pub fn stamp(&mut self, number: u64, stamp: Option<(i32, u32)>) -> Option<(i32, u32)> {
+    pub fn stamp(
+        &mut self,
+        number: SequenceNumber,
+        stamp: Option<(i32, u32)>,
+    ) -> Option<(i32, u32)> {
         if let Some(stamp) = stamp {
             self.head = Some((number, stamp));
         }
@@ -366,7 +377,7 @@ impl Sampled {
     /// Processes a sample whose number is not confirmed.
     fn unconfirmed(
         &mut self,
-        (number, seen): (u64, Seen),
+        (number, seen): (SequenceNumber, Seen),
         new: bool,
         sequence: &mut Sequence,
     ) -> SampledUpdate {
@@ -397,7 +408,7 @@ impl Sampled {
 
     /// Marks a sample as seen. Returns whether nothing more of it is waited for, for the first
     /// time.
-    fn sight(&mut self, number: u64, seen: Seen) -> bool {
+    fn sight(&mut self, number: SequenceNumber, seen: Seen) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
         if self.sighted & bit != bit {
             self.sighted |= bit;
@@ -411,14 +422,20 @@ impl Sampled {
     }
 
     /// Returns the bit of a number relative to `next`.
-    fn bit(&self, number: u64, next: u64) -> Option<u128> {
-        let below = next.checked_sub(number)?.checked_sub(1)?;
+    fn bit(&self, number: SequenceNumber, next: SequenceNumber) -> Option<u128> {
+        let below = next.0.checked_sub(number.0)?.checked_sub(1)?;
         1_u128.checked_shl(u32::try_from(below).ok()?)
     }
 
     /// Marks all numbers below `end` as used and not lost, and returns how many are new. `sent` is
     /// false if no samples have these numbers.
-    fn advance(&mut self, end: u64, sent: bool, now: Timestamp, sequence: &mut Sequence) -> u64 {
+    fn advance(
+        &mut self,
+        end: SequenceNumber,
+        sent: bool,
+        now: Timestamp,
+        sequence: &mut Sequence,
+    ) -> u64 {
         let next = sequence.next();
         if end <= next {
             return 0;
@@ -427,12 +444,12 @@ impl Sampled {
         self.settle(oldest.min(next));
         if oldest > next {
             if sent {
-                self.leave_out(next, oldest - 1);
+                self.leave_out(next, oldest.previous());
             }
             self.settled = oldest;
         }
-        sequence.exists(end - 1, now, &mut |_| {});
-        for number in next.max(end.saturating_sub(MAX_WINDOW))..end {
+        sequence.exists(end.previous(), now, &mut |_| {});
+        for number in next.max(end.saturating_sub(MAX_WINDOW)).until(end) {
             sequence.know(number);
         }
         let samples = end - next;
@@ -444,7 +461,7 @@ impl Sampled {
     }
 
     /// Takes over numbers that were counted elsewhere.
-    fn follow(&mut self, next: u64, now: Timestamp) {
+    fn follow(&mut self, next: SequenceNumber, now: Timestamp) {
         if self.next != next {
             self.settle_all();
             self.begin(next, now);
@@ -452,15 +469,15 @@ impl Sampled {
     }
 
     /// Marks all numbers below `next` as seen or not needed.
-    const fn begin(&mut self, next: u64, now: Timestamp) {
+    const fn begin(&mut self, next: SequenceNumber, now: Timestamp) {
         (self.sighted, self.finished) = (u128::MAX, u128::MAX);
         (self.next, self.settled, self.last_settled) = (next, next, (now, next));
     }
 
     /// Stops waiting for numbers below `end`; unseen ones are skipped.
-    fn settle(&mut self, end: u64) {
+    fn settle(&mut self, end: SequenceNumber) {
         let known = self.next.saturating_sub(WINDOW).max(self.settled);
-        for number in known..end.min(self.next) {
+        for number in known.until(end.min(self.next)) {
             let bit = self.bit(number, self.next);
             if bit.is_some_and(|bit| self.finished & bit == 0) {
                 self.leave_out(number, number);
@@ -469,9 +486,9 @@ impl Sampled {
         self.settled = self.settled.max(end.min(self.next));
     }
 
-    fn leave_out(&mut self, first: u64, last: u64) {
+    fn leave_out(&mut self, first: SequenceNumber, last: SequenceNumber) {
         match self.unseen.last_mut() {
-            Some(run) if run.1.checked_add(1) == Some(first) => run.1 = last,
+            Some(run) if run.1.precedes(first) => run.1 = last,
             _ => self.unseen.push((first, last)),
         }
     }

@@ -6,7 +6,7 @@
 //! sample was seen before; the caller checks there first.
 
 use ros2probe_wire::record::DataFrag;
-use ros2probe_wire::{RtpsTime, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::size::Size;
 
@@ -51,13 +51,13 @@ pub struct Samples {
     /// Time from which samples have all fragments captured; earlier ones may lack some.
     sure_from: Timestamp,
     /// The last sample that began before that time.
-    last_uncertain: u64,
+    last_uncertain: SequenceNumber,
 }
 
 /// An unfinished sample.
 #[derive(Debug)]
 struct Partial {
-    number: u64,
+    number: SequenceNumber,
     size: u32,
     fragment_size: u32,
     seen: u32,
@@ -194,7 +194,7 @@ impl Samples {
 
     /// Returns whether this sample has some but not all of its fragments.
     #[must_use]
-    pub fn is_partial(&self, number: u64) -> bool {
+    pub fn is_partial(&self, number: SequenceNumber) -> bool {
         self.place(number).is_some()
     }
 
@@ -205,14 +205,19 @@ impl Samples {
 
     /// Returns whether this sample is unfinished and may lack fragments without a loss.
     #[must_use]
-    pub fn is_doubtful(&self, number: u64) -> bool {
+    pub fn is_doubtful(&self, number: SequenceNumber) -> bool {
         number <= self.last_uncertain && self.is_partial(number)
     }
 
     /// Returns the oldest sample, from `first` on, that still receives fragments. It and later ones
     /// are not decided yet.
     #[must_use]
-    pub fn growing(&self, now: Timestamp, window: u64, first: u64) -> Option<u64> {
+    pub fn growing(
+        &self,
+        now: Timestamp,
+        window: u64,
+        first: SequenceNumber,
+    ) -> Option<SequenceNumber> {
         let growing = self
             .partial
             .iter()
@@ -221,7 +226,7 @@ impl Samples {
     }
 
     /// Drops this sample; returns whether it was unfinished.
-    pub fn forget(&mut self, number: u64, budget: &mut Budget) -> bool {
+    pub fn forget(&mut self, number: SequenceNumber, budget: &mut Budget) -> bool {
         let index = self.place(number);
         if let Some(index) = index {
             self.close(index, budget);
@@ -230,7 +235,7 @@ impl Samples {
     }
 
     /// Drops all samples below this number.
-    pub fn forget_below(&mut self, number: u64, budget: &mut Budget) {
+    pub fn forget_below(&mut self, number: SequenceNumber, budget: &mut Budget) {
         while let Some(index) = self.partial.iter().position(|each| each.number < number) {
             self.close(index, budget);
         }
@@ -266,7 +271,7 @@ impl Samples {
         }
     }
 
-    fn place(&self, number: u64) -> Option<usize> {
+    fn place(&self, number: SequenceNumber) -> Option<usize> {
         self.partial.iter().position(|each| each.number == number)
     }
 
@@ -299,7 +304,7 @@ impl Samples {
     }
 
     /// Drops the sample with the longest wait; the newcomer goes only if it is alone.
-    fn evict(&mut self, newcomer: u64, budget: &mut Budget) {
+    fn evict(&mut self, newcomer: SequenceNumber, budget: &mut Budget) {
         let candidates = self.partial.iter().enumerate();
         let oldest = candidates.min_by_key(|(_, each)| (each.number == newcomer, each.latest));
         if let Some(index) = oldest.map(|(index, _)| index) {
@@ -357,7 +362,7 @@ mod tests {
             (0, 300),
         ] {
             let partial = || Partial {
-                number: 1,
+                number: SequenceNumber(1),
                 size: 0,
                 fragment_size: 0,
                 seen: 0,
@@ -491,8 +496,14 @@ mod tests {
     fn stalled_samples_expire() {
         let (mut samples, mut budget) = (Samples::default(), budget());
         put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
-        assert_eq!(samples.growing(Timestamp(150), 100, 0), Some(4));
-        assert_eq!(samples.growing(Timestamp(250), 100, 0), None);
+        assert_eq!(
+            samples.growing(Timestamp(150), 100, SequenceNumber(0)),
+            Some(SequenceNumber(4))
+        );
+        assert_eq!(
+            samples.growing(Timestamp(250), 100, SequenceNumber(0)),
+            None
+        );
         assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);
         assert_eq!(budget.bytes, 0);
     }

@@ -14,8 +14,8 @@ mod unconfirmed;
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::MILLISECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::size::Size;
 use bitmap::Bitmap;
@@ -55,29 +55,29 @@ const WORDS: usize = MAX_WINDOW as usize / 64;
 #[derive(Debug, Default)]
 pub struct Sequence {
     /// The first number seen; earlier ones do not count. 0 before the first.
-    first: u64,
+    first: SequenceNumber,
     /// All numbers below are decided.
-    settled: u64,
+    settled: SequenceNumber,
     /// One more than the highest number known to exist.
-    next: u64,
+    next: SequenceNumber,
     /// The lowest number that the writer still has: the highest firstSN of its HEARTBEATs.
-    available: u64,
+    available: SequenceNumber,
     /// An earlier value of `available`, and its time.
-    withdrawn: Option<(Timestamp, u64)>,
+    withdrawn: Option<(Timestamp, SequenceNumber)>,
     /// All readers that acknowledge have every number below, or will not get it.
-    acknowledged: u64,
+    acknowledged: SequenceNumber,
     /// Every number below, as far as checked, has arrived or is not waited for.
-    complete: u64,
+    complete: SequenceNumber,
     /// Number of restarts.
     incarnation: u32,
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some times, oldest first.
-    checkpoints: VecDeque<(Timestamp, u64)>,
+    checkpoints: VecDeque<(Timestamp, SequenceNumber)>,
     gaps: VecDeque<Gap>,
     newest_source: Timestamp,
     /// The number with the newest source time.
-    newest: u64,
+    newest: SequenceNumber,
     /// Consecutive samples after it with an older source time.
     older: u8,
     stale: u32,
@@ -107,8 +107,8 @@ pub enum RunMembership {
 /// A run of missing numbers, to distinguish reordering from retransmission.
 #[derive(Clone, Copy, Debug)]
 struct Gap {
-    start: u64,
-    end: u64,
+    start: SequenceNumber,
+    end: SequenceNumber,
     noticed: Timestamp,
     requested: bool,
 }
@@ -142,11 +142,11 @@ pub enum RepairMode {
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub enum Settled {
     /// The number never arrived.
-    Lost(u64),
+    Lost(SequenceNumber),
     /// The writer excused the number.
-    Irrelevant(u64),
+    Irrelevant(SequenceNumber),
     /// Lost numbers from the first to the last, beyond the capacity of the window.
-    LostRun(u64, u64),
+    LostRun(SequenceNumber, SequenceNumber),
 }
 
 impl Sequence {
@@ -192,12 +192,12 @@ impl Sequence {
     /// Returns whether any sample was seen.
     #[must_use]
     pub const fn started(&self) -> bool {
-        self.first != 0
+        self.first.0 != 0
     }
 
     /// Returns the highest number known to exist, plus one.
     #[must_use]
-    pub const fn next(&self) -> u64 {
+    pub const fn next(&self) -> SequenceNumber {
         self.next
     }
 
@@ -209,19 +209,19 @@ impl Sequence {
 
     /// Returns whether this sample was received whole before.
     #[must_use]
-    pub fn has(&self, number: u64) -> bool {
+    pub fn has(&self, number: SequenceNumber) -> bool {
         self.started() && (number < self.floor() || number < self.next && self.received.get(number))
     }
 
     /// Processes a whole sample, after [`Self::recognise`].
     pub fn receive(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         repair_mode: RepairMode,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) -> Arrival {
-        if !is_number(number) {
+        if !number.is_valid() {
             return Arrival::Duplicate;
         }
         if !self.started() {
@@ -259,7 +259,7 @@ impl Sequence {
     }
 
     /// Records the source time of a sample.
-    pub fn sourced(&mut self, number: u64, source: Timestamp) {
+    pub fn sourced(&mut self, number: SequenceNumber, source: Timestamp) {
         if number <= self.newest {
             return;
         }
@@ -272,36 +272,41 @@ impl Sequence {
     }
 
     /// Records that a sample exists, because some of its fragments arrived.
-    pub fn exists(&mut self, number: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    pub fn exists(
+        &mut self,
+        number: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
         let is_ahead = number >= self.next && number - self.next <= MAX_JUMP;
-        if self.started() && is_ahead && is_number(number) {
+        if self.started() && is_ahead && number.is_valid() {
             self.extend(number, number + 1, now, settled);
         }
     }
 
     /// Begins to count at this number; does nothing after the beginning.
-    pub fn begin(&mut self, number: u64) {
-        if !self.started() && number > 0 && number < u64::MAX >> 1 {
+    pub fn begin(&mut self, number: SequenceNumber) {
+        if !self.started() && number > SequenceNumber::ZERO && number < SequenceNumber::MAX {
             self.restart(number);
         }
     }
 
     /// Returns the number below which everything is decided.
     #[must_use]
-    pub const fn settled(&self) -> u64 {
+    pub const fn settled(&self) -> SequenceNumber {
         self.settled
     }
 
     /// Returns the time at which this number was detected as missing, if remembered.
     #[must_use]
-    pub fn missed_since(&self, number: u64) -> Option<Timestamp> {
+    pub fn missed_since(&self, number: SequenceNumber) -> Option<Timestamp> {
         let mut gaps = self.gaps.iter().rev();
         let gap = gaps.find(|gap| gap.start <= number && number < gap.end);
         gap.map(|gap| gap.noticed)
     }
 
     /// Records that this number arrived elsewhere: here it is neither a loss nor a sample.
-    pub fn know(&mut self, number: u64) {
+    pub fn know(&mut self, number: SequenceNumber) {
         if self.started() && number >= self.floor() && number < self.next {
             self.received.set(number);
         }
@@ -314,9 +319,13 @@ impl Sequence {
             return;
         }
         if other.next > self.next && other.next - self.next <= FAR {
-            self.extend(other.next - 1, other.next, now, settled);
+            self.extend(other.next.previous(), other.next, now, settled);
         }
-        for number in self.floor().max(other.floor())..self.next.min(other.next) {
+        for number in self
+            .floor()
+            .max(other.floor())
+            .until(self.next.min(other.next))
+        {
             if other.received.get(number) {
                 self.received.set(number);
             }
@@ -325,13 +334,13 @@ impl Sequence {
 
     /// Returns the lowest number that counts.
     #[must_use]
-    pub const fn first(&self) -> u64 {
+    pub const fn first(&self) -> SequenceNumber {
         self.first
     }
 
     /// Returns the number below which every sample has arrived or is not waited for: the writer
     /// skipped or dropped it, readers acknowledged it, or it is settled.
-    pub fn complete(&mut self) -> u64 {
+    pub fn complete(&mut self) -> SequenceNumber {
         let decided = self.settled.max(self.available).max(self.floor());
         self.complete = self.complete.max(decided);
         while self.complete < self.next
@@ -343,13 +352,13 @@ impl Sequence {
     }
 
     /// Stops waiting for numbers below this one.
-    pub fn skip(&mut self, number: u64) {
+    pub fn skip(&mut self, number: SequenceNumber) {
         self.complete = self.complete.max(number.min(self.next));
     }
 
     /// Returns the number below which the writer sends no sample again.
     #[must_use]
-    pub fn awaited(&self) -> u64 {
+    pub fn awaited(&self) -> SequenceNumber {
         self.available.max(self.acknowledged)
     }
 
@@ -365,7 +374,7 @@ impl Sequence {
         &mut self,
         now: Timestamp,
         (window, grace): (u64, u64),
-        hold: Option<u64>,
+        hold: Option<SequenceNumber>,
         settled: &mut impl FnMut(Settled),
     ) {
         if !self.started() {
@@ -408,11 +417,11 @@ impl Sequence {
     }
 
     /// Returns the lowest number that is remembered.
-    fn floor(&self) -> u64 {
+    fn floor(&self) -> SequenceNumber {
         self.next.saturating_sub(self.received.len())
     }
 
-    fn restart(&mut self, number: u64) {
+    fn restart(&mut self, number: SequenceNumber) {
         *self = Self {
             first: number,
             settled: number,
@@ -429,7 +438,13 @@ impl Sequence {
     }
 
     /// Raises `next` to `end`: `start..end` arrived, and the numbers before are a gap.
-    fn extend(&mut self, start: u64, end: u64, now: Timestamp, settled: &mut impl FnMut(Settled)) {
+    fn extend(
+        &mut self,
+        start: SequenceNumber,
+        end: SequenceNumber,
+        now: Timestamp,
+        settled: &mut impl FnMut(Settled),
+    ) {
         if start > self.next {
             self.note_gap(self.next, start, now);
         }
@@ -454,7 +469,7 @@ impl Sequence {
         self.last_advance = now;
     }
 
-    fn note_gap(&mut self, start: u64, end: u64, now: Timestamp) {
+    fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: Timestamp) {
         if self.gaps.len() >= GAPS {
             self.gaps.pop_front();
         }
@@ -466,7 +481,12 @@ impl Sequence {
         });
     }
 
-    fn was_retransmitted(&self, number: u64, repair_mode: RepairMode, now: Timestamp) -> bool {
+    fn was_retransmitted(
+        &self,
+        number: SequenceNumber,
+        repair_mode: RepairMode,
+        now: Timestamp,
+    ) -> bool {
         let gap = self
             .gaps
             .iter()
@@ -481,8 +501,8 @@ impl Sequence {
         }
     }
 
-    fn settle(&mut self, limit: u64, settled: &mut impl FnMut(Settled)) {
-        for number in self.settled..limit.min(self.next) {
+    fn settle(&mut self, limit: SequenceNumber, settled: &mut impl FnMut(Settled)) {
+        for number in self.settled.until(limit.min(self.next)) {
             if !self.received.get(number) {
                 let excused = self.excused.get(number);
                 settled(if excused {
@@ -494,11 +514,6 @@ impl Sequence {
         }
         self.settled = self.settled.max(limit.min(self.next));
     }
-}
-
-/// Returns whether it is a valid sequence number, which is signed (RTPS 2.5, 9.3.2).
-const fn is_number(number: u64) -> bool {
-    number > 0 && number <= u64::MAX >> 1
 }
 
 #[cfg(test)]

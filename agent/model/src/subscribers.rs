@@ -17,7 +17,7 @@ mod lifecycle;
 mod submessages;
 
 use ros2probe_wire::record::{Body, Sample, flag};
-use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::acknowledgement::Acknowledgements;
 use super::delivery::{Delivery, DeliveryContext, Receiver, Totals, seconds};
@@ -166,7 +166,7 @@ impl Subscribers {
     pub fn acknowledgements(
         &self,
         writer: Guid,
-        next: u64,
+        next: SequenceNumber,
         now: Timestamp,
     ) -> impl Iterator<Item = AcknowledgementFacts> + '_ {
         self.acknowledgements.facts(writer, next, now)
@@ -228,12 +228,12 @@ impl Subscribers {
     /// Returns the number below which all acknowledging readers have everything; `None` without
     /// any.
     #[must_use]
-    pub fn acknowledged_below(&self) -> Option<u64> {
+    pub fn acknowledged_below(&self) -> Option<SequenceNumber> {
         self.acknowledgements.floor(|_| true)
     }
 
     /// Records the writer's newest sample and its time.
-    pub fn wrote(&mut self, number: u64, at: Timestamp) {
+    pub fn wrote(&mut self, number: SequenceNumber, at: Timestamp) {
         self.acknowledgements.wrote(number, at);
     }
 
@@ -457,7 +457,7 @@ impl Subscribers {
     }
 
     /// Shares the samples of deliveries that may be the same receiver.
-    fn share(&mut self, place: usize, next: u64, whole: Option<u64>) {
+    fn share(&mut self, place: usize, next: SequenceNumber, whole: Option<SequenceNumber>) {
         let Some(delivery) = self.deliveries.get(place) else {
             return;
         };
@@ -473,11 +473,11 @@ impl Subscribers {
             return;
         }
         let end = delivery.next().min(next.saturating_add(LOOK_BACK));
-        if next == 0 || end <= next + 1 {
+        if next == SequenceNumber::ZERO || end <= next + 1 {
             return;
         }
-        let missing = (next..end).filter(|number| delivery.misses(*number));
-        let has = |number: &u64| {
+        let missing = next.until(end).filter(|number| delivery.misses(*number));
+        let has = |number: &SequenceNumber| {
             let mut others = self.deliveries.iter().filter(|each| is_open(each));
             others.any(|other| other.misses(*number) || other.has(*number))
         };

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
-use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, SequenceNumber, Timestamp};
 
 use super::identity::Identity;
 use super::names::{TopicName, TypeName};
@@ -75,7 +75,7 @@ pub struct Message {
     /// GUID of its writer.
     pub writer: Guid,
     /// Its sequence number.
-    pub sequence_number: u64,
+    pub sequence_number: SequenceNumber,
     /// Trace id, derived from both.
     pub trace_id: u128,
     /// Its topic and type.
@@ -146,7 +146,7 @@ struct WriterTrace {
     /// Spans of arrivals, until it is certain that they were not sent from this host.
     arrived: VecDeque<Span>,
     waiting: VecDeque<Unacknowledged>,
-    done: VecDeque<u64>,
+    done: VecDeque<SequenceNumber>,
 }
 
 /// A message that was sent and that some readers have not acknowledged.
@@ -285,7 +285,7 @@ impl Tracer {
 impl Message {
     /// Returns the identity of a message, equal for every agent that sees it.
     #[must_use]
-    pub fn identity(writer: Guid, sequence_number: u64) -> u128 {
+    pub fn identity(writer: Guid, sequence_number: SequenceNumber) -> u128 {
         numbered(of_writer(writer), sequence_number)
     }
 }
@@ -296,8 +296,8 @@ fn of_writer(writer: Guid) -> Identity {
     identity
 }
 
-fn numbered(mut identity: Identity, sequence_number: u64) -> u128 {
-    identity.add(&sequence_number.to_be_bytes());
+fn numbered(mut identity: Identity, sequence_number: SequenceNumber) -> u128 {
+    identity.add(&sequence_number.0.to_be_bytes());
     identity.bits()
 }
 

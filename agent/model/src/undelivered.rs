@@ -8,9 +8,9 @@
 
 use std::collections::VecDeque;
 
-use ros2probe_wire::Record;
 use ros2probe_wire::record::Sample;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{Record, SequenceNumber};
 
 use super::size::Size;
 
@@ -30,7 +30,7 @@ pub struct Undelivered {
 #[derive(Clone, Copy, Debug)]
 struct UndeliveredPart {
     socket: u64,
-    number: u64,
+    number: SequenceNumber,
     /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
     start: u32,
     end: u32,

@@ -9,7 +9,7 @@ mod sampled_view;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Record, RtpsTime, Timestamp};
+use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber, Timestamp};
 
 use super::dispatch::MissedReason;
 use super::histogram::Histogram;
@@ -64,7 +64,7 @@ pub struct MeasurementContext<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Counted {
     /// Its sequence number.
-    pub number: u64,
+    pub number: SequenceNumber,
     /// Payload bytes, including encapsulation.
     pub bytes: u64,
     /// INFO_TS of the message.
@@ -177,7 +177,7 @@ impl Writer {
 
     /// Returns the highest sequence number known to exist, plus one.
     #[must_use]
-    pub const fn next(&self) -> u64 {
+    pub const fn next(&self) -> SequenceNumber {
         self.reception.sequence().next()
     }
 
@@ -301,7 +301,7 @@ impl Writer {
         }
         let (next, advanced) = before;
         let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && advanced < opened && sequence.next() > next {
             // The newest sample is excused too, which has no effect once it is received.
             sequence.excuse(next, sequence.next());
         }
@@ -309,7 +309,7 @@ impl Writer {
     }
 
     /// Records that all readers have every sample below `base`.
-    pub fn acknowledged(&mut self, base: u64) {
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
         self.reception.sequence_mut().acknowledged(base);
     }
 
@@ -319,7 +319,7 @@ impl Writer {
         let reliable = self.traits.reliable && !self.is_sampled(now);
         // While a sample is waited for in shared memory, its retransmission may pass there, too.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
-        let unseen = unseen.filter(|_| waits).unwrap_or(u64::MAX);
+        let unseen = unseen.filter(|_| waits).unwrap_or(SequenceNumber(u64::MAX));
         let sequence = self.reception.sequence_mut();
         if !waits {
             sequence.skip(sequence.next());
@@ -334,7 +334,7 @@ impl Writer {
     }
 
     /// Stops waiting for samples below `number`.
-    pub fn skip(&mut self, number: u64) {
+    pub fn skip(&mut self, number: SequenceNumber) {
         self.reception.sequence_mut().skip(number);
     }
 

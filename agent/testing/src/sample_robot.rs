@@ -24,7 +24,7 @@ use ros2probe_model::watch::Watch;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
@@ -242,7 +242,7 @@ pub fn topic(name: &str) -> TopicFacts {
             writer: guid(1),
             reader: guid(2),
             node: Some("/mapper".into()),
-            acknowledged: 123_400,
+            acknowledged: SequenceNumber(123_400),
             missing: 2,
             requested: 9,
             acknacks: 1_000,

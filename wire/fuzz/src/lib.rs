@@ -13,7 +13,7 @@ use ros2probe_wire::names::{Demangled, MAX_LEN};
 use ros2probe_wire::record::{self, Record, Sample, flag, kind};
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Step, Walk};
-use ros2probe_wire::{EntityId, Guid};
+use ros2probe_wire::{EntityId, Guid, SequenceNumber};
 
 #[path = "../../tests/oracle/mod.rs"]
 pub mod oracle;
@@ -218,7 +218,7 @@ fn agrees(submessage: &Submessage<'_>, record: Option<&Record>) {
     let Some(record) = record else { return };
     assert_eq!(record.kind, kind, "{submessage:?}");
     assert_eq!(record.submessage_flags, submessage.flags.0);
-    assert_eq!(record.sequence_number, number.0.cast_unsigned());
+    assert_eq!(record.sequence_number, number.0);
     if kind == kind::DATA || kind == kind::DATA_FRAG {
         assert_eq!(record.source_timestamp, submessage.receiver.timestamp.0);
     }
@@ -254,14 +254,10 @@ fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
         }
         (Body::Heartbeat(theirs), record::Body::Heartbeat(ours)) => assert_eq!(
             (ours.first(), ours.last(), ours.count()),
-            (
-                theirs.first.0.cast_unsigned(),
-                theirs.last.0.cast_unsigned(),
-                theirs.count
-            )
+            (theirs.first, theirs.last, theirs.count)
         ),
         (Body::Gap(theirs), record::Body::Gap(ours)) => {
-            assert_eq!(ours.start(), theirs.start.0.cast_unsigned());
+            assert_eq!(ours.start(), theirs.start);
             sets_agree(&ours.list(), &theirs.list);
         }
         (Body::AckNack(theirs), record::Body::AckNack(ours)) => {
@@ -273,16 +269,14 @@ fn bodies_agree(submessage: &Submessage<'_>, record: &Record) {
 
 /// Checks the sets; a record holds only the first numbers of a long set.
 fn sets_agree(ours: &record::SequenceNumberSet, theirs: &SequenceNumberSet<'_>) {
-    assert_eq!(ours.base, theirs.base.0.cast_unsigned());
+    assert_eq!(ours.base, theirs.base);
     assert_eq!(ours.num_bits, theirs.num_bits());
     let end = ours.base.saturating_add(Record::BITMAP_BITS.into());
-    let numbers = theirs.iter().map(|number| number.0.cast_unsigned());
     // The oracle yields no numbers beyond the largest sequence number.
-    let largest = i64::MAX.cast_unsigned();
     assert!(
         ours.iter()
-            .take_while(|number| *number <= largest)
-            .eq(numbers.take_while(|number| *number < end))
+            .take_while(|number| *number <= SequenceNumber::MAX)
+            .eq(theirs.iter().take_while(|number| *number < end))
     );
 }
 

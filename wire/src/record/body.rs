@@ -5,7 +5,7 @@
 //! trusts the kind and does not validate numbers.
 
 use super::{Record, flag, kind};
-use crate::rtps::{StatusInfo, SubmessageFlags};
+use crate::rtps::{SequenceNumber, StatusInfo, SubmessageFlags};
 use crate::time::RtpsTime;
 
 /// The body of a record, by kind.
@@ -94,8 +94,8 @@ impl<'a> Sample<'a> {
     /// Returns writerSN.
     #[inline]
     #[must_use]
-    pub const fn sequence_number(self) -> u64 {
-        self.record().sequence_number
+    pub const fn sequence_number(self) -> SequenceNumber {
+        SequenceNumber(self.record().sequence_number)
     }
 
     /// Returns the INFO_TS in force.
@@ -202,8 +202,8 @@ impl<'a> DataFrag<'a> {
     /// Returns writerSN.
     #[inline]
     #[must_use]
-    pub const fn sequence_number(self) -> u64 {
-        self.0.sequence_number
+    pub const fn sequence_number(self) -> SequenceNumber {
+        SequenceNumber(self.0.sequence_number)
     }
 
     /// Returns fragmentStartingNum: the number of its first fragment, counted from 1.
@@ -291,15 +291,15 @@ impl<'a> Heartbeat<'a> {
     /// Returns firstSN: the oldest sample that the writer has; one more than `last` if it has none.
     #[inline]
     #[must_use]
-    pub const fn first(self) -> u64 {
-        self.0.sequence_number
+    pub const fn first(self) -> SequenceNumber {
+        SequenceNumber(self.0.sequence_number)
     }
 
     /// Returns lastSN: the newest sample.
     #[inline]
     #[must_use]
-    pub const fn last(self) -> u64 {
-        self.0.long()
+    pub const fn last(self) -> SequenceNumber {
+        SequenceNumber(self.0.long())
     }
 
     /// Returns the count, which grows with every new HEARTBEAT of the writer.
@@ -326,15 +326,15 @@ impl<'a> Gap<'a> {
     /// Returns gapStart.
     #[inline]
     #[must_use]
-    pub const fn start(self) -> u64 {
-        self.0.sequence_number
+    pub const fn start(self) -> SequenceNumber {
+        SequenceNumber(self.0.sequence_number)
     }
 
     /// Returns gapList.
     #[inline]
     #[must_use]
     pub const fn list(self) -> SequenceNumberSet {
-        SequenceNumberSet::of(self.0.long(), self.0)
+        SequenceNumberSet::of(SequenceNumber(self.0.long()), self.0)
     }
 }
 
@@ -353,15 +353,15 @@ impl<'a> AckNack<'a> {
     /// Returns the number below which the reader acknowledges all samples.
     #[inline]
     #[must_use]
-    pub const fn base(self) -> u64 {
-        self.0.sequence_number
+    pub const fn base(self) -> SequenceNumber {
+        SequenceNumber(self.0.sequence_number)
     }
 
     /// Returns readerSNState, whose members are missing.
     #[inline]
     #[must_use]
     pub const fn missing(self) -> SequenceNumberSet {
-        SequenceNumberSet::of(self.0.sequence_number, self.0)
+        SequenceNumberSet::of(self.base(), self.0)
     }
 }
 
@@ -369,7 +369,7 @@ impl<'a> AckNack<'a> {
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
 pub struct SequenceNumberSet {
     /// The number of bit 0.
-    pub base: u64,
+    pub base: SequenceNumber,
     /// Length of the bitmap; up to 256, of which the record holds the first
     /// [`Record::BITMAP_BITS`].
     pub num_bits: u32,
@@ -378,7 +378,7 @@ pub struct SequenceNumberSet {
 
 impl SequenceNumberSet {
     #[inline]
-    const fn of(base: u64, record: &Record) -> Self {
+    const fn of(base: SequenceNumber, record: &Record) -> Self {
         Self {
             base,
             num_bits: record.stamp_seconds,
@@ -393,7 +393,7 @@ impl SequenceNumberSet {
     }
 
     /// Iterates over the members in the record, ascending. Numbers saturate at the largest.
-    pub fn iter(&self) -> impl Iterator<Item = u64> + use<> {
+    pub fn iter(&self) -> impl Iterator<Item = SequenceNumber> + use<> {
         let Self {
             base,
             num_bits,
@@ -434,14 +434,14 @@ mod tests {
         };
         assert_eq!(
             (heartbeat.first(), heartbeat.last(), heartbeat.count()),
-            (7, 2 << 32 | 9, 34)
+            (SequenceNumber(7), SequenceNumber(2 << 32 | 9), 34)
         );
         let record = of_kind(kind::GAP);
         let Body::Gap(gap) = record.body() else {
             panic!("{record:?}")
         };
-        let base = 2 << 32 | 9;
-        assert_eq!((gap.start(), gap.list().base), (7, base));
+        let base = SequenceNumber(2 << 32 | 9);
+        assert_eq!((gap.start(), gap.list().base), (SequenceNumber(7), base));
         // One bit of the second word lies behind numBits.
         assert_eq!(
             gap.list().iter().collect::<Vec<_>>(),
@@ -451,10 +451,10 @@ mod tests {
         let Body::AckNack(acknack) = record.body() else {
             panic!("{record:?}")
         };
-        assert_eq!(acknack.base(), 7);
+        assert_eq!(acknack.base(), SequenceNumber(7));
         assert_eq!(
             acknack.missing().iter().collect::<Vec<_>>(),
-            [7, 7 + 31, 7 + 33]
+            [7, 7 + 31, 7 + 33].map(SequenceNumber)
         );
         assert!(record.is_acknack() && record.sample().is_none());
         for (kind, is_expected) in [
@@ -494,7 +494,10 @@ mod tests {
         };
         let members: Vec<_> = acknack.missing().iter().collect();
         assert_eq!(members.len(), Record::BITMAP_BITS as usize);
-        assert_eq!(members[..3], [u64::MAX - 1, u64::MAX, u64::MAX]);
+        assert_eq!(
+            members[..3],
+            [u64::MAX - 1, u64::MAX, u64::MAX].map(SequenceNumber)
+        );
     }
 
     #[test]

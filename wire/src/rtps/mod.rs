@@ -11,6 +11,7 @@ mod locator;
 mod payload;
 
 use core::fmt;
+use core::ops::{Add, AddAssign, Sub};
 
 use crate::cursor::{Cursor, WireError};
 
@@ -90,18 +91,106 @@ impl fmt::Display for ProtocolVersion {
 }
 
 /// Sequence number of a writer's change; the first is 1 (RTPS 2.5, 8.3.5.4).
+///
+/// RTPS signs the number. Its 64 bits are unsigned here, so that a negative number is larger than
+/// every number that a change can have.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-pub struct SequenceNumber(pub i64);
+pub struct SequenceNumber(pub u64);
 
 impl SequenceNumber {
     /// `SEQUENCENUMBER_UNKNOWN`: high −1, low 0.
-    pub const UNKNOWN: Self = Self(-(1 << 32));
+    pub const UNKNOWN: Self = Self(u64::MAX << 32);
+    /// The number before the first; no change has it.
+    pub const ZERO: Self = Self(0);
+    /// The largest number that a change can have.
+    pub const MAX: Self = Self(u64::MAX >> 1);
 
-    /// Reads `i32` high, then `u32` low, each in the cursor's byte order.
+    /// Returns whether a change can have the number.
+    #[inline]
+    #[must_use]
+    pub const fn is_valid(self) -> bool {
+        self.0 > Self::ZERO.0 && self.0 <= Self::MAX.0
+    }
+
+    /// Returns the number after this one; the 64 bits saturate.
+    #[inline]
+    #[must_use]
+    pub const fn next(self) -> Self {
+        self.saturating_add(1)
+    }
+
+    /// Returns the number before this one; zero stays zero.
+    #[inline]
+    #[must_use]
+    pub const fn previous(self) -> Self {
+        self.saturating_sub(1)
+    }
+
+    /// Returns whether `other` is the number after this one.
+    #[inline]
+    #[must_use]
+    pub const fn precedes(self, other: Self) -> bool {
+        self.0 < other.0 && other.0 - self.0 == 1
+    }
+
+    /// Returns the number `steps` after this one; the 64 bits saturate.
+    #[inline]
+    #[must_use]
+    pub const fn saturating_add(self, steps: u64) -> Self {
+        Self(self.0.saturating_add(steps))
+    }
+
+    /// Returns the number `steps` before this one, at least zero.
+    #[inline]
+    #[must_use]
+    pub const fn saturating_sub(self, steps: u64) -> Self {
+        Self(self.0.saturating_sub(steps))
+    }
+
+    /// Returns how far this number is after `other`; 0 if it is not.
+    #[inline]
+    #[must_use]
+    pub const fn steps_since(self, other: Self) -> u64 {
+        self.0.saturating_sub(other.0)
+    }
+
+    /// Iterates over the numbers from this one to before `end`.
+    #[inline]
+    pub fn until(self, end: Self) -> impl DoubleEndedIterator<Item = Self> {
+        (self.0..end.0).map(Self)
+    }
+
+    /// Reads the high half, then the low half, each in the cursor's byte order.
     pub(crate) fn read(cursor: &mut Cursor<'_>, what: &'static str) -> Result<Self, WireError> {
-        let high = cursor.i32(what)?;
+        let high = cursor.u32(what)?;
         let low = cursor.u32(what)?;
-        Ok(Self(i64::from(high) << 32 | i64::from(low)))
+        Ok(Self(u64::from(high) << 32 | u64::from(low)))
+    }
+}
+
+impl Add<u64> for SequenceNumber {
+    type Output = Self;
+
+    #[inline]
+    fn add(self, steps: u64) -> Self {
+        Self(self.0 + steps)
+    }
+}
+
+impl AddAssign<u64> for SequenceNumber {
+    #[inline]
+    fn add_assign(&mut self, steps: u64) {
+        self.0 += steps;
+    }
+}
+
+/// The distance from a lower number.
+impl Sub for SequenceNumber {
+    type Output = u64;
+
+    #[inline]
+    fn sub(self, lower: Self) -> u64 {
+        self.0 - lower.0
     }
 }
 

@@ -336,7 +336,7 @@ fn what_came_before_a_malformed_submessage_stands() {
 #[test]
 fn numbers_the_protocol_does_not_have_are_refused() {
     let reason = |message: &Encoder| parse(&message.bytes)[0].map(|_| ()).unwrap_err().reason;
-    for number in [0, -1, SequenceNumber::UNKNOWN.0, i64::MIN] {
+    for number in [0, -1, SequenceNumber::UNKNOWN.0.cast_signed(), i64::MIN] {
         let mut message = message(Endianness::Little);
         message.submessage(0x15, 0, |body| data_head(body, number));
         assert_eq!(reason(&message), Reason::BadValue, "{number}");
@@ -526,7 +526,7 @@ proptest! {
             body.raw(&payload);
         });
         let [(_, inline_qos, data)] = testing::data(&message.bytes).try_into().unwrap();
-        prop_assert_eq!(data.sequence_number.0, number);
+        prop_assert_eq!(data.sequence_number.0, number.cast_unsigned());
         prop_assert_eq!(inline_qos.key_hash, key_hash);
         let expected = if is_key { Payload::Key(&payload) } else { Payload::Data(&payload) };
         prop_assert_eq!(data.payload, expected);
@@ -546,7 +546,7 @@ proptest! {
         let Body::AckNack(acknack) = all(&message.bytes)[0].body else { panic!() };
         let expected: Vec<_> = (0..bits)
             .filter(|bit| words[*bit as usize / 32] << (bit % 32) >> 31 == 1)
-            .map(|bit| SequenceNumber(base + i64::from(bit)))
+            .map(|bit| SequenceNumber(base.cast_unsigned() + u64::from(bit)))
             .collect();
         prop_assert_eq!(acknack.missing.iter().collect::<Vec<_>>(), expected);
     }

@@ -13,11 +13,11 @@ pub fn sequence_number(
     let error = cursor.error(what, Reason::BadValue);
     let high = cursor.i32(what)?;
     let low = cursor.u32(what)?;
-    let number = SequenceNumber(i64::from(high) << 32 | i64::from(low));
-    if number.0 < least {
+    let number = i64::from(high) << 32 | i64::from(low);
+    if number < least {
         Err(error)
     } else {
-        Ok(number)
+        Ok(SequenceNumber(number.cast_unsigned()))
     }
 }
 
@@ -89,7 +89,8 @@ impl<'a> SequenceNumberSet<'a> {
         let base = self.base.0;
         self.bitmap
             .ones()
-            .filter_map(move |bit| Some(SequenceNumber(base.checked_add(bit.into())?)))
+            .map(move |bit| SequenceNumber(base + u64::from(bit)))
+            .take_while(|number| *number <= SequenceNumber::MAX)
     }
 }
 

@@ -226,7 +226,7 @@ pub(super) fn read<'a>(
         SubmessageId::HEARTBEAT => {
             let (reader, writer) = from_writer(&mut body, receiver)?;
             let first = sequence_number(&mut body, "HEARTBEAT firstSN", 1)?;
-            let last = sequence_number(&mut body, "HEARTBEAT lastSN", first.0 - 1)?;
+            let last = sequence_number(&mut body, "HEARTBEAT lastSN", first.0.cast_signed() - 1)?;
             Body::Heartbeat(Heartbeat {
                 reader,
                 writer,

@@ -14,7 +14,7 @@ use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::rotel::{Item, Rotel, exports};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 const MESSAGES: u64 = 1_200;
 const DROPPED: &str = "ros2probe_otlp_dropped_total";
@@ -163,7 +163,7 @@ fn both_ends_report_the_same_traces(
     at_monitor: &mut Rotel,
 ) -> Result<()> {
     let sampled: Vec<u64> = (1..=MESSAGES)
-        .filter(|number| Message::identity(writer, *number) >> 55 & 1 == 1)
+        .filter(|number| Message::identity(writer, SequenceNumber(*number)) >> 55 & 1 == 1)
         .collect();
     ensure!(
         sampled.len() as u64 > MESSAGES / 3,
@@ -185,7 +185,10 @@ fn both_ends_report_the_same_traces(
         let received = received.get(number).context("not received")?;
         ensure!(field(sent, "Trace ID")? == field(received, "Trace ID")?);
         ensure!(field(sent, "ID")? == field(received, "Parent ID")?);
-        let trace = format!("{:032x}", Message::identity(writer, *number));
+        let trace = format!(
+            "{:032x}",
+            Message::identity(writer, SequenceNumber(*number))
+        );
         ensure!(field(sent, "Trace ID")? == trace);
     }
     Ok(())

@@ -165,7 +165,7 @@ impl Counts {
         }
         for loss in losses {
             let lost = counts.lost.entry(loss.writer.to_string()).or_default();
-            lost.extend(loss.first..=loss.last);
+            lost.extend(loss.first.0..=loss.last.0);
         }
         counts
     }

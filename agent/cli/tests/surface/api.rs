@@ -244,7 +244,7 @@ fn the_agent_does_not_start_where_the_api_would_be_open_to_everybody_or_cannot_b
         open.contains("config.yaml:1:15: api.listen: is 0.0.0.0:17401"),
         "{open}"
     );
-    assert!(open.contains("needs `token_file`"), "{open}");
+    assert!(open.contains("set `token_file`"), "{open}");
     let missing = refused("{listen: 'off', token_file: /nowhere/token}");
     assert!(missing.contains("/nowhere/token"), "{missing}");
     let missing = refused("{listen: 'off', socket: /nowhere/api.sock}");

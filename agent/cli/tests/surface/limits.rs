@@ -27,7 +27,7 @@ use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{self, BOB, Host, Seen};
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use tokio_util::sync::CancellationToken;
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
@@ -281,7 +281,7 @@ fn sample(number: u64) -> Dispatch {
             topic: Arc::new(topic),
             time: Timestamp(number),
             writer: writer(1, 1),
-            sequence_number: number,
+            sequence_number: SequenceNumber(number),
             source_timestamp: None,
             header_stamp: None,
             size: 1_000,
@@ -294,7 +294,7 @@ fn sample(number: u64) -> Dispatch {
 fn numbers(subscription: &mut Subscription) -> Vec<u64> {
     let items = std::iter::from_fn(|| subscription.try_next());
     let number = |item| match item {
-        Item::Sample(sample) => Some(sample.sequence_number),
+        Item::Sample(sample) => Some(sample.sequence_number.0),
         _ => None,
     };
     items.filter_map(number).collect()

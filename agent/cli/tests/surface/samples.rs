@@ -24,7 +24,7 @@ use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -219,11 +219,13 @@ fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_ti
             for news in replayed(&capture, Some(depth)).1 {
                 match news {
                     SampleOutcome::Sample(sample) if &*sample.topic.name == "/chatter" => {
-                        given.push((sample.sequence_number - 1, sample.time.0));
+                        given.push((sample.sequence_number - SequenceNumber(1), sample.time.0));
                     }
                     SampleOutcome::Missed(missed) if &*missed.topic.name == "/chatter" => {
                         match missed.reason {
-                            MissedReason::Lost => lost.extend(missed.first - 1..missed.last),
+                            MissedReason::Lost => {
+                                lost.extend(missed.first - SequenceNumber(1)..missed.last.0)
+                            }
                             MissedReason::Unannounced => early += missed.samples,
                             reason => panic!("{label}: {reason:?}"),
                         }
@@ -311,10 +313,10 @@ impl Robot {
                 SampleOutcome::Sample(sample) => {
                     let payload = sample.payload.as_ref().map(|bytes| bytes.to_vec());
                     let payload = payload.unwrap_or_default();
-                    (sample.writer.prefix, sample.sequence_number, Ok(payload))
+                    (sample.writer.prefix, sample.sequence_number.0, Ok(payload))
                 }
                 SampleOutcome::Missed(missed) => {
-                    (missed.writer.prefix, missed.first, Err(missed.reason))
+                    (missed.writer.prefix, missed.first.0, Err(missed.reason))
                 }
             })
             .collect()
@@ -394,7 +396,7 @@ fn each_subscription_is_told_of_the_losses_since_it_began() {
             SampleOutcome::Missed(missed) => {
                 assert_eq!(missed.reason, MissedReason::Lost);
                 assert_eq!(missed.samples, missed.last - missed.first + 1);
-                Some((given.to.to_vec(), missed.first, missed.last))
+                Some((given.to.to_vec(), missed.first.0, missed.last.0))
             }
             SampleOutcome::Sample(_) => None,
         })

@@ -1,5 +1,6 @@
 //! One builtin writer of a participant, with its received and missing announcements.
 
+use ros2probe_wire::SequenceNumber;
 use std::collections::BTreeSet;
 use std::ops::RangeInclusive;
 
@@ -19,10 +20,10 @@ pub(super) struct Announcer {
     pub(super) reader: EntityId,
     pub(super) role: Role,
     /// First and last sequence number in its HEARTBEAT.
-    pub(super) available: Option<RangeInclusive<u64>>,
-    pub(super) received: BTreeSet<u64>,
+    pub(super) available: Option<RangeInclusive<SequenceNumber>>,
+    pub(super) received: BTreeSet<SequenceNumber>,
     /// Sequence numbers of the last request.
-    requested: BTreeSet<u64>,
+    requested: BTreeSet<SequenceNumber>,
 }
 
 impl Announcer {
@@ -42,22 +43,24 @@ impl Announcer {
     }
 
     /// Available sequence numbers that have not arrived, lowest first.
-    pub(super) fn missing(&self) -> impl Iterator<Item = u64> + '_ {
+    pub(super) fn missing(&self) -> impl Iterator<Item = SequenceNumber> + '_ {
         let (first, last) = match &self.available {
             Some(range) => (*range.start(), *range.end()),
-            None => (1, 0),
+            None => (SequenceNumber(1), SequenceNumber::ZERO),
         };
-        let first = first.max(1);
+        let first = first.max(SequenceNumber(1));
         let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
-        (first..=last).filter(|number| !self.received.contains(number))
+        first
+            .until(last.next())
+            .filter(|number| !self.received.contains(number))
     }
 
     /// Sequence numbers for the next request, as many as one request holds.
-    pub(super) fn next_request(&mut self) -> BTreeSet<u64> {
-        let first = self.missing().next().unwrap_or(0);
+    pub(super) fn next_request(&mut self) -> BTreeSet<SequenceNumber> {
+        let first = self.missing().next().unwrap_or_default();
         let wanted: BTreeSet<_> = self
             .missing()
-            .take_while(|number| number - first < MOST_NUMBERS)
+            .take_while(|number| *number - first < MOST_NUMBERS)
             .collect();
         self.requested.clone_from(&wanted);
         wanted
@@ -71,8 +74,8 @@ impl Announcer {
     /// Handles a GAP: these samples will never arrive.
     pub(super) fn skip(&mut self, gap: Gap<'_>) {
         let (irrelevant, list) = (gap.start()..gap.list().base, gap.list());
-        let listed: BTreeSet<u64> = list.iter().collect();
-        let skipped: Vec<u64> = self
+        let listed: BTreeSet<SequenceNumber> = list.iter().collect();
+        let skipped: Vec<SequenceNumber> = self
             .missing()
             .filter(|number| irrelevant.contains(number) || listed.contains(number))
             .collect();

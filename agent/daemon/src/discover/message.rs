@@ -8,7 +8,7 @@ use std::net::SocketAddrV4;
 use ros2probe_wire::parameters::ParameterId;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::rtps::{LocatorKind, SubmessageFlags, SubmessageId, VendorId};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber};
 
 /// Vendor id, believed to be unassigned. Both vendors treat it as foreign and use no extensions.
 pub const VENDOR: VendorId = VendorId([0x01, 0x7f]);
@@ -128,7 +128,7 @@ impl Message {
             )
             .end();
         let (reader, writer) = (SUBSCRIPTIONS_READER, EntityId::SEDP_SUBSCRIPTIONS_WRITER);
-        let numbers = [number(1), number(1)].concat();
+        let numbers = [number(SequenceNumber(1)); 2].concat();
         let heartbeat = [&reader.0[..], &writer.0, &numbers, &1u32.to_le_bytes()];
         self.data(reader, writer, 1, &payload).submessage(
             SubmessageId::HEARTBEAT,
@@ -144,11 +144,11 @@ impl Message {
         self,
         reader: EntityId,
         writer: EntityId,
-        base: u64,
-        missing: impl IntoIterator<Item = u64>,
+        base: SequenceNumber,
+        missing: impl IntoIterator<Item = SequenceNumber>,
         count: u32,
     ) -> Self {
-        let set = bitmap(base, missing);
+        let set = bitmap(base.0, missing.into_iter().map(|number| number.0));
         let count = count.to_le_bytes();
         let body = [&reader.0[..], &writer.0, &number(base), &set, &count];
         self.submessage(SubmessageId::ACKNACK, SubmessageFlags::FINAL, &body)
@@ -161,7 +161,7 @@ impl Message {
         self,
         reader: EntityId,
         writer: EntityId,
-        sample: u64,
+        sample: SequenceNumber,
         missing: impl IntoIterator<Item = u32>,
         count: u32,
     ) -> Self {
@@ -209,7 +209,7 @@ impl Message {
 fn data_head(reader: EntityId, writer: EntityId, sequence_number: u32) -> Vec<u8> {
     // extraFlags, octetsToInlineQos.
     let fixed = [0, 0, 16, 0];
-    let number = number(sequence_number.into());
+    let number = number(SequenceNumber(sequence_number.into()));
     [&fixed[..], &reader.0, &writer.0, &number].concat()
 }
 
@@ -233,8 +233,8 @@ fn bitmap(base: u64, numbers: impl IntoIterator<Item = u64>) -> Vec<u8> {
 }
 
 /// Encodes a sequence number: high word, low word (RTPS 2.5, 9.3.2.5).
-fn number(number: u64) -> [u8; 8] {
-    number.rotate_left(32).to_le_bytes()
+fn number(number: SequenceNumber) -> [u8; 8] {
+    number.0.rotate_left(32).to_le_bytes()
 }
 
 fn locator(address: std::net::Ipv4Addr, port: u16) -> Vec<u8> {
@@ -372,7 +372,7 @@ mod tests {
         let record::Body::Heartbeat(heartbeat) = heartbeat.body() else {
             panic!("{heartbeat:?}")
         };
-        assert_eq!((heartbeat.first(), heartbeat.last()), (1, 1));
+        assert_eq!((heartbeat.first().0, heartbeat.last().0), (1, 1));
     }
 
     fn missing_of(record: &Record) -> record::SequenceNumberSet {
@@ -386,17 +386,26 @@ mod tests {
     fn a_request_asks_for_exactly_the_missing_numbers() {
         let asked = |base: u64, missing: &[u64]| -> (Record, Vec<u64>) {
             let writer = EntityId::SEDP_PUBLICATIONS_WRITER;
-            let numbers = missing.iter().copied();
+            let numbers = missing.iter().copied().map(SequenceNumber);
             let bytes = message()
-                .acknack(PUBLICATIONS_READER, writer, base, numbers, 7)
+                .acknack(
+                    PUBLICATIONS_READER,
+                    writer,
+                    SequenceNumber(base),
+                    numbers,
+                    7,
+                )
                 .bytes();
             let record = walked(&bytes)[0].record;
-            (record, missing_of(&record).iter().collect())
+            (
+                record,
+                missing_of(&record).iter().map(|number| number.0).collect(),
+            )
         };
         for missing in [vec![1], vec![1, 2, 3, 33, 64, 65, 150], vec![(1 << 32) + 5]] {
             let (record, numbers) = asked(missing[0], &missing);
             assert_eq!(
-                (numbers, missing_of(&record).base),
+                (numbers, missing_of(&record).base.0),
                 (missing.clone(), missing[0])
             );
             assert_eq!(
@@ -409,7 +418,13 @@ mod tests {
             );
         }
         let bytes = message()
-            .nack_frag(NODES_READER, NODES_READER, 48, [2, 4, 33], 1)
+            .nack_frag(
+                NODES_READER,
+                NODES_READER,
+                SequenceNumber(48),
+                [2, 4, 33],
+                1,
+            )
             .bytes();
         // After the header and INFO_DST (RTPS 2.5, 9.4.5.14).
         let nack_frag = [

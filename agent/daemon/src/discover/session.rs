@@ -15,7 +15,7 @@ use ros2probe_wire::record::{Body, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::{self, Envelope, Found};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::announcer::{Announcer, MOST_ANNOUNCEMENTS};
 use super::message::{
@@ -92,10 +92,10 @@ pub struct Session {
     requests: u32,
     discovery_fragments: DiscoveryFragments,
     /// Incomplete samples, each with the time of its last fragment.
-    partial: BTreeMap<(EntityId, u64), Timestamp>,
+    partial: BTreeMap<(EntityId, SequenceNumber), Timestamp>,
     endpoints: BTreeMap<Guid, EndpointAnnouncement>,
     /// First and last sequence number of user writers, from their HEARTBEATs.
-    user_writers: BTreeMap<EntityId, RangeInclusive<u64>>,
+    user_writers: BTreeMap<EntityId, RangeInclusive<SequenceNumber>>,
     nodes: Nodes,
     sent: Traffic,
     received: Traffic,
@@ -143,14 +143,15 @@ impl Session {
     /// Packets of a conversation without losses, with requests of maximal size.
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
-        let full = || (1, 1..=MOST_NUMBERS);
+        let first = SequenceNumber(1);
+        let full = || (first, first.until(first + MOST_NUMBERS));
         let mut plan = vec![
             self.to_discovery("introduction", self.message().announce(self.local)),
             self.to_discovery("request", self.request([full(), full()])),
         ];
         if self.wants_nodes {
             let message = self.message();
-            let message = message.acknack(NODES_READER, EntityId::UNKNOWN, 1, [1], 1);
+            let message = message.acknack(NODES_READER, EntityId::UNKNOWN, first, [first], 1);
             plan.push(self.to_user("node request", message));
         }
         plan.push(self.to_discovery("goodbye", self.message().goodbye(self.local)));
@@ -341,7 +342,7 @@ impl Session {
     fn endpoint_announced(
         &mut self,
         entity: EntityId,
-        number: u64,
+        number: SequenceNumber,
         vendor: VendorId,
         payload: Payload<'_>,
         qos: &InlineQos,
@@ -407,7 +408,7 @@ impl Session {
         let wanted = [&mut self.publications, &mut self.subscriptions].map(Announcer::next_request);
         self.requests += 1;
         let message = self.request(wanted.map(|wanted| {
-            let base = wanted.first().copied().unwrap_or(0);
+            let base = wanted.first().copied().unwrap_or_default();
             (base, wanted)
         }));
         self.asked = Some(now);
@@ -425,7 +426,7 @@ impl Session {
         let Some(last) = self.user_writers.get(&writer).map(|range| *range.end()) else {
             return;
         };
-        if last == 0 || self.sent.packets + 1 >= MOST_PACKETS {
+        if last == SequenceNumber::ZERO || self.sent.packets + 1 >= MOST_PACKETS {
             self.nodes = Nodes::Missing;
             return;
         }
@@ -438,7 +439,7 @@ impl Session {
 
     /// Requests missing fragments of incomplete samples.
     fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let due = |(_, at): &(&(EntityId, u64), &Timestamp)| since(**at, now) >= GATHER;
+        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| since(**at, now) >= GATHER;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
         if stuck.is_empty() || self.partial.values().any(|at| since(*at, now) < GATHER) {
             return;
@@ -514,14 +515,17 @@ impl Session {
 
     /// Request for these sequence numbers from their bases on. The first request announces the
     /// reader of the node list.
-    fn request<N: IntoIterator<Item = u64>>(&self, wanted: [(u64, N); 2]) -> Message {
+    fn request<N: IntoIterator<Item = SequenceNumber>>(
+        &self,
+        wanted: [(SequenceNumber, N); 2],
+    ) -> Message {
         let mut message = self.message();
         if self.wants_nodes && self.asked.is_none() {
             message = message.read_nodes(self.local);
         }
         let both = [&self.publications, &self.subscriptions];
         for (announcer, (base, numbers)) in both.into_iter().zip(wanted) {
-            if base > 0 {
+            if base > SequenceNumber::ZERO {
                 let (reader, writer) = (announcer.reader, announcer.writer);
                 message = message.acknack(reader, writer, base, numbers, self.requests.max(1));
             }

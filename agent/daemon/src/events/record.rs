@@ -362,8 +362,8 @@ fn loss(loss: &LossBurst) -> Values {
         ("writer", written(&loss.writer)),
         ("ros_node", loss.node.as_deref().map(text)),
         ("count", number(loss.count)),
-        ("first_sequence_number", number(loss.first)),
-        ("last_sequence_number", number(loss.last)),
+        ("first_sequence_number", number(loss.first.0)),
+        ("last_sequence_number", number(loss.last.0)),
     ]
 }
 

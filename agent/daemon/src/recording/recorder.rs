@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::disk_quota::DiskQuota;
 use super::filter::{Candidate, Filter};
@@ -94,7 +94,7 @@ struct RecordedTopic {
     /// Offered QoS of each publisher by its GUID, for the description.
     offered: BTreeMap<String, Qos>,
     /// Sequence number of the first recorded sample of each writer.
-    first: HashMap<Guid, u64>,
+    first: HashMap<Guid, SequenceNumber>,
 }
 
 /// Result of a recording.
@@ -390,7 +390,7 @@ impl<'a> Recorder<'a> {
         }
         let sent = sample.source_timestamp.unwrap_or(sample.time);
         self.writer
-            .write(id, sample.time, sent, sample.sequence_number, payload)?;
+            .write(id, sample.time, sent, sample.sequence_number.0, payload)?;
         add_written(&mut self.report, &topic.name, payload.len());
         if sample.sampled && !self.sampled.contains(&*topic.name) {
             self.sampled.insert(topic.name.to_string());

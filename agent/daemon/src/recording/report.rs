@@ -73,8 +73,8 @@ pub(super) fn add_missed(report: &mut Report, missed: &Missed) {
     report.missing_runs.push(MissingRun {
         topic: missed.topic.name.to_string(),
         writer: missed.writer.to_string(),
-        first_sequence_number: missed.first,
-        last_sequence_number: missed.last,
+        first_sequence_number: missed.first.0,
+        last_sequence_number: missed.last.0,
         samples: missed.samples,
         reason: reason.to_owned(),
     });
@@ -203,6 +203,8 @@ mod tests {
 
     use ros2probe_wire::Guid;
 
+    use ros2probe_wire::SequenceNumber;
+
     use super::*;
     use crate::subscriptions::Topic;
 
@@ -216,8 +218,8 @@ mod tests {
                 offered: None,
             }),
             writer: Guid::default(),
-            first,
-            last: first + samples - 1,
+            first: SequenceNumber(first),
+            last: SequenceNumber(first + samples - 1),
             samples,
             reason,
         }

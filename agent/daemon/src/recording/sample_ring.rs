@@ -115,6 +115,8 @@ mod tests {
     use ros2probe_wire::DomainId;
     use ros2probe_wire::Guid;
 
+    use ros2probe_wire::SequenceNumber;
+
     use super::*;
     use crate::subscriptions::Topic;
 
@@ -129,7 +131,7 @@ mod tests {
             }),
             time: Timestamp(seconds * 1_000_000_000),
             writer: Guid::default(),
-            sequence_number: seconds,
+            sequence_number: SequenceNumber(seconds),
             source_timestamp: None,
             header_stamp: None,
             size: 0,
@@ -139,7 +141,9 @@ mod tests {
     }
 
     fn numbers(ring: &mut SampleRing) -> Vec<u64> {
-        ring.drain().map(|sample| sample.sequence_number).collect()
+        ring.drain()
+            .map(|sample| sample.sequence_number.0)
+            .collect()
     }
 
     #[test]

@@ -8,7 +8,7 @@ use ros2probe_api::samples::{self, Line, Open};
 use ros2probe_model::discovery::hexadecimal;
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample, Topic};
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::Item;
 use super::line::announced;
@@ -56,8 +56,8 @@ impl LineReader {
             Line::Missed(facts) => Item::Missed(Missed {
                 topic: self.topic(facts.domain_id, &facts.topic, None, None),
                 writer: guid(&facts.writer),
-                first: facts.first_sequence_number,
-                last: facts.last_sequence_number,
+                first: SequenceNumber(facts.first_sequence_number),
+                last: SequenceNumber(facts.last_sequence_number),
                 samples: facts.samples,
                 reason: match facts.reason {
                     samples::MissedReason::Incomplete => MissedReason::Incomplete,
@@ -124,7 +124,7 @@ fn sample(topic: Arc<Topic>, facts: &samples::Sample, payload: Bytes) -> Sample 
         topic,
         time: time(facts.time_ns),
         writer: guid(&facts.writer),
-        sequence_number: facts.sequence_number,
+        sequence_number: SequenceNumber(facts.sequence_number),
         source_timestamp: facts.source_timestamp_ns.map(time),
         header_stamp: facts.header_stamp_ns.and_then(stamp),
         size: facts.size,

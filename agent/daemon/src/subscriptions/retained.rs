@@ -124,6 +124,8 @@ mod tests {
     use ros2probe_wire::rtps::VendorId;
     use ros2probe_wire::{EntityId, GuidPrefix, Timestamp};
 
+    use ros2probe_wire::SequenceNumber;
+
     use super::*;
     use ros2probe_model::dispatch::Offered;
 
@@ -158,7 +160,7 @@ mod tests {
             }),
             time: Timestamp(time),
             writer: writer(number),
-            sequence_number: time,
+            sequence_number: SequenceNumber(time),
             source_timestamp: None,
             header_stamp: None,
             size: 0,

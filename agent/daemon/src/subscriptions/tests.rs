@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 
 use super::*;
 use crate::agent_facts::SourceKind;
@@ -46,7 +46,7 @@ fn sample_of(topic: &str, number: u64, payload: Option<usize>) -> Arc<Sample> {
         }),
         time: Timestamp(number),
         writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
-        sequence_number: number,
+        sequence_number: SequenceNumber(number),
         source_timestamp: None,
         header_stamp: None,
         size: 10_000,
@@ -70,7 +70,7 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
     let mut numbers = Vec::new();
     while let Some(item) = subscription.try_next() {
         if let Item::Sample(sample) = item {
-            numbers.push(sample.sequence_number);
+            numbers.push(sample.sequence_number.0);
         }
     }
     numbers
@@ -109,7 +109,7 @@ fn a_slow_reader_loses_the_oldest_and_is_told_before_what_is_left() {
     let Some(Item::Missed(missed)) = slow.try_next() else {
         panic!("nothing was told");
     };
-    assert_eq!((missed.first, missed.last, missed.samples), (1, 6, 6));
+    assert_eq!((missed.first.0, missed.last.0, missed.samples), (1, 6, 6));
     assert_eq!(missed.reason, MissedReason::QueueFull);
     assert_eq!(numbers(&mut slow), [7, 8, 9, 10]);
     assert_eq!(all.facts().missed, [0, 0, 0, 0, 6]);
@@ -134,7 +134,7 @@ fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
             Item::Sample(sample) => left
                 .entry(sample.topic.name.to_string())
                 .or_default()
-                .push(sample.sequence_number),
+                .push(sample.sequence_number.0),
             Item::Missed(missed) => dropped.push(missed),
             // The last clock item supersedes the others.
             Item::Clock(now) => assert_eq!(now, Timestamp(10)),
@@ -147,7 +147,10 @@ fn a_full_queue_loses_the_oldest_of_the_topic_that_holds_most_of_it() {
         panic!("{dropped:?}");
     };
     assert_eq!(&*dropped.topic.name, "/points");
-    assert_eq!((dropped.first, dropped.last, dropped.samples), (1, 7, 7));
+    assert_eq!(
+        (dropped.first.0, dropped.last.0, dropped.samples),
+        (1, 7, 7)
+    );
     assert_eq!(all.facts().queued_bytes, 0);
 }
 
@@ -212,7 +215,7 @@ fn on_a_replay_the_source_waits_for_the_reader_and_not_for_one_that_has_gone() {
     while expected <= 100 {
         match reader.next_blocking(LONG).unwrap() {
             Item::Sample(sample) => {
-                assert_eq!(sample.sequence_number, expected);
+                assert_eq!(sample.sequence_number, SequenceNumber(expected));
                 expected += 1;
             }
             Item::Clock(now) => assert_eq!(now.0, expected - 1),

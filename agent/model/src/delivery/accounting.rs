@@ -1,6 +1,6 @@
 //! Effects of decisions about a delivery's samples: counters, causes, journal entries.
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::Receiver;
 use crate::journal::Journal;
@@ -88,7 +88,7 @@ impl Accounting<'_> {
     }
 
     /// Marks samples as pending: their cause is not known yet.
-    pub(super) fn wait(&mut self, first: u64, last: u64) {
+    pub(super) fn wait(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let Some(until) = self.until else {
             self.lose(LossCause::BeforeHost, first, last);
             return;
@@ -101,14 +101,14 @@ impl Accounting<'_> {
     }
 
     /// Settles pending samples as lost before this host.
-    pub(super) fn conclude(&mut self, first: u64, last: u64) {
+    pub(super) fn conclude(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let count = last - first + 1;
         self.tally.pending = self.tally.pending.saturating_sub(count);
         self.totals.pending = self.totals.pending.saturating_sub(count);
         self.lose(LossCause::BeforeHost, first, last);
     }
 
-    pub(super) fn lose(&mut self, cause: LossCause, first: u64, last: u64) {
+    pub(super) fn lose(&mut self, cause: LossCause, first: SequenceNumber, last: SequenceNumber) {
         let count = last - first + 1;
         self.tally.lose(cause, count);
         self.totals.lose(cause, count);

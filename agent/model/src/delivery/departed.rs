@@ -1,6 +1,6 @@
 //! Samples that left this host for a receiver on the same host: whether they arrive or are lost.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::{Delivery, DeliveryContext, FIRST_MOMENTS, SILENCE, UNDER_WAY};
 
@@ -10,9 +10,9 @@ impl Delivery {
     /// was `alive` afterwards.
     pub fn expect(
         &mut self,
-        newest: u64,
+        newest: SequenceNumber,
         alive: Option<Timestamp>,
-        left_by: impl Fn(Timestamp) -> Option<u64>,
+        left_by: impl Fn(Timestamp) -> Option<SequenceNumber>,
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
@@ -34,7 +34,7 @@ impl Delivery {
     }
 
     /// Settles samples up to `newest`, which have left for this receiver and will not arrive.
-    pub fn expect_no_more(&mut self, newest: u64, context: &mut DeliveryContext<'_>) {
+    pub fn expect_no_more(&mut self, newest: SequenceNumber, context: &mut DeliveryContext<'_>) {
         if self.reception.sequence().started() && !self.presumed_lost {
             self.exists(newest, context);
         }
@@ -42,9 +42,9 @@ impl Delivery {
 
     /// Excuses samples that were written before the receiver's reader appeared. `next` and the time
     /// of its last rise are the values from before the current record.
-    pub(super) fn excuse_unheard(&mut self, (next, advanced): (u64, Timestamp)) {
+    pub(super) fn excuse_unheard(&mut self, (next, advanced): (SequenceNumber, Timestamp)) {
         let sequence = self.reception.sequence_mut();
-        if next > 0 && advanced < self.opened && sequence.next() > next {
+        if next > SequenceNumber::ZERO && advanced < self.opened && sequence.next() > next {
             sequence.excuse(next, sequence.next());
         }
     }

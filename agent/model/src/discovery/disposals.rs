@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::facts::Origin;
 use crate::size::Size;
@@ -18,7 +18,7 @@ const UNDER_WAY: u64 = 4 * STALE_WITHIN;
 #[derive(Debug, Default)]
 pub(super) struct Disposals {
     /// The GUID, the time, and the sender and sequence number of the disposal.
-    latest: VecDeque<(Guid, Timestamp, GuidPrefix, u64)>,
+    latest: VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>,
 }
 
 impl Disposals {

@@ -6,7 +6,7 @@ use std::cmp::Reverse;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
 use ros2probe_wire::rtps::Locator;
-use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::entity::DiscoveredEntity;
 use super::eviction::{Newcomer, Table};
@@ -38,7 +38,8 @@ impl Discovery {
             return false;
         }
         let guid = announcement.guid;
-        let announces_readers = announcement.role == Role::Reader && origin.sequence_number == 1;
+        let announces_readers =
+            announcement.role == Role::Reader && origin.sequence_number == SequenceNumber(1);
         let pending = PendingEndpoint {
             at: origin.at,
             announces_readers,

@@ -8,7 +8,7 @@ use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::{Locator, VendorId};
-use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::priority::Priority;
@@ -39,7 +39,7 @@ pub struct Origin {
     /// GUID prefix of the sender, which may relay another participant's announcement.
     pub sender: GuidPrefix,
     /// Sequence number, counted by the sender's writer.
-    pub sequence_number: u64,
+    pub sequence_number: SequenceNumber,
     /// Destination address, IPv4-mapped for IPv4.
     pub destination: [u8; 16],
     /// Destination port.
@@ -105,7 +105,7 @@ pub struct Participant {
     pub(super) sends: bool,
     pub(super) domain_source: DomainSource,
     /// Writer and number of the `ros_discovery_info` sample that announced the nodes.
-    pub(super) nodes_from: Option<(Guid, u64)>,
+    pub(super) nodes_from: Option<(Guid, SequenceNumber)>,
 }
 
 /// A node.

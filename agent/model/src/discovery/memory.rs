@@ -15,7 +15,7 @@ use ros2probe_wire::qos::{
     Liveliness, Ownership, Presentation, Qos, Reliability,
 };
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
@@ -184,7 +184,7 @@ impl Remembered {
             nodes: participant.nodes.iter().map(RememberedNode::of).collect(),
             nodes_from: participant
                 .nodes_from
-                .map(|(writer, number)| (digits(writer), number)),
+                .map(|(writer, number)| (digits(writer), number.0)),
             endpoints,
         }
     }
@@ -222,8 +222,9 @@ impl Remembered {
             local: false,
             sends: false,
             domain_source: self.domain_source,
-            nodes_from: nodes_from
-                .and_then(|(writer, number)| Some((guid(writer, prefix)?, *number))),
+            nodes_from: nodes_from.and_then(|(writer, number)| {
+                Some((guid(writer, prefix)?, SequenceNumber(*number)))
+            }),
         };
         Some((prefix, participant))
     }

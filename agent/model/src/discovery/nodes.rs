@@ -1,7 +1,7 @@
 //! Nodes, from `ros_discovery_info`.
 
 use ros2probe_wire::entities::ParticipantEntities;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::entity::DiscoveredEntity;
 use super::eviction::{Newcomer, Table};
@@ -130,7 +130,7 @@ impl Discovery {
         &mut self,
         prefix: GuidPrefix,
         writer: Guid,
-        sequence_number: u64,
+        sequence_number: SequenceNumber,
         nodes: Vec<Node>,
         at: Timestamp,
         journal: &mut Journal,
@@ -138,7 +138,8 @@ impl Discovery {
         let Some(participant) = self.participants.get_mut(&prefix) else {
             return;
         };
-        let older = |(from, number): (Guid, u64)| from == writer && number >= sequence_number;
+        let older =
+            |(from, number): (Guid, SequenceNumber)| from == writer && number >= sequence_number;
         if participant.nodes_from.is_some_and(older) {
             return;
         }

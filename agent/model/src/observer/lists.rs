@@ -5,7 +5,7 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::{MATCHES_AT_ONCE, Observer, graph, naming};
 use crate::discovery::Endpoint;
@@ -140,7 +140,7 @@ impl Observer {
                             })),
                         };
                         let known = self.profiler.get(guid);
-                        let next = known.map_or(0, |known| known.writer.next());
+                        let next = known.map_or(SequenceNumber::ZERO, |known| known.writer.next());
                         self.payloads.want(guid, topic, requested, (next, now));
                     }
                     _ => self.payloads.release(guid, now),

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::record::Sample;
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
 
 use super::{Observer, graph};
 use crate::profiler::{Measured, UNDELIVERED};
@@ -107,7 +107,7 @@ impl Observer {
         }
     }
 
-    pub(super) fn skip(&mut self, writer: Guid, number: Option<u64>) {
+    pub(super) fn skip(&mut self, writer: Guid, number: Option<SequenceNumber>) {
         if let Some(number) = number {
             self.profiler.skip(writer, number);
         }

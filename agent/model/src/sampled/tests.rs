@@ -24,8 +24,12 @@ impl View {
     fn part(&mut self, number: u64, seen: Seen) -> SampledUpdate {
         self.now += SECOND / 100;
         let now = Timestamp(self.now);
-        self.sampled
-            .sample((number, seen, Some(now)), FAR, now, &mut self.sequence)
+        self.sampled.sample(
+            (SequenceNumber(number), seen, Some(now)),
+            FAR,
+            now,
+            &mut self.sequence,
+        )
     }
 
     fn counts(&self) -> (u64, u64) {
@@ -83,20 +87,28 @@ fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
     let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
     view.part(2, Seen::Part);
     assert_eq!(
-        [1, 2, 3].map(|number| has(&view, number)),
+        [1, 2, 3].map(|number| has(&view, SequenceNumber(number))),
         [true, false, false]
     );
     // The next sample begins before this one is whole.
     view.part(3, Seen::Part);
     view.part(2, Seen::Whole);
-    assert_eq!([2, 3].map(|number| has(&view, number)), [true, false]);
+    assert_eq!(
+        [2, 3].map(|number| has(&view, SequenceNumber(number))),
+        [true, false]
+    );
     view.part(3, Seen::Tail);
     view.see(500);
     // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
-    assert!(has(&view, 300) && !has(&view, 499));
+    assert!(has(&view, SequenceNumber(300)) && !has(&view, SequenceNumber(499)));
     let now = Timestamp(view.now);
-    view.sampled.skip((501, 503), FAR, now, &mut view.sequence);
-    assert!(has(&view, 502) && !has(&view, 499));
+    view.sampled.skip(
+        (SequenceNumber(501), SequenceNumber(503)),
+        FAR,
+        now,
+        &mut view.sequence,
+    );
+    assert!(has(&view, SequenceNumber(502)) && !has(&view, SequenceNumber(499)));
 }
 
 #[test]
@@ -112,20 +124,42 @@ fn an_interval_is_that_between_neighbours_that_both_were_seen() {
 fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
     let mut view = View::new();
     let now = Timestamp(view.now);
-    assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 0);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        0
+    );
     view.see(5);
-    assert_eq!(view.sampled.exist(7, FAR, now, &mut view.sequence), 2);
-    assert_eq!(view.sampled.exist(6, FAR, now, &mut view.sequence), 0);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(7), FAR, now, &mut view.sequence),
+        2
+    );
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(6), FAR, now, &mut view.sequence),
+        0
+    );
     assert_eq!(view.counts(), (1, 3));
     // Sample 8 was sent, 9 to 11 were not.
-    assert_eq!(view.sampled.skip((9, 12), FAR, now, &mut view.sequence), 1);
+    assert_eq!(
+        view.sampled.skip(
+            (SequenceNumber(9), SequenceNumber(12)),
+            FAR,
+            now,
+            &mut view.sequence
+        ),
+        1
+    );
     assert_eq!(view.counts(), (1, 4));
     let update = view.see(12);
     // The update includes 6, 7 and 8, whose sizes are not known either.
     assert_eq!((update.samples, update.alike), (1, 4));
     view.see(7);
     assert_eq!(view.counts(), (3, 5));
-    let forged = view.sampled.exist(1 << 40, FAR, now, &mut view.sequence);
+    let forged = view
+        .sampled
+        .exist(SequenceNumber(1 << 40), FAR, now, &mut view.sequence);
     assert_eq!((forged, view.counts()), (0, (3, 5)));
     assert_eq!(view.losses(), []);
 }
@@ -146,7 +180,11 @@ fn a_sample_that_was_told_of_and_seen_late_is_no_new_beginning() {
     let mut view = View::new();
     view.see(1);
     let now = Timestamp(view.now);
-    assert_eq!(view.sampled.exist(5, FAR, now, &mut view.sequence), 4);
+    assert_eq!(
+        view.sampled
+            .exist(SequenceNumber(5), FAR, now, &mut view.sequence),
+        4
+    );
     view.now += SECOND;
     for seen in [Seen::Part, Seen::Part, Seen::Whole] {
         assert_eq!(view.part(4, seen).samples, 0);
@@ -169,23 +207,29 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     // The sample may still arrive until the next tick.
     assert_eq!(settle(&mut view), []);
     assert!(view.see(3).finished);
-    assert_eq!(settle(&mut view), [(2, 2), (4, 4)]);
+    assert_eq!(settle(&mut view), runs(&[(2, 2), (4, 4)]));
     assert_eq!(view.sampled.unseen_since(), None);
     assert!(!view.see(4).finished, "given after it was left out");
     // Neither a part of a sample nor a HEARTBEAT makes it seen.
     view.part(6, Seen::Part);
     let now = Timestamp(view.now);
-    view.sampled.exist(8, FAR, now, &mut view.sequence);
+    view.sampled
+        .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
     // Numbers skipped by a GAP are not missing.
-    view.sampled.skip((9, 200), FAR, now, &mut view.sequence);
-    assert_eq!(settle(&mut view), [(6, 8)]);
+    view.sampled.skip(
+        (SequenceNumber(9), SequenceNumber(200)),
+        FAR,
+        now,
+        &mut view.sequence,
+    );
+    assert_eq!(settle(&mut view), runs(&[(6, 8)]));
     assert_eq!(settle(&mut view), []);
     assert_eq!(
         (view.see(200).finished, view.see(1000).finished),
         (true, true)
     );
     view.sampled.settle_all();
-    assert_eq!(view.sampled.take_unseen(), [(201, 999)]);
+    assert_eq!(view.sampled.take_unseen(), runs(&[(201, 999)]));
 }
 
 #[test]
@@ -196,15 +240,16 @@ fn what_was_counted_otherwise_meanwhile_is_not_left_out() {
     view.sampled.end();
     // The sample may still arrive; it is skipped when the view begins again.
     assert_eq!(view.sampled.take_unseen(), []);
-    assert!(view.sampled.awaits(2) && !view.sampled.awaits(3));
+    assert!(view.sampled.awaits(SequenceNumber(2)) && !view.sampled.awaits(SequenceNumber(3)));
     let now = Timestamp(view.now);
     for number in 4..500 {
-        view.sequence.exists(number, now, &mut |_| {});
+        view.sequence
+            .exists(SequenceNumber(number), now, &mut |_| {});
     }
     view.see(500);
     view.see(502);
     view.sampled.settle_all();
-    assert_eq!(view.sampled.take_unseen(), [(2, 2), (501, 501)]);
+    assert_eq!(view.sampled.take_unseen(), runs(&[(2, 2), (501, 501)]));
 }
 
 #[test]
@@ -220,7 +265,10 @@ fn a_jump_beyond_all_windows_is_bounded_work_and_no_loss() {
     view.see(u64::MAX);
     view.see(0);
     assert_eq!(view.counts(), (12, 1_000_006));
-    assert!((1..=6).all(|n| view.sampled.has(1_000_000 + n, view.sequence.next())));
+    assert!((1..=6).all(|n| {
+        view.sampled
+            .has(SequenceNumber(1_000_000 + n), view.sequence.next())
+    }));
 }
 
 #[test]
@@ -237,10 +285,15 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
     assert!(view.part(6, Seen::Whole).finished);
     assert_eq!(view.see(7).samples, 1);
     let now = Timestamp(view.now);
-    let messages = view.sampled.exist(3000, REACH, now, &mut view.sequence);
-    let passed = view
+    let messages = view
         .sampled
-        .skip((2000, 3000), REACH, now, &mut view.sequence);
+        .exist(SequenceNumber(3000), REACH, now, &mut view.sequence);
+    let passed = view.sampled.skip(
+        (SequenceNumber(2000), SequenceNumber(3000)),
+        REACH,
+        now,
+        &mut view.sequence,
+    );
     assert_eq!((messages, passed, view.counts()), (0, 0, (8, 8)));
 }
 
@@ -256,7 +309,13 @@ fn it_is_sampled_until_shared_memory_has_been_silent_for_a_while() {
 #[test]
 fn the_stamp_of_a_first_fragment_is_that_of_the_sample() {
     let mut sampled = Sampled::new(Timestamp(SECOND));
-    assert_eq!(sampled.stamp(1, Some((5, 6))), Some((5, 6)));
-    assert_eq!(sampled.stamp(1, None), Some((5, 6)));
-    assert_eq!(sampled.stamp(2, None), None);
+    assert_eq!(sampled.stamp(SequenceNumber(1), Some((5, 6))), Some((5, 6)));
+    assert_eq!(sampled.stamp(SequenceNumber(1), None), Some((5, 6)));
+    assert_eq!(sampled.stamp(SequenceNumber(2), None), None);
+}
+
+/// Returns the runs, given as their first and last numbers.
+fn runs(runs: &[(u64, u64)]) -> Vec<(SequenceNumber, SequenceNumber)> {
+    let numbered = |(first, last): &(u64, u64)| (SequenceNumber(*first), SequenceNumber(*last));
+    runs.iter().map(numbered).collect()
 }

@@ -1,5 +1,7 @@
 //! A bitmap by sequence number.
 
+use ros2probe_wire::SequenceNumber;
+
 /// A ring of bits, addressed by sequence number. Its length is a power of two.
 #[derive(Debug, Default)]
 pub(super) struct Bitmap {
@@ -17,41 +19,46 @@ impl Bitmap {
         self.words.len() as u64 * 64
     }
 
-    fn place(&self, number: u64) -> (usize, u64) {
-        let bit = number & self.len().wrapping_sub(1);
+    fn place(&self, number: SequenceNumber) -> (usize, u64) {
+        let bit = number.0 & self.len().wrapping_sub(1);
         (
             usize::try_from(bit / 64).unwrap_or(usize::MAX),
             1 << (bit % 64),
         )
     }
 
-    pub(super) fn get(&self, number: u64) -> bool {
+    pub(super) fn get(&self, number: SequenceNumber) -> bool {
         let (word, mask) = self.place(number);
         self.words.get(word).is_some_and(|word| word & mask != 0)
     }
 
-    pub(super) fn set(&mut self, number: u64) {
+    pub(super) fn set(&mut self, number: SequenceNumber) {
         let (word, mask) = self.place(number);
         if let Some(word) = self.words.get_mut(word) {
             *word |= mask;
         }
     }
 
-    pub(super) fn set_all(&mut self, start: u64, end: u64) {
+    pub(super) fn set_all(&mut self, start: SequenceNumber, end: SequenceNumber) {
         self.each_word(start, end, |word, mask| *word |= mask);
     }
 
-    pub(super) fn clear(&mut self, start: u64, end: u64) {
+    pub(super) fn clear(&mut self, start: SequenceNumber, end: SequenceNumber) {
         self.each_word(start, end, |word, mask| *word &= !mask);
     }
 
     /// Changes whole words, since each HEARTBEAT may excuse thousands of numbers.
-    fn each_word(&mut self, start: u64, end: u64, change: impl Fn(&mut u64, u64)) {
+    fn each_word(
+        &mut self,
+        start: SequenceNumber,
+        end: SequenceNumber,
+        change: impl Fn(&mut u64, u64),
+    ) {
         let end = end.min(start.saturating_add(self.len()));
         let mut number = start;
         while number < end {
             let (word, _) = self.place(number);
-            let (first, left) = (number % 64, end - number);
+            let (first, left) = (number.0 % 64, end - number);
             let bits = left.min(64 - first);
             if let Some(word) = self.words.get_mut(word) {
                 change(word, (u64::MAX >> (64 - bits)) << first);
@@ -60,9 +67,9 @@ impl Bitmap {
         }
     }
 
-    pub(super) fn grow(&mut self, bits: u64, start: u64, end: u64) {
+    pub(super) fn grow(&mut self, bits: u64, start: SequenceNumber, end: SequenceNumber) {
         let mut wider = Self::with_len(bits);
-        for number in start..end {
+        for number in start.until(end) {
             if self.get(number) {
                 wider.set(number);
             }

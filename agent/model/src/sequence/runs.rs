@@ -1,21 +1,21 @@
 //! The writer's run of numbers: the live one, or another that further datagrams confirm.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::unconfirmed::{CONFIRMATIONS, Run};
-use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled, is_number};
+use super::{FAR, INCARNATION, MAX_JUMP, RunMembership, STALE, Sequence, Settled};
 
 impl Sequence {
     /// Checks number and source time of a sample before any other processing, to recognise a writer
     /// that jumps or restarts under its GUID. Numbers up to `reach` ahead belong to the live run.
     pub fn recognise(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         source: Option<Timestamp>,
         reach: u64,
         now: Timestamp,
     ) -> RunMembership {
-        if !is_number(number) {
+        if !number.is_valid() {
             return RunMembership::Live;
         }
         if self.is_unconfirmed(number, source, reach) {
@@ -47,8 +47,13 @@ impl Sequence {
 
     /// Returns whether a sample with this number and source time is outside the live run.
     #[must_use]
-    pub fn is_unconfirmed(&self, number: u64, source: Option<Timestamp>, reach: u64) -> bool {
-        if !self.started() || !is_number(number) {
+    pub fn is_unconfirmed(
+        &self,
+        number: SequenceNumber,
+        source: Option<Timestamp>,
+        reach: u64,
+    ) -> bool {
+        if !self.started() || !number.is_valid() {
             return false;
         }
         if number >= self.next {
@@ -68,14 +73,14 @@ impl Sequence {
     }
 
     /// Marks an unconfirmed sample as whole. Returns whether that is new.
-    pub fn complete_unconfirmed(&mut self, number: u64) -> bool {
+    pub fn complete_unconfirmed(&mut self, number: SequenceNumber) -> bool {
         let unconfirmed = self.unconfirmed.as_mut();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.complete(number))
     }
 
     /// Returns whether an unconfirmed sample arrived whole.
     #[must_use]
-    pub fn has_unconfirmed(&self, number: u64) -> bool {
+    pub fn has_unconfirmed(&self, number: SequenceNumber) -> bool {
         let unconfirmed = self.unconfirmed.as_ref();
         unconfirmed.is_some_and(|unconfirmed| unconfirmed.is_whole(number))
     }
@@ -99,7 +104,7 @@ impl Sequence {
         let Some((first, _)) = run.numbers.first() else {
             return run;
         };
-        let jump = first.checked_sub(self.next);
+        let jump = first.0.checked_sub(self.next.0);
         // A run of only a few samples has no losses far from it.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,

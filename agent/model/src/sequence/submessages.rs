@@ -1,6 +1,6 @@
 //! HEARTBEAT, GAP and ACKNACK: existing numbers, and those that readers miss (RTPS 2.5, 8.3.8).
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::unconfirmed::Run;
 use super::{FAR, MAX_JUMP, REACH, Sequence, Settled};
@@ -10,15 +10,15 @@ impl Sequence {
     /// and all numbers up to `last` exist.
     pub fn heartbeat(
         &mut self,
-        first: u64,
-        last: u64,
+        first: SequenceNumber,
+        last: SequenceNumber,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) {
-        if !self.started() || first == 0 || first > last.saturating_add(1) {
+        if !self.started() || first == SequenceNumber::ZERO || first > last.next() {
             return;
         }
-        let next = last.saturating_add(1);
+        let next = last.next();
         let (is_confirmed, run) = self.claim(next, REACH, now);
         if let Some(run) = run {
             self.accept(&run, now, settled);
@@ -28,7 +28,7 @@ impl Sequence {
         }
         if next > self.next {
             self.note_gap(self.next, next, now);
-            self.extend(next - 1, next, now, settled);
+            self.extend(next.previous(), next, now, settled);
         }
         let available = first.min(self.next);
         if available > self.available {
@@ -39,13 +39,18 @@ impl Sequence {
 
     /// Processes a HEARTBEAT's lastSN, `next - 1`. Returns whether it is confirmed, and the run
     /// that it confirms.
-    pub fn claim(&mut self, next: u64, reach: u64, now: Timestamp) -> (bool, Option<Run>) {
+    pub fn claim(
+        &mut self,
+        next: SequenceNumber,
+        reach: u64,
+        now: Timestamp,
+    ) -> (bool, Option<Run>) {
         let live = self.next;
         let unconfirmed = self.unconfirmed.as_mut();
         if unconfirmed.is_some_and(|unconfirmed| unconfirmed.agrees(next, live, now)) {
             return (true, Some(self.confirm()));
         }
-        let ahead = next.saturating_sub(live);
+        let ahead = next.steps_since(live);
         if ahead <= reach {
             if next >= live {
                 self.contradict();
@@ -61,15 +66,15 @@ impl Sequence {
     }
 
     /// Returns whether an ACKNACK acknowledges numbers that are not known to exist.
-    pub const fn refuses(&mut self, base: u64) -> bool {
-        let refuses = self.started() && base.saturating_sub(self.next) > FAR;
+    pub const fn refuses(&mut self, base: SequenceNumber) -> bool {
+        let refuses = self.started() && base.steps_since(self.next) > FAR;
         self.jumps += refuses as u64;
         refuses
     }
 
     /// Processes an ACKNACK: the readers have all numbers below `base`, even unseen ones, except
     /// samples that the writer had withdrawn before.
-    pub fn acknowledged(&mut self, base: u64) {
+    pub fn acknowledged(&mut self, base: SequenceNumber) {
         if self.started() {
             self.excuse(self.available, base);
             self.acknowledged = self.acknowledged.max(base);
@@ -79,16 +84,16 @@ impl Sequence {
     /// Processes a GAP: `start..base` and some numbers after it will never arrive.
     pub fn gap(
         &mut self,
-        start: u64,
-        base: u64,
-        set: impl Iterator<Item = u64>,
+        start: SequenceNumber,
+        base: SequenceNumber,
+        set: impl Iterator<Item = SequenceNumber>,
         now: Timestamp,
         settled: &mut impl FnMut(Settled),
     ) {
-        if !self.started() || start == 0 || base < start {
+        if !self.started() || start == SequenceNumber::ZERO || base < start {
             return;
         }
-        let ahead = base.saturating_sub(self.next);
+        let ahead = base.steps_since(self.next);
         if ahead > REACH {
             self.jumps += 1;
             if ahead <= MAX_JUMP {
@@ -98,23 +103,23 @@ impl Sequence {
             }
             return;
         }
-        let mut one = |sequence: &mut Self, start: u64, end: u64| {
+        let mut one = |sequence: &mut Self, start: SequenceNumber, end: SequenceNumber| {
             if end > sequence.next {
                 if end - sequence.next > REACH {
                     return;
                 }
-                sequence.extend(end - 1, end, now, settled);
+                sequence.extend(end.previous(), end, now, settled);
             }
             sequence.excuse(start.max(sequence.settled), end);
         };
         one(self, start, base);
         for number in set {
-            one(self, number, number.saturating_add(1));
+            one(self, number, number.next());
         }
     }
 
     /// Processes an ACKNACK in which a reader requests these numbers again.
-    pub fn requested(&mut self, mut set: impl Iterator<Item = u64>) {
+    pub fn requested(&mut self, mut set: impl Iterator<Item = SequenceNumber>) {
         if self.gaps.is_empty() {
             return;
         }
@@ -128,7 +133,7 @@ impl Sequence {
     }
 
     /// Excuses `start..end`, so that no number in it is lost.
-    pub fn excuse(&mut self, start: u64, end: u64) {
+    pub fn excuse(&mut self, start: SequenceNumber, end: SequenceNumber) {
         let start = start.max(self.floor()).max(self.settled);
         self.excused.set_all(start, end.min(self.next));
     }

@@ -22,13 +22,14 @@ impl Bench {
     }
 
     fn receive_at(&mut self, number: u64, source: Option<u64>) {
+        let number = SequenceNumber(number);
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
         let (source, now) = (source.map(Timestamp), Timestamp(self.now));
         match self.sequence.recognise(number, source, REACH, now) {
             RunMembership::Live => {}
             RunMembership::Unconfirmed { .. } => {
                 if !self.sequence.complete_unconfirmed(number) {
-                    self.duplicates.push(number);
+                    self.duplicates.push(number.0);
                 }
                 return;
             }
@@ -45,17 +46,21 @@ impl Bench {
         match arrival {
             Arrival::New {
                 recovered: true, ..
-            } => self.recovered.push(number),
+            } => self.recovered.push(number.0),
             Arrival::New { .. } => {}
-            Arrival::Duplicate => self.duplicates.push(number),
+            Arrival::Duplicate => self.duplicates.push(number.0),
         }
     }
 
     fn heartbeat(&mut self, first: u64, last: u64) -> &mut Self {
         let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
         let mut note = |settled| note(settled, lost, irrelevant);
-        self.sequence
-            .heartbeat(first, last, Timestamp(self.now), &mut note);
+        self.sequence.heartbeat(
+            SequenceNumber(first),
+            SequenceNumber(last),
+            Timestamp(self.now),
+            &mut note,
+        );
         self
     }
 
@@ -79,9 +84,9 @@ impl Bench {
 
 fn note(settled: Settled, lost: &mut Vec<u64>, irrelevant: &mut Vec<u64>) {
     match settled {
-        Settled::Lost(number) => lost.push(number),
-        Settled::LostRun(start, end) => lost.extend(start..end),
-        Settled::Irrelevant(number) => irrelevant.push(number),
+        Settled::Lost(number) => lost.push(number.0),
+        Settled::LostRun(start, end) => lost.extend(start.0..end.0),
+        Settled::Irrelevant(number) => irrelevant.push(number.0),
     }
 }
 
@@ -126,7 +131,9 @@ fn a_retransmission_recovers() {
 fn a_fast_retransmission_that_was_asked_for_is_no_reordering() {
     let mut bench = Bench::default();
     bench.receive([1, 2, 4]);
-    bench.sequence.requested([3].into_iter());
+    bench
+        .sequence
+        .requested([3].map(SequenceNumber).into_iter());
     bench.receive([3]);
     assert_eq!(bench.recovered, [3]);
 }
@@ -142,9 +149,13 @@ fn nothing_before_the_first_sight_is_lost() {
 fn gap_excuses_and_heartbeat_does_not() {
     let mut bench = Bench::default();
     bench.receive([1, 4, 7, 9]);
-    bench
-        .sequence
-        .gap(2, 4, [].into_iter(), Timestamp(bench.now), &mut |_| {});
+    bench.sequence.gap(
+        SequenceNumber(2),
+        SequenceNumber(4),
+        [].into_iter(),
+        Timestamp(bench.now),
+        &mut |_| {},
+    );
     bench.heartbeat(7, 9).wait(3);
     assert_eq!(
         (bench.irrelevant.as_slice(), bench.lost.as_slice()),
@@ -156,10 +167,10 @@ fn gap_excuses_and_heartbeat_does_not() {
 fn what_readers_acknowledge_is_no_loss_unless_the_writer_had_withdrawn_it() {
     let mut bench = Bench::default();
     bench.receive([1, 4]);
-    bench.sequence.acknowledged(4);
+    bench.sequence.acknowledged(SequenceNumber(4));
     bench.heartbeat(4, 4).receive([7]);
     bench.heartbeat(7, 7);
-    bench.sequence.acknowledged(8);
+    bench.sequence.acknowledged(SequenceNumber(8));
     bench.wait(3);
     assert_eq!(
         (bench.irrelevant.as_slice(), bench.lost.as_slice()),
@@ -192,9 +203,13 @@ fn what_the_writer_withdrew_is_decided_after_the_grace_and_not_the_window() {
 fn a_gap_ahead_of_the_data_does_not_hide_data() {
     let mut bench = Bench::default();
     bench.receive([1]);
-    bench
-        .sequence
-        .gap(2, 4, [4].into_iter(), Timestamp(bench.now), &mut |_| {});
+    bench.sequence.gap(
+        SequenceNumber(2),
+        SequenceNumber(4),
+        [SequenceNumber(4)].into_iter(),
+        Timestamp(bench.now),
+        &mut |_| {},
+    );
     bench.receive([3, 5]).wait(3);
     assert_eq!(
         (bench.irrelevant.as_slice(), bench.lost.len()),
@@ -207,9 +222,12 @@ fn a_gap_ahead_of_the_data_does_not_hide_data() {
 fn the_last_sample_of_a_burst_is_missed_by_its_heartbeat() {
     let mut bench = Bench::default();
     bench.receive([1, 2]);
-    bench
-        .sequence
-        .heartbeat(1, 3, Timestamp(bench.now), &mut |_| {});
+    bench.sequence.heartbeat(
+        SequenceNumber(1),
+        SequenceNumber(3),
+        Timestamp(bench.now),
+        &mut |_| {},
+    );
     bench.wait(3);
     assert_eq!(bench.lost, [3]);
 }
@@ -220,12 +238,27 @@ fn forged_heartbeats_and_gaps_make_no_losses() {
     bench.receive([1, 2]);
     let now = Timestamp(bench.now);
     for (first, last) in [(1, u64::MAX), (0, 5), (9, 3), (u64::MAX, u64::MAX)] {
-        bench.sequence.heartbeat(first, last, now, &mut |_| {});
+        bench.sequence.heartbeat(
+            SequenceNumber(first),
+            SequenceNumber(last),
+            now,
+            &mut |_| {},
+        );
     }
-    bench
-        .sequence
-        .gap(1, u64::MAX, [u64::MAX].into_iter(), now, &mut |_| {});
-    bench.sequence.gap(0, 0, [].into_iter(), now, &mut |_| {});
+    bench.sequence.gap(
+        SequenceNumber(1),
+        SequenceNumber(u64::MAX),
+        [SequenceNumber(u64::MAX)].into_iter(),
+        now,
+        &mut |_| {},
+    );
+    bench.sequence.gap(
+        SequenceNumber(0),
+        SequenceNumber(0),
+        [].into_iter(),
+        now,
+        &mut |_| {},
+    );
     bench.receive([3, 4]).wait(3);
     assert!(bench.lost.is_empty());
 }
@@ -277,8 +310,10 @@ fn a_fragment_of_a_number_that_cannot_be_loses_nothing() {
         bench.receive([1, 2]);
         let mut decided = 0;
         let now = Timestamp(bench.now);
-        bench.sequence.exists(number, now, &mut |_| decided += 1);
-        assert_eq!((decided, bench.sequence.next()), (0, 3));
+        bench
+            .sequence
+            .exists(SequenceNumber(number), now, &mut |_| decided += 1);
+        assert_eq!((decided, bench.sequence.next().0), (0, 3));
         bench.receive([3]).wait(3);
         assert!(bench.lost.is_empty() && bench.duplicates.is_empty());
     }
@@ -319,23 +354,23 @@ fn ranges_of_a_bitmap_are_set_and_cleared_to_the_bit_also_around_its_end() {
         (1000, 5000),
     ] {
         let mut bits = Bitmap::with_len(256);
-        bits.set_all(start, end);
+        bits.set_all(SequenceNumber(start), SequenceNumber(end));
         let is_within = |number: u64| {
             let number = start + (number.wrapping_sub(start) & 255);
             (start..end).contains(&number)
         };
         for number in 1000..1256 {
             assert_eq!(
-                bits.get(number),
+                bits.get(SequenceNumber(number)),
                 is_within(number),
                 "{start} {end} {number}"
             );
         }
-        bits.set_all(0, 256);
-        bits.clear(start, end);
+        bits.set_all(SequenceNumber(0), SequenceNumber(256));
+        bits.clear(SequenceNumber(start), SequenceNumber(end));
         for number in 1000..1256 {
             assert_eq!(
-                bits.get(number),
+                bits.get(SequenceNumber(number)),
                 !is_within(number),
                 "{start} {end} {number}"
             );
@@ -350,8 +385,13 @@ fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
     let mut count = |settled| lost += u64::from(matches!(settled, Settled::Lost(_)));
     for step in 1..10_000_u64 {
         let now = Timestamp(step * SECOND / 10);
-        sequence.receive(2 * step, RepairMode::BestEffort, now, &mut count);
-        sequence.advance(now, (SECOND, SECOND), Some(100), &mut count);
+        sequence.receive(
+            SequenceNumber(2 * step),
+            RepairMode::BestEffort,
+            now,
+            &mut count,
+        );
+        sequence.advance(now, (SECOND, SECOND), Some(SequenceNumber(100)), &mut count);
         let [.., checkpoints, _] = sequence.sizes();
         assert!(checkpoints.entries <= checkpoints.cap, "{checkpoints:?}");
     }

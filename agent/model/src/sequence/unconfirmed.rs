@@ -3,7 +3,7 @@
 //! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
 //! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
 
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::FAR;
 
@@ -24,16 +24,16 @@ pub(super) struct UnconfirmedRun {
     since: Timestamp,
     latest: Timestamp,
     /// The number after lastSN of a HEARTBEAT, and its time.
-    claim: (u64, Timestamp),
+    claim: (SequenceNumber, Timestamp),
 }
 
 /// Samples that were counted before their numbers were confirmed.
 #[derive(Clone, Debug, Default)]
 pub struct Run {
     /// Numbers, and whether each sample is whole; sorted once confirmed.
-    pub numbers: Vec<(u64, bool)>,
+    pub numbers: Vec<(SequenceNumber, bool)>,
     /// Numbers that a GAP skipped before the run.
-    pub(super) gap: (u64, u64),
+    pub(super) gap: (SequenceNumber, SequenceNumber),
 }
 
 impl UnconfirmedRun {
@@ -54,13 +54,13 @@ impl UnconfirmedRun {
     }
 
     /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
-    pub(super) fn note(&mut self, number: u64, now: Timestamp) -> (bool, bool) {
+    pub(super) fn note(&mut self, number: SequenceNumber, now: Timestamp) -> (bool, bool) {
         let numbers = &self.run.numbers;
         if numbers.iter().any(|(known, _)| *known == number) {
             return (false, false);
         }
         let last = numbers.last().map(|(last, _)| *last);
-        let opens = last.is_none_or(|last| last.abs_diff(number) > FAR);
+        let opens = last.is_none_or(|last| last.0.abs_diff(number.0) > FAR);
         if opens {
             self.run.numbers.clear();
             self.evidence = 0;
@@ -81,7 +81,7 @@ impl UnconfirmedRun {
     }
 
     /// Marks a sample as whole. Returns whether that is new.
-    pub(super) fn complete(&mut self, number: u64) -> bool {
+    pub(super) fn complete(&mut self, number: SequenceNumber) -> bool {
         let mut numbers = self.run.numbers.iter_mut();
         let Some((_, is_whole)) = numbers.find(|(known, _)| *known == number) else {
             return false;
@@ -90,12 +90,12 @@ impl UnconfirmedRun {
     }
 
     /// Returns whether this number continues a run below `live`.
-    pub(super) fn is_continued(&self, number: u64, live: u64) -> bool {
+    pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
         let last = self.run.numbers.last().filter(|_| self.evidence > 0);
-        last.is_some_and(|(last, _)| *last < live && last.abs_diff(number) <= FAR)
+        last.is_some_and(|(last, _)| *last < live && last.0.abs_diff(number.0) <= FAR)
     }
 
-    pub(super) fn is_whole(&self, number: u64) -> bool {
+    pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
         self.run.numbers.contains(&(number, true))
     }
 
@@ -106,12 +106,17 @@ impl UnconfirmedRun {
     /// Resets the evidence, because the live run continued.
     pub(super) const fn contradict(&mut self) {
         self.evidence = 0;
-        self.claim = (0, Timestamp(0));
+        self.claim = (SequenceNumber::ZERO, Timestamp(0));
     }
 
     /// Returns whether a HEARTBEAT with lastSN `next - 1` confirms the run, where `live` is the
     /// live run's next number. A HEARTBEAT that reaches `live` never confirms a run below it.
-    pub(super) fn agrees(&self, next: u64, live: u64, now: Timestamp) -> bool {
+    pub(super) fn agrees(
+        &self,
+        next: SequenceNumber,
+        live: SequenceNumber,
+        now: Timestamp,
+    ) -> bool {
         let end = self.end();
         let is_ahead = end > live;
         self.evidence > 0
@@ -121,9 +126,10 @@ impl UnconfirmedRun {
     }
 
     /// Returns whether an earlier HEARTBEAT had the same lastSN, or one lower by at most `reach`.
-    pub(super) fn is_claimed(&mut self, next: u64, reach: u64, now: Timestamp) -> bool {
+    pub(super) fn is_claimed(&mut self, next: SequenceNumber, reach: u64, now: Timestamp) -> bool {
         let (claimed, at) = self.claim;
-        let is_same = claimed > 0 && (claimed..=claimed.saturating_add(reach)).contains(&next);
+        let is_same = claimed > SequenceNumber::ZERO
+            && (claimed..=claimed.saturating_add(reach)).contains(&next);
         if !is_same {
             self.claim = (next, now);
         }
@@ -131,7 +137,7 @@ impl UnconfirmedRun {
     }
 
     /// Records the numbers that a GAP skips.
-    pub(super) const fn pass_over(&mut self, start: u64, end: u64) {
+    pub(super) const fn pass_over(&mut self, start: SequenceNumber, end: SequenceNumber) {
         self.run.gap = (start, end);
     }
 
@@ -145,15 +151,16 @@ impl UnconfirmedRun {
             .is_none_or(|(first, _)| run.gap.1 > *first)
         {
             // The GAP contradicts the samples that arrived.
-            run.gap = (0, 0);
+            run.gap = Default::default();
         }
         run
     }
 
     /// Returns the highest number of the run, plus one.
-    fn end(&self) -> u64 {
+    fn end(&self) -> SequenceNumber {
         let numbers = self.run.numbers.iter();
-        numbers.map(|(number, _)| number + 1).max().unwrap_or(0)
+        let ends = numbers.map(|(number, _)| number.next());
+        ends.max().unwrap_or_default()
     }
 }
 
@@ -165,12 +172,21 @@ mod tests {
     fn the_oldest_numbers_of_a_long_run_are_forgotten() {
         let mut unconfirmed = UnconfirmedRun::default();
         for number in 1..=100 {
-            assert_eq!(unconfirmed.note(number, Timestamp(1)), (number == 1, true));
+            assert_eq!(
+                unconfirmed.note(SequenceNumber(number), Timestamp(1)),
+                (number == 1, true)
+            );
         }
         assert_eq!(unconfirmed.len(), UnconfirmedRun::CAP);
         // The evidence counts again.
-        assert_eq!(unconfirmed.note(1, Timestamp(1)), (false, true));
-        assert_eq!(unconfirmed.note(100, Timestamp(1)), (false, false));
+        assert_eq!(
+            unconfirmed.note(SequenceNumber(1), Timestamp(1)),
+            (false, true)
+        );
+        assert_eq!(
+            unconfirmed.note(SequenceNumber(100), Timestamp(1)),
+            (false, false)
+        );
         assert_eq!(unconfirmed.evidence, 1);
     }
 }

@@ -5,7 +5,7 @@ use std::fmt;
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use crate::measurement::Delivered;
 use crate::names::NodeName;
@@ -110,7 +110,7 @@ pub struct AcknowledgementFacts {
     /// The reader's node.
     pub node: Option<NodeName>,
     /// All samples up to this number are acknowledged; 0 for none.
-    pub acknowledged: u64,
+    pub acknowledged: SequenceNumber,
     /// Samples that the reader requested in its last ACKNACK.
     pub missing: u64,
     /// Samples requested again since the start, counted per request.

@@ -1,9 +1,9 @@
 //! Effects of time and discovery on deliveries: gaps settle, sockets get owners, receivers appear
 //! and vanish.
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::{Subscribers, WriterContext, delivery_context, is_reader};
 use crate::delivery::{Delivery, Receiver, Totals};
@@ -89,8 +89,12 @@ impl Subscribers {
                 continue;
             };
             if main.is_sent() {
-                if let Some(known) = self.routes.get_mut(at).filter(|_| next > 0) {
-                    known.mark(next - 1, context.now);
+                if let Some(known) = self
+                    .routes
+                    .get_mut(at)
+                    .filter(|_| next > SequenceNumber::ZERO)
+                {
+                    known.mark(next.previous(), context.now);
                 }
                 continue;
             }
@@ -108,9 +112,10 @@ impl Subscribers {
             let Some(left) = left.and_then(|left| self.deliveries.get(left)) else {
                 continue;
             };
-            let Some(newest) = left.next().checked_sub(1) else {
+            if left.next() == SequenceNumber::ZERO {
                 continue;
-            };
+            }
+            let newest = left.next().previous();
             let alive = match delivery.receiver() {
                 Receiver::Participant(prefix) => {
                     let participant = context.graph.discovery.participants().get(&prefix);

@@ -1,5 +1,5 @@
 use ros2probe_wire::record::{guid_words, kind};
-use ros2probe_wire::{EntityId, GuidPrefix};
+use ros2probe_wire::{EntityId, GuidPrefix, SequenceNumber};
 
 use super::*;
 use ros2probe_wire::time::SECOND;
@@ -110,7 +110,10 @@ fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_rea
         panic!()
     };
     assert_eq!(sent.message, settled.message);
-    assert_eq!(sent.message.trace_id, Message::identity(WRITER, 5));
+    assert_eq!(
+        sent.message.trace_id,
+        Message::identity(WRITER, SequenceNumber(5))
+    );
     assert_eq!((sent.message.size, sent.message.fragments), (10_000, 10));
     assert_eq!(sent.message.source, RtpsTime(99));
     assert_eq!(tracer.size().0, 1);

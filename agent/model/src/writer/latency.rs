@@ -1,6 +1,6 @@
 //! Latencies of a writer's samples since INFO_TS and since their header's stamp.
 
-use ros2probe_wire::{RtpsTime, Timestamp};
+use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::{HISTORY, Writer, seconds};
 use crate::header::{PLAUSIBLE, stamp_time};
@@ -8,7 +8,7 @@ use crate::header::{PLAUSIBLE, stamp_time};
 impl Writer {
     pub(super) fn delays(
         &mut self,
-        number: u64,
+        number: SequenceNumber,
         newest: bool,
         (source, stamp): (RtpsTime, Option<(i32, u32)>),
         (now, wall_clock): (Timestamp, Timestamp),

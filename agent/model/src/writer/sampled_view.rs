@@ -74,7 +74,7 @@ impl Writer {
             Body::Gap(gap) => sampled.skip((gap.start(), gap.list().base), reach, now, sequence),
             // The reader has all samples below this number.
             Body::AckNack(acknack) => {
-                sampled.exist(acknack.base().saturating_sub(1), reach, now, sequence)
+                sampled.exist(acknack.base().previous(), reach, now, sequence)
             }
             Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
         };

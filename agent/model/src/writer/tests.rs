@@ -143,7 +143,7 @@ fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
         bench
             .journal
             .losses()
-            .map(|loss| loss.first)
+            .map(|loss| loss.first.0)
             .collect::<Vec<_>>(),
         [2]
     );
@@ -162,7 +162,7 @@ fn a_sample_that_began_before_the_kernel_was_told_of_its_writer_is_no_loss_when_
     assert_eq!((facts.messages, facts.lost, facts.incomplete), (1, 1, 1));
     assert_eq!(facts.irrelevant, 1);
     assert_eq!(
-        bench.journal.losses().next().map(|loss| loss.first),
+        bench.journal.losses().next().map(|loss| loss.first.0),
         Some(2)
     );
     assert_eq!((bench.budget.bytes, bench.budget.samples), (0, 0));
@@ -518,7 +518,7 @@ fn every_sample_is_given_or_missed(
                         .has(Record { time, ..*record }.sample().unwrap());
                     if let Some(counted) = bench.take(*record) {
                         assert!(!has, "{record:?}");
-                        given[usize::try_from(counted.number).unwrap() - 1] += 1;
+                        given[usize::try_from(counted.number.0).unwrap() - 1] += 1;
                     }
                 }
             };
@@ -537,7 +537,7 @@ fn every_sample_is_given_or_missed(
             let mut accounted = given;
             for missing in bench.journal.take_missing() {
                 assert_eq!(missing.reason, MissedReason::NotCaptured);
-                for number in missing.first..=missing.last {
+                for number in missing.first.0..=missing.last.0 {
                     accounted[usize::try_from(number).unwrap() - 1] += 1;
                 }
             }

@@ -213,7 +213,7 @@ fn one_acknack_far_ahead_acknowledges_nothing() {
     let acknowledgements = host.topic().acknowledgements;
     let bases: Vec<_> = acknowledgements
         .iter()
-        .map(|each| each.acknowledged)
+        .map(|each| each.acknowledged.0)
         .collect();
     assert_eq!(bases, [399]);
     run.stays_exact(0, &|host, bob| {
@@ -479,7 +479,7 @@ fn a_doubted_message_is_given_once_and_holds_no_other_up() {
         host.data(bob, number);
         let samples = host.observer.drain().samples.into_iter();
         given.extend(samples.filter_map(|given: Dispatch| match given.outcome {
-            SampleOutcome::Sample(sample) => Some(sample.sequence_number),
+            SampleOutcome::Sample(sample) => Some(sample.sequence_number.0),
             SampleOutcome::Missed(_) => None,
         }));
     }

@@ -45,7 +45,7 @@ fn given(host: &mut Host) -> Vec<(u64, u64)> {
         .filter_map(|given| match given.outcome {
             SampleOutcome::Sample(sample) => {
                 let at = (sample.time.0 - START) / MILLISECOND;
-                Some((sample.sequence_number, at))
+                Some((sample.sequence_number.0, at))
             }
             SampleOutcome::Missed(_) => None,
         })
@@ -61,7 +61,7 @@ fn missed(host: &mut Host) -> Vec<(MissedReason, u64, u64)> {
     let given = host.observer.drain().samples.into_iter();
     given
         .filter_map(|given| match given.outcome {
-            SampleOutcome::Missed(missed) => Some((missed.reason, missed.first, missed.last)),
+            SampleOutcome::Missed(missed) => Some((missed.reason, missed.first.0, missed.last.0)),
             SampleOutcome::Sample(_) => None,
         })
         .collect()
@@ -262,12 +262,12 @@ proptest! {
         for given in host.observer.drain().samples {
             match given.outcome {
                 SampleOutcome::Sample(sample) => {
-                    numbers.push(sample.sequence_number);
+                    numbers.push(sample.sequence_number.0);
                     times.push(sample.time);
                 }
                 SampleOutcome::Missed(missed) => {
                     prop_assert_eq!(missed.reason, MissedReason::Lost);
-                    told.extend(missed.first..=missed.last);
+                    told.extend(missed.first.0..=missed.last.0);
                 }
             }
         }
@@ -327,7 +327,7 @@ impl Unannounced {
             let SampleOutcome::Sample(sample) = given.outcome else {
                 panic!("{given:?}")
             };
-            let number = sample.sequence_number;
+            let number = sample.sequence_number.0;
             if depth == Depth::Payloads {
                 let payload = sample.payload.as_ref().unwrap();
                 let text = format!("hello {number}");
@@ -374,7 +374,9 @@ fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() 
     let given = dora.host.observer.drain().samples.into_iter();
     let mut told: Vec<_> = given
         .filter_map(|given| match given.outcome {
-            SampleOutcome::Missed(missed) => Some((given.to.to_vec(), missed.first, missed.last)),
+            SampleOutcome::Missed(missed) => {
+                Some((given.to.to_vec(), missed.first.0, missed.last.0))
+            }
             SampleOutcome::Sample(_) => None,
         })
         .collect();

@@ -321,7 +321,7 @@ impl Host {
         let losses = self.observer.journal().delivery_losses();
         let mut lost: Vec<_> = losses
             .filter(|loss| loss.cause == cause)
-            .flat_map(|loss| loss.first..=loss.last)
+            .flat_map(|loss| loss.first.0..=loss.last.0)
             .collect();
         lost.sort_unstable();
         lost

@@ -3,9 +3,10 @@
 use std::vec::Vec;
 
 use crate::cursor::{Cursor, Endianness, Reason, WireError};
+use crate::rtps::SequenceNumber;
 use crate::testing::oracle::sets::SequenceNumberSet;
 
-fn sequence_numbers(bytes: &[u8], endianness: Endianness) -> Result<Vec<i64>, WireError> {
+fn sequence_numbers(bytes: &[u8], endianness: Endianness) -> Result<Vec<u64>, WireError> {
     let mut cursor = Cursor::new(bytes, endianness);
     Ok(SequenceNumberSet::read(&mut cursor)?
         .iter()
@@ -78,7 +79,7 @@ fn members_beyond_the_last_number_are_left_out() {
     bytes[12] = 0xff;
     assert_eq!(
         sequence_numbers(&bytes, Endianness::Big),
-        Ok([i64::MAX].into())
+        Ok([SequenceNumber::MAX.0].into())
     );
 }
 

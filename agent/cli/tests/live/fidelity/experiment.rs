@@ -513,7 +513,7 @@ pub(crate) fn reported(
     for loss in losses {
         let socket = sockets.contains(&loss.socket);
         if loss.participant.map_or(socket, is_prefix) && is(loss.writer, writer) {
-            for number in loss.first..=loss.last {
+            for number in loss.first.0..=loss.last.0 {
                 let before = reported.insert(number, loss.cause);
                 ensure!(before.is_none(), "{number} was lost twice: {loss:?}");
             }

@@ -1,6 +1,7 @@
 //! A reliable stream that the agent sees on the receiving host only: lost datagrams are sent again,
 //! and a tail without successors is still counted as lost.
 
+use ros2probe_wire::SequenceNumber;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
@@ -70,8 +71,9 @@ impl Repair {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
             let received = Truth::of(&subscriber, "sub").ok()?;
             let first = *received.missing(&sent.numbers).first()?;
-            let is_settled = facts.acknowledged == first - 1 && facts.missing > 0;
-            (is_settled && facts.acknowledged + facts.lag_samples == newest).then_some(facts)
+            let told = facts.acknowledged == SequenceNumber(first - 1) && facts.missing > 0;
+            (told && facts.acknowledged + facts.lag_samples == SequenceNumber(newest))
+                .then_some(facts)
         })?;
         let seen = witness.latest().context("no snapshot")?;
         let repaired = sums(&seen, &sent.guid, &reader);
@@ -126,7 +128,7 @@ impl Repair {
         // The reader acknowledges all before the first that it misses.
         let first = *missing.first().context("nothing is missing")?;
         ensure!(
-            waiting.acknowledged == first - 1,
+            waiting.acknowledged == SequenceNumber(first - 1),
             "{waiting:?}, {first} is missing"
         );
         let expected: Vec<_> = missing

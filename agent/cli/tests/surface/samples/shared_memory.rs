@@ -90,9 +90,9 @@ fn a_repair_in_shared_memory_is_given_before_what_its_reader_held_back() {
         for each in robot.observer.drain().samples {
             match each.outcome {
                 SampleOutcome::Sample(sample) => {
-                    given.push((sample.sequence_number, Some(sample.time.0)));
+                    given.push((sample.sequence_number.0, Some(sample.time.0)));
                 }
-                SampleOutcome::Missed(missed) => given.push((missed.first, None)),
+                SampleOutcome::Missed(missed) => given.push((missed.first.0, None)),
             }
         }
     }

@@ -1,4 +1,4 @@
-use ros2probe_wire::{DomainId, EntityId, GuidPrefix};
+use ros2probe_wire::{DomainId, EntityId, GuidPrefix, SequenceNumber};
 
 use super::*;
 use crate::recording::shortfalls;
@@ -31,7 +31,7 @@ fn sample(name: &str, number: u64) -> Item {
         topic: topic(name, "std_msgs/msg/String"),
         time: Timestamp(1_000 + number),
         writer: writer(1),
-        sequence_number: number,
+        sequence_number: SequenceNumber(number),
         source_timestamp: Some(Timestamp(number)),
         header_stamp: None,
         size: 12,
@@ -121,8 +121,8 @@ fn what_the_filter_takes_is_in_the_bag_and_what_is_missing_in_the_report() {
         Item::Missed(Missed {
             topic: topic(name, "std_msgs/msg/String"),
             writer: writer(1),
-            first: 3,
-            last: 4,
+            first: SequenceNumber(3),
+            last: SequenceNumber(4),
             samples: 2,
             reason: MissedReason::QueueFull,
         })

@@ -23,7 +23,7 @@ impl Recorder<'_> {
             let begun: HashSet<String> = taken
                 .first
                 .iter()
-                .filter(|(_, first)| **first <= 1)
+                .filter(|(_, first)| first.0 <= 1)
                 .map(|(writer, _)| writer.to_string())
                 .collect();
             if topic

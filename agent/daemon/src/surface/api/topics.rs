@@ -322,7 +322,7 @@ fn acknowledgement(facts: &AcknowledgementFacts) -> Acknowledgement<'_> {
         writer: facts.writer.to_string(),
         reader: facts.reader.to_string(),
         node: facts.node.as_deref().map(Cow::Borrowed),
-        acknowledged_sequence_number: facts.acknowledged,
+        acknowledged_sequence_number: facts.acknowledged.0,
         missing_messages: facts.missing,
         requested_messages: facts.requested,
         lag_messages: facts.lag_samples,

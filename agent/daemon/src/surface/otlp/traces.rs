@@ -226,7 +226,7 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
         int("messaging.message.body.size", message.size.into()),
         int("domain_id", message.description.domain_id.into()),
         attribute("writer", writer.to_string()),
-        int("sequence_number", number),
+        int("sequence_number", number.0),
         attribute("message_type", &*message.description.message_type),
     ];
     if let Some(time) = message.source.timestamp() {
@@ -256,6 +256,8 @@ mod tests {
 
     use ros2probe_wire::{EntityId, Guid, GuidPrefix, RtpsTime, Timestamp};
 
+    use ros2probe_wire::SequenceNumber;
+
     use super::*;
     use ros2probe_model::route::Destination;
     use ros2probe_model::trace::{Message, WriterDescription};
@@ -266,8 +268,8 @@ mod tests {
             stage,
             message: Message {
                 writer,
-                sequence_number: 42,
-                trace_id: Message::identity(writer, 42),
+                sequence_number: SequenceNumber(42),
+                trace_id: Message::identity(writer, SequenceNumber(42)),
                 description: Arc::new(WriterDescription {
                     domain_id: DomainId(5),
                     topic: "/points".into(),

@@ -39,7 +39,7 @@ fn an_acknowledgement_tells_what_a_reader_waits_for() {
         panic!("one reader")
     };
     assert_eq!(
-        (facts.acknowledged, facts.missing, facts.lag_samples),
+        (facts.acknowledged.0, facts.missing, facts.lag_samples),
         (10, 2, 10)
     );
     assert!(

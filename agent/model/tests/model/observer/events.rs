@@ -85,7 +85,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
     let told = losses(&mut world);
     assert!((1..=2).contains(&told.len()), "{told:?}");
     assert_eq!(told.iter().map(|burst| burst.count).sum::<u64>(), 4);
-    assert_eq!((told[0].first, told.last().unwrap().last), (2, 7));
+    assert_eq!((told[0].first.0, told.last().unwrap().last.0), (2, 7));
     for burst in &told {
         assert_eq!(burst.writer, alice(WRITER));
         assert_eq!(burst.topic, Some((DomainId(0), "rt/chatter".into())));
@@ -98,7 +98,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
     world.wait(1_000);
     let told = losses(&mut world);
     assert_eq!(told.len(), 1);
-    assert_eq!((told[0].first, told[0].last, told[0].count), (9, 9, 1));
+    assert_eq!((told[0].first.0, told[0].last.0, told[0].count), (9, 9, 1));
     assert_eq!(told[0].topic, Some((DomainId(0), "rt/chatter".into())));
 }
 

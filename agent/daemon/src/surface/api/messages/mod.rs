@@ -311,7 +311,7 @@ impl Stream {
             source_time: sample.source_timestamp.map(|time| time.seconds()),
             writer: sample.writer.to_string(),
             node,
-            sequence_number: sample.sequence_number,
+            sequence_number: sample.sequence_number.0,
             bytes: sample.size,
             skipped: std::mem::take(&mut self.skipped),
             value,
@@ -400,6 +400,8 @@ mod tests {
     use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
+    use ros2probe_wire::SequenceNumber;
+
     use super::*;
     use crate::agent_facts::SourceKind;
     use crate::snapshot_cell::SnapshotCell;
@@ -429,7 +431,7 @@ mod tests {
                 topic: Arc::clone(&topic),
                 time: Timestamp(number),
                 writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
-                sequence_number: number,
+                sequence_number: SequenceNumber(number),
                 source_timestamp: None,
                 header_stamp: None,
                 size: 1 << 20,
@@ -445,7 +447,7 @@ mod tests {
         while let Some(item) = subscription.try_next() {
             match item {
                 Item::Missed(news) => missed += news.samples,
-                Item::Sample(sample) => kept.push(sample.sequence_number),
+                Item::Sample(sample) => kept.push(sample.sequence_number.0),
                 Item::Clock(_) | Item::End(_) => {}
             }
         }
