@@ -224,7 +224,7 @@ fn a_subscription_gets_what_a_reliable_subscriber_got_in_its_order_and_at_its_ti
                     SampleOutcome::Missed(missed) if &*missed.topic.name == "/chatter" => {
                         match missed.reason {
                             MissedReason::Lost => {
-                                lost.extend(missed.first - SequenceNumber(1)..missed.last.0)
+                                lost.extend(missed.first - SequenceNumber(1)..missed.last.0);
                             }
                             MissedReason::Unannounced => early += missed.samples,
                             reason => panic!("{label}: {reason:?}"),
