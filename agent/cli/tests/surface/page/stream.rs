@@ -33,7 +33,7 @@ fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
         notes.any(|note| note["text"]
             .as_str()
             .unwrap()
-            .starts_with("A capture holds")),
+            .starts_with("A capture file contains")),
         "{findings:?}"
     );
     let loss = findings.iter().find(|each| each["kind"] == "loss").unwrap();
