@@ -71,7 +71,7 @@ fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
     let before = page.value("ros2probe_state_writes_total", &[("outcome", "written")]);
     let lines = fs::read_to_string(&log)?;
     assert_eq!(
-        lines.matches("state cannot be written").count(),
+        lines.matches("cannot save state").count(),
         1,
         "{lines}"
     );
