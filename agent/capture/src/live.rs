@@ -202,7 +202,8 @@ impl LiveSource {
         !self.wires.is_empty()
     }
 
-    /// Returns why the host hook is not used although it would show more, as a sentence.
+    /// Returns why the host hook is not used although it would show more, as a sentence; `None` if
+    /// it is used, or not configured.
     #[must_use]
     pub fn without_host(&self) -> Option<&str> {
         self.without_host.as_deref()
@@ -456,20 +457,22 @@ impl LiveSource {
         self.exact.as_ref().map(Uprobe::facts)
     }
 
-    /// Returns the number of messages captured whole in the processes that sent them.
+    /// Returns the number of messages captured whole in the processes that sent them; `None`
+    /// without uprobes.
     #[must_use]
     pub fn messages_of_processes(&self) -> Option<u64> {
         Some(self.exact.as_ref()?.reader().datagrams())
     }
 
     /// Returns why messages are not read in their senders although that is configured, as a
-    /// sentence.
+    /// sentence; otherwise `None`.
     #[must_use]
     pub fn without_exact(&self) -> Option<&str> {
         self.without_exact.as_deref()
     }
 
-    /// Returns which observed objects are gone, as a sentence: nothing is seen there.
+    /// Returns which observed object is gone, as a sentence; `None` if all exist. Nothing is seen
+    /// there.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);

@@ -93,7 +93,7 @@ struct Embedded {
     text: &'static str,
 }
 
-/// Returns the text of a file in a distribution.
+/// Returns the text of a file in a distribution, if it is embedded.
 pub(super) fn find(file: &TypeName, dialect: Dialect) -> Option<&'static str> {
     let (_, text) = PACKAGES
         .iter()

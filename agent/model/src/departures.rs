@@ -55,7 +55,7 @@ impl Departures {
         });
     }
 
-    /// Returns the time at which the sample left for this destination.
+    /// Returns the time at which the sample left for this destination, if it is remembered.
     #[must_use]
     pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<Timestamp> {
         let mut latest = self.latest.iter().rev();

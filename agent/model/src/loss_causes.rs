@@ -108,8 +108,8 @@ impl LossCauses {
         }
     }
 
-    /// Keeps the cause of these samples open until then. Returns a run that must be decided now to
-    /// make room.
+    /// Keeps the cause of these samples open until `until`. Returns a run that must be decided now
+    /// to make room.
     pub fn wait(
         &mut self,
         first: SequenceNumber,

@@ -176,7 +176,8 @@ impl Port {
         })
     }
 
-    /// Reads `count` cells starting at `first`, wrapping around the ring's end.
+    /// Reads `count` cells starting at `first`, wrapping around the ring's end; `None` if the file
+    /// is too short.
     fn cells<S: Source + ?Sized>(
         &mut self,
         source: &S,

@@ -83,7 +83,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     findings
 }
 
-/// `/sys` shows the network namespace in which it was mounted, which may differ from this one.
+/// Finding for a `/sys` that shows another network namespace: the one in which it was mounted.
 fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let table = host.files.text(OWN).ok()?;
     let own = table

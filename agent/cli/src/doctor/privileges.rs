@@ -134,7 +134,7 @@ pub fn is_installed(host: &HostState) -> bool {
     host.files.exists(SYSTEMD) && installed(host).is_some()
 }
 
-/// Path of the service's unit.
+/// Path of the service's unit. `None` if it is not installed.
 fn installed(host: &HostState) -> Option<&'static str> {
     let mut places = UNITS.into_iter();
     places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))

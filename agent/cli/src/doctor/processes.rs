@@ -150,7 +150,7 @@ impl Processes {
         findings
     }
 
-    /// Finding for processes that cannot be inspected.
+    /// Finding for processes that cannot be inspected. `None` if all can.
     fn unseen(&self, is_root: bool) -> Option<Finding> {
         let first = self.closed.first()?;
         let which = match self.closed.len() {
@@ -295,7 +295,7 @@ fn read_process(
     }))
 }
 
-/// RMW implementation, from the mapped libraries.
+/// RMW implementation, from the mapped libraries. `None` if no library is one.
 fn implementation(map: &str) -> Option<&'static str> {
     const LIBRARIES: [(&str, &str); 7] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),

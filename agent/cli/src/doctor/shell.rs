@@ -81,7 +81,7 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
 }
 
-/// Range of ephemeral ports.
+/// Range of ephemeral ports, if it is readable.
 fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
     let text = host.files.text(PORTS).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);

@@ -43,7 +43,7 @@ fn a_good_configuration_is_called_good() {
     assert!(
         String::from_utf8(output.stdout)
             .unwrap()
-            .contains("is good")
+            .contains("is valid")
     );
 }
 

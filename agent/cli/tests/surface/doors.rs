@@ -365,7 +365,7 @@ fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() 
     assert!(!echo.status.success());
     assert_eq!(said.lines().count(), 1, "{said}");
     assert!(
-        said.contains("loopback gives no message payloads"),
+        said.contains("loopback grants no message payloads"),
         "{said}"
     );
 }

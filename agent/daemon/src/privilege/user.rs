@@ -50,7 +50,8 @@ pub fn become_own_user() -> Identity {
     }
 }
 
-/// Ids of the user and group of that name, or else of the user's primary group.
+/// Ids of the package's user and its group, or else of the user's primary group. `None` if the user
+/// does not exist, or is root.
 fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     let line = |text: &str| -> Option<Vec<String>> {
         let mut lines = text.lines().map(|line| line.split(':'));

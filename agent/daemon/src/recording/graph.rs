@@ -101,7 +101,7 @@ fn is_ros_topic(kind: &str) -> bool {
     TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
 }
 
-/// Texts of the values.
+/// Returns each value as displayed text.
 fn printed<T: ToString>(texts: &[T]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }

@@ -164,7 +164,7 @@ impl fmt::Debug for Policies {
     }
 }
 
-/// Returns whether this writer matches this reader of its topic and type.
+/// Decides whether this writer matches this reader of its topic and type.
 #[must_use]
 pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     let both = [offered.vendor, requested.vendor];

@@ -189,6 +189,6 @@ fn a_wrong_configuration_is_a_problem_with_its_first_mistake() {
     assert_eq!(finding.severity, Severity::Problem);
     assert_eq!(
         finding.sentence,
-        "the configuration is wrong: x:1: bad (and 1 more)"
+        "the configuration is invalid: x:1: bad (and 1 more)"
     );
 }

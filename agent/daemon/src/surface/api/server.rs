@@ -35,7 +35,7 @@ pub enum OpenError {
     Token(#[from] TokenError),
     /// Without a token, any host could change the watches.
     #[error(
-        "{address} can be reached from elsewhere: serving the control API there needs \
+        "{address} is reachable from other hosts: serving the control API there needs \
          `api.token_file`"
     )]
     Unprotected {

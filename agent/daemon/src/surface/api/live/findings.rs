@@ -397,7 +397,8 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`].
+/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`]; `None` without
+/// a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;

@@ -99,7 +99,7 @@ impl Page {
         !self.addresses.is_empty()
     }
 
-    /// Returns the address of the page on the agent's host.
+    /// Returns the address of the page on the agent's host; `None` if the page is not served.
     fn address(&self) -> Option<String> {
         let is_near = |address: &&SocketAddr| address.ip().is_loopback();
         let near = self.addresses.iter().find(is_near);
