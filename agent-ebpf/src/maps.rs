@@ -467,7 +467,7 @@ pub fn count_outside(counter: Counter, by: u64) {
 #[inline(always)]
 pub fn add(to: *mut u64, by: u64) {
     // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
-    // every BPF verifier knows.
+    // every BPF verifier accepts.
     unsafe {
         asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
     }
