@@ -166,7 +166,7 @@ impl<R: Read> Read for ProgressReader<'_, R> {
             return Ok(0);
         }
         if self.progress.is_given_up() {
-            self.failed = Some(io::Error::other("given up"));
+            self.failed = Some(io::Error::other("abandoned"));
             return Ok(0);
         }
         loop {
@@ -308,7 +308,7 @@ mod tests {
         for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
             let source = File::open(&path).unwrap();
             let error = compression.compress_file(&source, &into, &progress);
-            assert_eq!(error.unwrap_err().to_string(), "given up");
+            assert_eq!(error.unwrap_err().to_string(), "abandoned");
         }
     }
 }

@@ -238,7 +238,7 @@ impl LiveSource {
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
-            // News seldom comes alone. After a timeout it has had time to accumulate.
+            // Packets arrive in bursts. After a timeout some have had time to accumulate.
             std::thread::sleep(if observer.wants_payloads() {
                 GATHER_PAYLOADS
             } else {
@@ -287,7 +287,7 @@ impl LiveSource {
         Ok(())
     }
 
-    /// Passes what the model wants of shared memory to its readers, ten times a second.
+    /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
         if now.wrapping_sub(self.wanted_asked) < TENTH {
             return;

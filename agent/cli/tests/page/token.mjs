@@ -78,7 +78,7 @@ async function strict(open) {
   const tab = await open({ address: STRICT });
   tab.expect(REFUSED);
   await tab.page.getByRole('dialog', { name: 'Token' }).waitFor();
-  await tab.shows('The agent asks for a token at this address.', 'dialog');
+  await tab.shows('This address requires a token.', 'dialog');
   await tab.accessible('login');
   await tab.page.getByLabel('Token', { exact: true }).last().fill('not the right one');
   await tab.page.getByRole('button', { name: 'Use this token' }).click();

@@ -174,7 +174,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         Diagnosis::TypeConflict { topic, types } => {
             let types: Vec<&str> = types.iter().map(AsRef::as_ref).collect();
             let text = format!(
-                "{} has several types, whose endpoints do not talk to each other: {}",
+                "{} has several types, whose endpoints cannot communicate: {}",
                 topic.name,
                 types.join(", ")
             );
