@@ -70,11 +70,7 @@ fn a_full_disk_costs_one_line_in_the_log_and_the_state_alone() -> Result<()> {
     let page = wait(&agent, known, PATIENCE, "all names")?;
     let before = page.value("ros2probe_state_writes_total", &[("outcome", "written")]);
     let lines = fs::read_to_string(&log)?;
-    assert_eq!(
-        lines.matches("state cannot be written").count(),
-        1,
-        "{lines}"
-    );
+    assert_eq!(lines.matches("cannot save state").count(), 1, "{lines}");
     fs::remove_file(state.join("something-else"))?;
     // The next change writes the state again.
     let stream = Stream::small(1);
