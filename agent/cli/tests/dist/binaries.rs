@@ -134,7 +134,7 @@ fn tree(directory: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// The page without what is of the process, its build and its time.
+/// The page without values of the process, its build and its time.
 fn of_the_robot(page: &str) -> String {
     let other = [
         "ros2probe_build_info{",

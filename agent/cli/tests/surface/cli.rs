@@ -227,7 +227,7 @@ fn the_version_is_the_package_s() {
 }
 
 #[test]
-fn a_signal_ends_the_agent_in_order_and_the_log_says_so() {
+fn a_signal_ends_the_agent_in_order_and_is_logged() {
     for signal in ["-TERM", "-INT"] {
         let mut agent = LocalAgent::start(&mut rp(), &[]);
         agent.wait_for_log("ready");

@@ -301,7 +301,7 @@ proptest! {
 
     /// Answers are lost, doubled, late, cut and changed.
     #[test]
-    fn whatever_is_answered_few_packets_are_sent_and_goodbye_is_said(
+    fn whatever_is_answered_few_packets_are_sent_and_the_participant_leaves(
         which in 0usize..2,
         fates in prop::collection::vec(
             (0u8..6, 0u64..1_500, any::<prop::sample::Index>(), any::<u8>()), 15),

@@ -153,7 +153,7 @@ fn who_cannot_be_asked_is_said_in_one_line() {
 }
 
 #[test]
-fn the_environment_names_domain_and_distribution_and_the_command_line_goes_before() {
+fn the_command_line_takes_precedence_over_the_environments_domain_and_distribution() {
     let capture = graph::own().join("graph.pcap.gz");
     let info = |distro: &str, domain: &str, further: &[&str]| {
         let mut rp = rp();

@@ -1,4 +1,4 @@
-//! `rp top` on a pseudo-terminal, against a real agent: what is on the screen, what keys do to it, and
+//! `rp top` on a pseudo-terminal, against a real agent: the screen, the effect of keys, and
 //! that the terminal is given back clean however it ends.
 
 use std::time::{Duration, Instant};

@@ -221,7 +221,7 @@ fn nobody_is_asked_about_a_writer_twice() {
     for number in 1..=3 {
         tracer.record(&data(number, number, 0), || {
             asked += 1;
-            // Discovery does not know the writer at first.
+            // Discovery has not announced the writer at first.
             (asked > 1).then(|| (description(), 0.0))
         });
     }

@@ -124,7 +124,7 @@ fn the_selection_follows_its_topic_and_asks_for_details_once() {
     assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);
     assert_eq!(press(&mut app, KeyCode::Down), []);
     assert_eq!(press(&mut app, KeyCode::Home), [Command::Select(key("/b"))]);
-    // After the topic has gone, the one in its place is selected.
+    // The topic is gone: the next one in its place is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
         app.take(topics(&left), Instant::now()),

@@ -1,4 +1,4 @@
-//! Disks that are full, read-only, or gone.
+//! Disks that are full, read-only, or removed.
 
 use std::fs;
 use std::io::Write as _;
@@ -170,7 +170,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     counted.check(&scene.agent)?;
     let written = disk.writes("written")?;
     disk.make_room()?;
-    // Although nothing changes any more.
+    // Although nothing changes.
     disk.wait_for_write("written", written)?;
     disk.state(&["/first", "/second"])?;
     disk.accepts(&mut counted, "roomy")?;

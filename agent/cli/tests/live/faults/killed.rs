@@ -220,7 +220,7 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     )
 }
 
-/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all gone
+/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all removed
 /// by then, and the time that its start took.
 fn until(
     link: &Link,

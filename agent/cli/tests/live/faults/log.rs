@@ -1,4 +1,4 @@
-//! A log that goes nowhere.
+//! A log without a reader.
 
 use std::fs::File;
 use std::io::{self, Read as _};

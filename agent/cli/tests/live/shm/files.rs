@@ -290,7 +290,7 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
         };
         assert!(is_harmless, "{line}");
     }
-    // Futexes of its own threads apart, the agent waits on nothing and locks nothing.
+    // Except for futexes of its own threads, the agent waits on nothing and locks nothing.
     for call in ["flock(", "F_SETLK", "PROT_WRITE, MAP_SHARED, 3<"] {
         let wrong = trace
             .lines()

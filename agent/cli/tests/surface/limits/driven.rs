@@ -558,10 +558,10 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "api_clients",
-        "clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone",
+        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
     ],
     [
         "metrics_clients",
-        "clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone",
+        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
     ],
 ];

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
+fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let mut live = Lines::open(agent.api, "/live", "").unwrap_or_else(|_| panic!());
     let first = live.batch();
@@ -42,7 +42,7 @@ fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
         "{loss}"
     );
 
-    // The capture has ended: nothing changes, and the stream goes on.
+    // The capture has ended: nothing changes, and the stream continues.
     let began = Instant::now();
     for _ in 0..2 {
         let batch = live.batch();

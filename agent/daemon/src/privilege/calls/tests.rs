@@ -129,7 +129,7 @@ fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
 }
 
 #[test]
-fn sockets_are_made_by_who_speaks_and_of_no_other_kind() {
+fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
     let refused = Some(libc::EPERM);
     for role in ROLES {
         confined(role, move || {

@@ -166,7 +166,7 @@ fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
     let elsewhere = host.reader(CAROL, 7413).wire();
     host.owner(group, BOB);
     for number in 1..=100 {
-        // The mirror comes first and shows the samples of Bob and Carol.
+        // The mirror is first and shows the samples of Bob and Carol.
         host.data(group.wire(), number);
         host.data(group, number);
         if number % 10 == 0 {

@@ -33,7 +33,7 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
 }
 
 #[test]
-fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_participant() {
+fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
     const FAST: GuidPrefix = GuidPrefix(*b"\x01\x0fsome-robot");
     let mut world = World::new(&[]);
     let holder = SocketFacts {
