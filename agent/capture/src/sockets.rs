@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_that_nobody_holds_any_more_is_told_as_closed_and_not_asked_for_again() {
+    fn a_socket_without_a_holder_is_reported_as_closed_and_not_requested_again() {
         let mut observer = Observer::new(Settings::default());
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
         let met = sockets(&[1, 2], 0);

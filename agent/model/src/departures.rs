@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn departures_for_several_places_are_told_apart_and_bounded() {
+    fn departures_for_several_places_are_separate_and_bounded() {
         let mut departures = Departures::default();
         let destination = |port| Destination {
             port,

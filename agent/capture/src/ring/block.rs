@@ -239,7 +239,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_block_cut_anywhere_ends_early_and_says_so() {
+    fn a_block_cut_anywhere_ends_early_and_reports_it() {
         let bytes = block();
         for end in 0..bytes.len() {
             let mut frames = Frames::new(&bytes[..end]);

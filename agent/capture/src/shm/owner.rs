@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_abandoned_when_nobody_holds_the_lock_beside_it() {
+    fn a_file_is_abandoned_when_no_process_holds_the_lock_beside_it() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("fastrtps_port7411");
         fs::write(&path, "x").unwrap();

@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn only_regular_files_are_opened_and_nobody_is_waited_for() {
+    fn only_regular_files_are_opened_and_none_is_awaited() {
         let directory = tempfile::tempdir().unwrap();
         let (file, link) = (directory.path().join("f"), directory.path().join("l"));
         fs::write(&file, "x").unwrap();

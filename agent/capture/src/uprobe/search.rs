@@ -482,7 +482,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used() {
+    fn a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used() {
         let directory = tempfile::tempdir().unwrap();
         for number in 0..=MAX_LIBRARIES {
             let path = directory.path().join(format!("library.{number}"));

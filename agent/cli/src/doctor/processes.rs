@@ -485,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_in_another_domain_than_all_is_told_the_command() {
+    fn a_shell_in_another_domain_than_all_others_gets_the_command() {
         let one = [(11, "talker", "ROS_DOMAIN_ID=3", FAST)];
         let findings = found(&one, &[("ROS_DISTRO", "jazzy")]);
         let finding = findings

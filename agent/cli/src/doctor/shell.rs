@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn domains_without_ports_of_their_own_are_told_apart_from_good_ones() {
+    fn domains_without_ports_are_distinguished_from_valid_ones() {
         for (domain, severity) in [
             ("0", Severity::Ok),
             ("101", Severity::Ok),
@@ -473,7 +473,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_old_variable_makes_ros_ignore_is_said() {
+    fn variables_that_ros_ignores_because_of_the_old_one_are_reported() {
         let findings = found(&[
             ("ROS_LOCALHOST_ONLY", "1"),
             ("ROS_STATIC_PEERS", "10.0.0.9"),

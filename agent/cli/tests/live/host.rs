@@ -111,7 +111,7 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
 }
 
 #[test]
-fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
+fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");

@@ -93,14 +93,14 @@ fn forgeries_that_fill_every_table_leave_memory_bounded_and_expire_with_their_le
 }
 
 #[test]
-fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_on_a_topic_watched_by_name()
+fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_if_watched_by_name()
 -> Result<()> {
     behind_a_flood(|_| ON_THE_WIRE.to_owned())
 }
 
 #[test]
-fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets() -> Result<()>
-{
+fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets()
+-> Result<()> {
     behind_a_flood(|link| at_the_sockets_of(&link.robot))
 }
 

@@ -38,12 +38,12 @@ fn an_agent_restarted_on_a_running_cyclone_dds_robot_has_all_names() -> Result<(
 }
 
 #[test]
-fn a_running_fast_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+fn a_running_fast_dds_robot_repeats_all_names_on_request() -> Result<()> {
     asked(Stack::Fast)
 }
 
 #[test]
-fn a_running_cyclone_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+fn a_running_cyclone_dds_robot_repeats_all_names_on_request() -> Result<()> {
     asked(Stack::Cyclone)
 }
 

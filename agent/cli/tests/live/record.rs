@@ -212,7 +212,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
 }
 
 #[test]
-fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<()> {
+fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\

@@ -308,7 +308,7 @@ fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Resu
 /// Ten clients at once: one never reads, one is killed. The others receive everything, the interest
 /// of closed clients ends, and memory stays bounded.
 #[test]
-fn readers_that_stop_or_die_hold_nobody_up() -> Result<()> {
+fn readers_that_stop_or_die_delay_no_other() -> Result<()> {
     let host = Namespace::alone()?;
     let limits = "limits: {payload_bytes: 8388608, subscriptions: 12}\n";
     let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;

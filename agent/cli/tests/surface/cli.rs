@@ -36,7 +36,7 @@ fn fails_with(output: &Output, code: i32, parts: &[&str]) {
 }
 
 #[test]
-fn a_good_configuration_is_called_good() {
+fn a_valid_configuration_is_reported_as_valid() {
     let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/ros2probe.yaml");
     let output = run(&["check-config", shipped]);
     assert!(output.status.success());

@@ -221,7 +221,7 @@ fn a_participant_that_announces_without_end_costs_no_more_packets() {
 }
 
 #[test]
-fn what_somebody_else_says_is_not_believed() {
+fn packets_of_other_participants_are_not_trusted() {
     for recording in Recording::both() {
         let mut forged = recording.received.clone();
         for (_, bytes) in &mut forged {
@@ -247,7 +247,7 @@ fn what_somebody_else_says_is_not_believed() {
 }
 
 #[test]
-fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
+fn leaving_sends_one_goodbye_and_only_to_contacted_participants() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
     assert!(session.say_goodbye().is_empty());
@@ -258,7 +258,7 @@ fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
 }
 
 #[test]
-fn who_has_secrets_or_no_address_is_not_asked() {
+fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
     let participant = |secured, metatraffic: &[&str]| ParticipantFacts {
         guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
         domain_id: DomainId(0),

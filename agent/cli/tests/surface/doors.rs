@@ -101,7 +101,7 @@ fn idle_connections_and_unfinished_requests_make_room_for_the_next_client() {
 }
 
 #[test]
-fn a_body_that_does_not_come_ends_its_connection_after_ten_seconds() {
+fn a_body_that_does_not_arrive_ends_its_connection_after_ten_seconds() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let mut client = TcpStream::connect(agent.api).unwrap();

@@ -350,7 +350,7 @@ fn without_samples(
 }
 
 #[test]
-fn a_replay_tells_every_endpoint_that_the_capture_announces_in_its_own_time() {
+fn a_replay_reports_every_endpoint_in_the_captures_time() {
     use ros2probe_wire::time::SECOND;
     const START: u64 = 1_795_143_000 * SECOND;
     let alice = ros2probe_wire::GuidPrefix(*b"\x01\x10alice-host");

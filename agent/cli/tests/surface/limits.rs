@@ -301,7 +301,7 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
 }
 
 #[test]
-fn messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_reads() {
+fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read() {
     let sources = MetricSources::new(SourceKind::Wire, Default::default());
     let caps = Caps {
         subscriptions: 1,

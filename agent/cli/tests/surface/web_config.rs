@@ -60,7 +60,7 @@ fn status(arguments: &[&str]) -> String {
 }
 
 #[test]
-fn who_has_no_password_reads_nothing() {
+fn a_client_without_a_password_reads_nothing() {
     let hash = bcrypt::hash("open sesame", 4).unwrap();
     let web = Web::new(&format!("basic_auth_users:\n  alice: {hash}\n"));
     let agent = web.agent();

@@ -98,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn who_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
+    fn an_agent_that_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
         assert!(geteuid().is_root(), "this takes root: run `make test`");
         let thread = std::thread::spawn(|| {
             let before = capabilities(None).unwrap().effective;

@@ -388,7 +388,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_values_are_nobodys_fault() {
+    fn unknown_values_are_no_incompatibility() {
         let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         reader.durability = Durability(9);
         reader.ownership = Ownership(7);

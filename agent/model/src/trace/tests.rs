@@ -215,7 +215,7 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
 }
 
 #[test]
-fn nobody_is_asked_about_a_writer_twice() {
+fn a_known_writer_is_looked_up_only_once() {
     let mut tracer = tracer();
     let mut asked = 0;
     for number in 1..=3 {

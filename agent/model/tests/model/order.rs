@@ -155,7 +155,7 @@ fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
 }
 
 #[test]
-fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
+fn a_reliable_reader_is_awaited_before_its_first_acknack_for_a_limited_time() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     request(&mut host, Depth::Arrivals);

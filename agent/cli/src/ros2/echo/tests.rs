@@ -188,7 +188,7 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
 }
 
 #[test]
-fn publishers_that_differ_are_told() {
+fn publishers_that_differ_are_reported() {
     let publisher = |reliability: &'static str, durability: &'static str| Endpoint {
         qos: Qos {
             reliability: reliability.into(),

@@ -205,7 +205,7 @@ fn arrows_scroll_the_pane_in_focus_and_escape_leads_back() {
 }
 
 #[test]
-fn who_reads_old_events_is_not_pushed_away_by_new_ones() {
+fn a_reader_of_old_events_is_not_evicted_by_new_ones() {
     let mut app = app();
     app.heights.events = 2;
     let event = || Fact::Event(Box::default());

@@ -12,7 +12,7 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
 
 #[test]
-fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
+fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let right = format!("watch: [/**]\n{ON_THE_WIRE}");

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Result<()> {
+fn files_that_are_idle_garbage_truncated_or_of_another_user_do_no_harm() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;

@@ -119,7 +119,7 @@ fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
 }
 
 #[test]
-fn a_replay_tells_figures_in_the_time_of_its_capture() {
+fn a_replay_sends_figures_in_the_time_of_its_capture() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.5"]);
     agent.wait_for_log("ready");

@@ -135,7 +135,7 @@ fn options_choose_what_is_echoed_and_when_it_ends() {
 }
 
 #[test]
-fn what_cannot_be_echoed_is_said_in_one_line() {
+fn what_cannot_be_echoed_is_reported_in_one_line() {
     let ask = |further: &[&str]| echo(&[&["topic", "echo", IMU], further].concat(), START, END);
     fails_with(
         &ask(&["--field", "orientation.v"]),
@@ -192,7 +192,7 @@ fn only_messages_that_pass_the_filter_are_timed() {
 
 /// Goals of order 4 in three recordings; Jazzy announces type hashes.
 #[test]
-fn an_action_tells_feedback_and_states_with_every_middleware() {
+fn an_action_prints_feedback_and_states_with_every_middleware() {
     let directory = tempfile::tempdir().unwrap();
     let place = directory.path().join("example_interfaces/action");
     std::fs::create_dir_all(&place).unwrap();

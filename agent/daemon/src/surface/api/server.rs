@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_busy_port_is_said_in_one_line() {
+    fn a_busy_port_is_reported_in_one_line() {
         let other = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = other.local_addr().unwrap();
         let error = Server::new(None, Access::Watch)

@@ -428,7 +428,7 @@ otlp:
     }
 
     #[test]
-    fn what_cannot_work_is_said_at_the_start() {
+    fn invalid_settings_are_reported_at_the_start() {
         let failed = |yaml: &str, environment: &[(&str, &str)]| {
             resolve(yaml, environment).unwrap_err().to_string()
         };

@@ -125,7 +125,7 @@ fn what_arrives_without_a_reader_is_unmatched_and_takes_no_room() {
 }
 
 #[test]
-fn a_killed_subscriber_does_not_lose_for_ever() {
+fn the_losses_of_a_killed_subscriber_end() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=1000 {
@@ -162,7 +162,7 @@ fn an_address_that_two_announce_in_turn_identifies_neither() {
 }
 
 #[test]
-fn who_is_silent_and_unknown_is_forgotten() {
+fn a_silent_unknown_receiver_is_removed() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let nobody = Seen {

@@ -109,7 +109,7 @@ fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
 }
 
 #[test]
-fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs() {
+fn a_wire_distinguishes_receivers_by_destination_and_invents_no_losses_for_repairs() {
     let mut host = Host::new();
     let (bob, carol) = (
         host.reader(BOB, 7411).wire(),
@@ -217,7 +217,7 @@ fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
 }
 
 #[test]
-fn a_full_table_refuses_counts_and_makes_room_when_somebody_is_silent() {
+fn a_full_table_refuses_counts_and_evicts_the_silent() {
     let mut host = Host::with(Settings {
         deliveries: 3,
         ..Settings::default()

@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn gzip_is_sent_to_who_takes_it() {
+    fn gzip_is_sent_to_clients_that_accept_it() {
         for (given, expected) in [
             ("gzip", true),
             ("deflate, GZIP;q=1", true),
