@@ -80,7 +80,7 @@ fn without_descriptors_only_what_needs_one_fails_and_later_recovers() -> Result<
     counted.check(&scene.agent)?;
     let took = scene.end()?;
     outcome(
-        &format!("no descriptor left (RLIMIT_NOFILE), {CLIENTS} clients that want one"),
+        &format!("no descriptor left (RLIMIT_NOFILE), {CLIENTS} clients that need one"),
         &format!(
             "{cpu:?} of CPU in {span:?}, every message counted; a recording is refused ({detail}), state \
              writes fail and are counted; both work again with the limit; ended in {took:?}"

@@ -53,9 +53,9 @@ fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     }
     let took = scene.end()?;
     outcome(
-        "nobody reads the log (stderr is a full pipe), 20 reloads of 200 mistakes",
+        "log without a reader (stderr is a full pipe), 20 reloads of 200 mistakes",
         &format!(
-            "every message counted, {missed} lines lost and counted, told in the log when it was read again; \
+            "every message counted, {missed} lines lost and counted, reported in the log once it was read again; \
              ended in {took:?}"
         ),
     )

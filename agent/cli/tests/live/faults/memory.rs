@@ -106,7 +106,7 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     )
 }
 
-/// Everything at once, for so long and until so much of the tables is used: the datagrams sent, and
+/// Everything at once, for at least this time and until this part of the tables is used: the datagrams sent, and
 /// the most memory needed.
 fn storm(
     scene: &Scene<'_>,

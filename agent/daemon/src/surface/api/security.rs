@@ -3,7 +3,7 @@
 //! [`Access`].
 //!
 //! Host and Origin matter because a web page can make a browser on this host send requests to
-//! loopback (CSRF). It can do so under a name of its own, too (DNS rebinding).
+//! loopback (CSRF). It can also do so under its own host name (DNS rebinding).
 
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
