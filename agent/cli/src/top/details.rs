@@ -195,7 +195,7 @@ fn counts(counted: &Measurement) -> String {
 }
 
 fn delivered(it: &Delivered) -> String {
-    let line = format!("{} came, {} lost", it.messages, it.lost_messages);
+    let line = format!("{} received, {} lost", it.messages, it.lost_messages);
     match causes(it) {
         causes if causes.is_empty() => line,
         causes => format!("{line} ({causes})"),
