@@ -42,7 +42,7 @@ macro_rules! kind {
                 }
             }
 
-            /// The word ROS has for it, or `UNKNOWN`.
+            /// Returns ROS's word for the value, or `UNKNOWN`.
             #[must_use]
             pub const fn label(self) -> &'static str {
                 match self.name() {

@@ -72,7 +72,7 @@ impl Duration {
         Self::Finite(seconds.cast_unsigned() as u64 * 1_000_000_000 + fraction_nanoseconds)
     }
 
-    /// Its nanoseconds; `None` if it never ends.
+    /// Returns the nanoseconds; `None` if the duration is infinite.
     #[must_use]
     pub const fn nanoseconds(self) -> Option<u64> {
         match self {
