@@ -1,4 +1,4 @@
-// Where loopback lacks the rights, the page requires a token once: in the address that `rp page`
+// Where loopback lacks the rights, the page asks for a token once: in the address that `rp page`
 // prints, or pasted. The page removes it from the address at once and keeps it in its tab only.
 // Arguments: address of an agent whose loopback grants `read`, address of one that requires a token.
 
