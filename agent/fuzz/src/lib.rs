@@ -8,6 +8,7 @@ use std::fs;
 use std::io::{Cursor, Write as _};
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
+use std::time::Duration;
 
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
@@ -408,8 +409,8 @@ const SMALL: Settings = Settings {
     interest: 12,
     sample_bytes: 1 << 12,
     payload_bytes: 1 << 14,
-    topic_grace: 1_000_000_000,
-    payload_delay: 400_000_000,
+    topic_grace: Duration::from_secs(1),
+    payload_delay: Duration::from_millis(400),
     directed: true,
 };
 

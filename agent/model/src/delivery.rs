@@ -10,9 +10,9 @@ mod accounting;
 mod departed;
 
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::journal::Journal;
@@ -34,11 +34,11 @@ pub use accounting::Totals;
 /// delivery restarts.
 const EXCUSED: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
-const UNDER_WAY: u64 = SECOND;
+const UNDER_WAY: Duration = Duration::from_secs(1);
 /// A receiver without any sign of life counts samples that left for it as lost after this silence.
 /// Socket diagnostics of the kernel report a closed socket earlier.
-const SILENCE: u64 = 18 * SECOND;
-const FIRST_MOMENTS: u64 = 5 * SECOND;
+const SILENCE: Duration = Duration::from_secs(18);
+const FIRST_MOMENTS: Duration = Duration::from_secs(5);
 /// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
@@ -348,7 +348,7 @@ impl Delivery {
         self.conclude(now, context);
         self.loss_causes
             .settled(self.reception.sequence().settled());
-        self.undelivered.expire(now.0);
+        self.undelivered.expire(now);
     }
 
     /// Settles all samples, including pending ones: the input has ended.
@@ -548,16 +548,14 @@ impl Delivery {
     }
 
     /// Splits the borrow into the reception, its memory budget, and the accounting of decisions.
-    const fn split<'a>(
+    fn split<'a>(
         &'a mut self,
         context: &'a mut DeliveryContext<'_>,
     ) -> (&'a mut Reception, &'a mut Budget, Accounting<'a>) {
-        let wait = REASSEMBLY - settle_window(self.is_reliable(context));
-        let until = if context.reassembled {
-            Some(Timestamp(context.now.0.saturating_add(wait)))
-        } else {
-            None
-        };
+        let window = settle_window(self.is_reliable(context));
+        let until = context
+            .reassembled
+            .then(|| context.now + REASSEMBLY.saturating_sub(window));
         let accounting = Accounting {
             tally: &mut self.tally,
             loss_causes: &mut self.loss_causes,

@@ -10,8 +10,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::dispatch::{Dispatch, Sample};
@@ -19,17 +19,17 @@ use super::size::Size;
 
 /// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
 /// which follows within three seconds.
-const PATIENCE: u64 = 4 * SECOND;
+const PATIENCE: Duration = Duration::from_secs(4);
 /// Largest number of waiting samples.
 const WAITING: usize = 4096;
 /// Largest number of samples remembered of a writer without an announcement.
 pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// Samples from before the announcement are retransmitted within this time, or not at all.
-const AGAIN: u64 = 10 * SECOND;
+const AGAIN: Duration = Duration::from_secs(10);
 /// Memory per sample in addition to its payload.
 const OVERHEAD: usize = size_of::<Due>() + 64;
 /// Longest time from the announcement to the first ACKNACK.
-const MATCHING: u64 = SECOND;
+const MATCHING: Duration = Duration::from_secs(1);
 
 /// How far the samples of a writer are decided.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
@@ -156,7 +156,7 @@ impl InOrder {
         if self.earlier.is_empty() {
             return Vec::new();
         }
-        let is_late = self.announced.0.saturating_add(AGAIN) <= now.0;
+        let is_late = self.announced + AGAIN <= now;
         if is_late || !progress.reliable {
             return std::mem::take(&mut self.earlier).into_iter().collect();
         }
@@ -178,7 +178,7 @@ impl InOrder {
         let first = self
             .earlier
             .first()
-            .filter(|_| progress.acknowledged || self.announced.0.saturating_add(MATCHING) > now.0);
+            .filter(|_| progress.acknowledged || self.announced + MATCHING > now);
         let complete = first.map_or(progress.complete, |first| progress.complete.min(*first));
         while let Some(entry) = self.waiting.first_entry()
             && *entry.key() < complete
@@ -192,7 +192,7 @@ impl InOrder {
         if self.hole.0 != complete {
             self.hole = (complete, now);
         }
-        let is_late = self.hole.1.0.saturating_add(PATIENCE) <= now.0;
+        let is_late = self.hole.1 + PATIENCE <= now;
         if is_late || self.waiting.len() > WAITING || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
             self.give_all(now, give);

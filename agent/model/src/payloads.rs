@@ -6,8 +6,8 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
 
 use super::assembly::Assembly;
@@ -22,7 +22,7 @@ use super::writer::Counted;
 const WAITING: usize = 65_536;
 /// Longest time until the kernel captures payloads after a request, and the model has processed
 /// what was captured before.
-pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
+pub const PAYLOAD_DELAY: Duration = Duration::from_millis(400);
 
 /// Requests for the samples of one writer.
 #[derive(Debug)]
@@ -55,7 +55,7 @@ struct UnannouncedSamples {
 #[derive(Debug)]
 pub struct Payloads {
     writers: HashMap<Guid, WantedWriter>,
-    payload_delay: u64,
+    payload_delay: Duration,
     /// Number of writers whose payloads are requested.
     deep: usize,
     assembly: Assembly,
@@ -70,9 +70,9 @@ pub struct Payloads {
 
 impl Payloads {
     /// Creates the state without requests. At most `limit` bytes are held; payloads arrive at most
-    /// `payload_delay` nanoseconds after they are requested.
+    /// `payload_delay` after they are requested.
     #[must_use]
-    pub fn new(limit: usize, payload_delay: u64) -> Self {
+    pub fn new(limit: usize, payload_delay: Duration) -> Self {
         Self {
             writers: HashMap::new(),
             payload_delay,
@@ -265,7 +265,7 @@ impl Payloads {
             false => self.assembly.take(writer, counted.number),
         };
         // A sample that began before the request is incomplete.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.payload_delay)
+        let is_expected = counted.began >= interested.since + self.payload_delay
             || interested
                 .first_whole
                 .is_some_and(|first| first < counted.number);

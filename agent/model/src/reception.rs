@@ -4,6 +4,8 @@
 //! a late fragment does not reopen it, and each missing sample is decided once. The caller counts
 //! the results.
 
+use std::time::Duration;
+
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
@@ -250,12 +252,11 @@ impl Reception {
         }
     }
 
-    /// Decides samples that have been open for `window` nanoseconds, and those that the writer
-    /// withdrew `grace` nanoseconds ago.
+    /// Decides samples that have been open for `window`, and those that the writer withdrew `grace` ago.
     pub fn advance(
         &mut self,
         now: Timestamp,
-        (window, grace): (u64, u64),
+        (window, grace): (Duration, Duration),
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {

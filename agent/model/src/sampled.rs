@@ -7,7 +7,8 @@
 //! counted here too.
 //! the network counts here too: it adds to what was seen.
 
-use ros2probe_wire::time::{MILLISECOND, SECOND};
+use std::time::Duration;
+
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::measurement::SampledFacts;
@@ -15,9 +16,9 @@ use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
-const HOLD: u64 = 10 * SECOND;
+const HOLD: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
-const PATIENCE: u64 = 200 * MILLISECOND;
+const PATIENCE: Duration = Duration::from_millis(200);
 /// Numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -133,13 +134,13 @@ impl Sampled {
 
     /// Returns whether the writer is still sampled.
     #[must_use]
-    pub const fn is_current(&self, now: Timestamp) -> bool {
-        self.last.0.saturating_add(HOLD) > now.0
+    pub fn is_current(&self, now: Timestamp) -> bool {
+        self.last + HOLD > now
     }
 
     /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
     /// the first record after that, since samples missing before it may have used shared memory.
-    pub const fn takes(&mut self, now: Timestamp) -> bool {
+    pub fn takes(&mut self, now: Timestamp) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
         takes
@@ -183,7 +184,7 @@ impl Sampled {
     /// Stops waiting for samples that were already missing at the previous tick.
     pub fn tick(&mut self, now: Timestamp) {
         let (then, next) = self.last_settled;
-        if now.0.saturating_sub(then.0) >= PATIENCE {
+        if now - then >= PATIENCE {
             self.settle(next.min(self.next));
             self.last_settled = (now, self.next);
         }

@@ -248,8 +248,7 @@ impl Subscribers {
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is no measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
-            && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
-            && delay <= PLAUSIBLE
+            && (source..=source + PLAUSIBLE).contains(&began)
             && self.departures.is_first(source)
         {
             let delay = began.nanoseconds_since(source);

@@ -267,7 +267,7 @@ fn who_has_secrets_or_no_address_is_not_asked() {
         process: ProcessFacts::default(),
         first_seen: Timestamp(1),
         last_seen: Timestamp(1),
-        lease: ros2probe_wire::Duration::Infinite,
+        lease: ros2probe_wire::RtpsDuration::Infinite,
         secured,
         restored: false,
         addresses: Addresses {

@@ -1,6 +1,6 @@
 use super::super::sequence::{FAR, REACH, Settled};
 use super::*;
-use ros2probe_wire::time::SECOND;
+use ros2probe_wire::time::{SECOND, nanoseconds};
 
 struct View {
     sampled: Sampled,
@@ -196,7 +196,7 @@ fn a_sample_that_was_told_of_and_seen_late_is_no_new_beginning() {
 fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     let mut view = View::new();
     let settle = |view: &mut View| {
-        view.now += PATIENCE;
+        view.now += nanoseconds(PATIENCE);
         view.sampled.tick(Timestamp(view.now));
         view.sampled.take_unseen()
     };

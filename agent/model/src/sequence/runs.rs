@@ -60,7 +60,7 @@ impl Sequence {
             return number - self.next > reach;
         }
         let newer = source.is_some_and(|source| {
-            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
+            self.newest_source.0 > 0 && source > self.newest_source + INCARNATION
         });
         // A restarted writer fills no gaps of its previous run.
         let unconfirmed = self.unconfirmed.as_ref();

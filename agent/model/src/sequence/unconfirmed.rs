@@ -3,6 +3,8 @@
 //! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
 //! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
 
+use std::time::Duration;
+
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::FAR;
@@ -12,7 +14,7 @@ pub(super) const CONFIRMATIONS: u8 = 5;
 /// Largest number of samples remembered per run; a datagram may contain several.
 const KEPT: usize = 32;
 /// Copies of one datagram arrive at several sockets within this time.
-const COPIES: i64 = 5_000_000;
+const COPIES: Duration = Duration::from_millis(5);
 
 /// The run, and unconfirmed claims of HEARTBEATs and GAPs.
 #[derive(Debug, Default)]
@@ -133,7 +135,7 @@ impl UnconfirmedRun {
         if !is_same {
             self.claim = (next, now);
         }
-        is_same && now.nanoseconds_since(at) >= COPIES
+        is_same && now - at >= COPIES
     }
 
     /// Records the numbers that a GAP skips.

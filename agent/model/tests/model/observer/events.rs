@@ -1,6 +1,7 @@
 //! Events of the graph, of losses and of expectations.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_model::churn;
 use ros2probe_model::event::EventKind;
@@ -104,14 +105,14 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
 
 #[test]
 fn a_changed_expectation_is_told_once_and_another_watch_changes_nothing() {
-    let expects = |pattern: &str, max_silence_s| Watch {
+    let expects = |pattern: &str, max_silence| Watch {
         expectations: Expectations {
-            max_silence_s,
+            max_silence,
             ..Expectations::default()
         },
         ..Watch::named(pattern).unwrap()
     };
-    let chatter = expects("/chatter", Some(2.0));
+    let chatter = expects("/chatter", Some(Duration::from_secs(2)));
     let mut world = World::new(&[]);
     let watch = |world: &mut World, watches: Vec<Watch>| {
         let watchlist = Watchlist::new(watches).unwrap();
@@ -169,7 +170,7 @@ fn expectations_are_judged_in_the_sources_time() {
     let mut world = World::new(&[]);
     let expectations = Expectations {
         min_rate_hz: Some(50.0),
-        max_silence_s: Some(3.0),
+        max_silence: Some(Duration::from_secs(3)),
         ..Expectations::default()
     };
     let watch = Watch {
