@@ -298,10 +298,10 @@ pub fn bag_file(bytes: &[u8]) {
     let name = ["a_0.mcap", "a_0.mcap.zstd", "a_0.mcap.lz4"][usize::from(choice % 3)];
     let path = directory.join(name);
     fs::write(&path, file).expect("a file");
-    told(&path);
+    reported(&path);
     if !metadata.is_empty() {
         fs::write(directory.join("metadata.yaml"), metadata).expect("a file");
-        told(directory);
+        reported(directory);
     }
     let Ok(report) = reindex(directory) else {
         return;
@@ -310,7 +310,7 @@ pub fn bag_file(bytes: &[u8]) {
     let of_file = &report.files[0];
     assert!(!path.with_extension("mcap.part").exists());
     // A completed bag is complete: a second run reports the same.
-    told(directory);
+    reported(directory);
     let again = reindex(directory).expect("what was written");
     assert_eq!(again.metadata.message_count, report.metadata.message_count);
     assert_eq!(again.metadata.topics, report.metadata.topics);
@@ -324,7 +324,7 @@ pub fn bag_file(bytes: &[u8]) {
 }
 
 /// Reads everything that can be reported of a bag or a file.
-fn told(path: &Path) {
+fn reported(path: &Path) {
     let Ok(opened) = Bag::open(path) else {
         return;
     };

@@ -19,7 +19,7 @@ use super::journal::Journal;
 use super::loss::LossCause;
 use super::loss_causes::{LossCauses, REASSEMBLY};
 use super::measurement::Delivered;
-use super::reception::{Outcome, Reception, Whole};
+use super::reception::{CompleteSample, Outcome, Reception};
 use super::route::Direction;
 use super::route::Route;
 use super::samples::Budget;
@@ -240,7 +240,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         self.touch(sample.record());
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.is_empty() {
@@ -259,7 +259,7 @@ impl Delivery {
     }
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
-    pub fn no_room(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
+    pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(sample.record());
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.note(sample) {
@@ -412,7 +412,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         let (number, reliable) = (sample.sequence_number(), self.is_reliable(context));
         self.begin_anew(number, context);
         let sequence = self.reception.sequence();
@@ -437,14 +437,14 @@ impl Delivery {
                 }
                 (true, None)
             }
-            Outcome::Whole(whole) => {
+            Outcome::Complete(whole) => {
                 self.whole(&whole, context);
                 (false, Some(whole))
             }
         }
     }
 
-    fn whole(&mut self, whole: &Whole, context: &mut DeliveryContext<'_>) {
+    fn whole(&mut self, whole: &CompleteSample, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_history = whole.number < sequence.first() && !whole.unconfirmed;
         let missed = sequence.missed_since(whole.number);
@@ -478,7 +478,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         let number = sample.sequence_number();
         let is_whole = matches!(sample, Sample::Data(_));
         if is_whole && self.loss_causes.resolve(number) {

@@ -33,7 +33,7 @@ use super::size::Size;
 use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;
-use eviction::{FORSAKEN, Newcomer, Table, Victims};
+use eviction::{MAX_SILENCE, Newcomer, Table, Victims};
 use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
 pub use memory::{Memory, hexadecimal};
@@ -431,7 +431,7 @@ impl Discovery {
                     RtpsDuration::Finite(lease) => lease,
                     // The restored participant may have stopped while no agent ran, so its infinite
                     // lease is limited.
-                    RtpsDuration::Infinite if participant.restored.is_some() => FORSAKEN,
+                    RtpsDuration::Infinite if participant.restored.is_some() => MAX_SILENCE,
                     RtpsDuration::Infinite => return None,
                 };
                 let end = participant.last_seen + lease;

@@ -242,11 +242,11 @@ mod tests {
             loss_causes.note(SequenceNumber(2 * number), LossCause::SocketBuffer, at(1))
         });
         assert_eq!(forgotten.count(), 10_000 - SAMPLES);
-        let told = (0..2000).filter_map(|number| {
+        let losses = (0..2000).filter_map(|number| {
             let number = SequenceNumber(2 * number);
             loss_causes.wait(number, number, at(1))
         });
-        assert_eq!(told.count(), 2000 - RUNS);
+        assert_eq!(losses.count(), 2000 - RUNS);
     }
 
     #[test]

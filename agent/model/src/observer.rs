@@ -52,7 +52,7 @@ const TICK: Duration = Duration::from_millis(100);
 /// A larger step of the clock means that the clock was set; it is not processed tick by tick.
 const JUMP: Duration = Duration::from_secs(3600);
 /// Largest number of names matched against globs at once, which takes a few milliseconds.
-const MATCHES_AT_ONCE: usize = 20_000;
+const MAX_MATCHES_PER_ROUND: usize = 20_000;
 
 /// What the model needs from shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

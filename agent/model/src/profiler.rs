@@ -29,7 +29,7 @@ pub use unknown_writers::UnknownWriters;
 /// second.
 const UNKNOWN_AFTER: Duration = Duration::from_secs(3);
 /// An unknown writer is dropped after this silence, or earlier if it sent little.
-const FORGET: Duration = Duration::from_secs(30);
+const UNKNOWN_WRITER_TIMEOUT: Duration = Duration::from_secs(30);
 const EVICTABLE_AFTER: Duration = Duration::from_secs(3);
 /// Number of messages from which on an unknown writer is not evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
@@ -40,10 +40,10 @@ const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
 /// Unknown writers may use one part in this many of the memory for fragmented samples.
 const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
-const SILENT: Duration = Duration::from_secs(10);
+const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 const GIVEN_UP: usize = 64;
 /// Flags of records that report undelivered datagrams; they are no transmissions.
-pub(super) const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+pub(super) const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
 
 /// A measured writer.
 #[derive(Debug)]
@@ -444,7 +444,7 @@ impl Profiler {
                 }
                 continue;
             }
-            if measured.last_seen + FORGET <= now {
+            if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
                 unknown_writers.forgotten.push(*guid);
             } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
                 (measured.metered, measured.opened) = (true, now);
@@ -493,7 +493,7 @@ impl Profiler {
             .iter()
             .filter_map(|(guid, measured)| Some((guid, measured.subscribers.as_ref()?)))
             .flat_map(|(guid, subscribers)| subscribers.silent_since().map(|at| (at, *guid)))
-            .filter(|(at, _)| *at + SILENT <= now)
+            .filter(|(at, _)| *at + DELIVERY_TIMEOUT <= now)
             .collect();
         silent.sort_unstable();
         for (at, guid) in silent.into_iter().take(GIVEN_UP) {

@@ -28,7 +28,7 @@ pub struct Reception {
 
 /// A complete sample.
 #[derive(Clone, Copy, Debug)]
-pub struct Whole {
+pub struct CompleteSample {
     /// Its sequence number.
     pub number: SequenceNumber,
     /// Payload bytes, including encapsulation.
@@ -55,7 +55,7 @@ pub struct Whole {
 #[derive(Clone, Copy, Debug)]
 pub enum Outcome {
     /// The record completed a sample.
-    Whole(Whole),
+    Complete(CompleteSample),
     /// The record is a duplicate.
     Duplicate,
     /// The sample is still incomplete, or the record was not usable.
@@ -297,7 +297,7 @@ impl Reception {
         let Arrival::New { recovered, newest } = arrival else {
             return Outcome::Duplicate;
         };
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             recovered,
             newest,
             ..whole_data(sample)
@@ -322,7 +322,7 @@ impl Reception {
             record::Sample::Data(_) => whole_data(sample),
         };
         self.sequence.complete_unconfirmed(number);
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             newest: false,
             unconfirmed: true,
             ..whole
@@ -375,15 +375,15 @@ impl Reception {
             return Outcome::Open;
         };
         let repaired = reliable && facts.repaired_after >= REPAIR;
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
             ..whole_fragments(record::Sample::DataFrag(fragments), &facts)
         })
     }
 }
 
-const fn whole_data(sample: record::Sample<'_>) -> Whole {
-    Whole {
+const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
+    CompleteSample {
         number: sample.sequence_number(),
         bytes: sample.size() as u64,
         is_message: sample.is_message(),
@@ -397,8 +397,8 @@ const fn whole_data(sample: record::Sample<'_>) -> Whole {
     }
 }
 
-const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> Whole {
-    Whole {
+const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> CompleteSample {
+    CompleteSample {
         bytes: facts.size as u64,
         source: facts.source,
         stamp: facts.stamp,

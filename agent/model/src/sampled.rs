@@ -16,9 +16,9 @@ use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
-const HOLD: Duration = Duration::from_secs(10);
+const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
-const PATIENCE: Duration = Duration::from_millis(200);
+const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
 /// Numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -72,13 +72,13 @@ pub struct SampledUpdate {
 
 /// How much of a sample was seen, including its latest record.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Seen {
+pub enum Completeness {
     /// Some fragments, with more to follow.
-    Part,
+    Partial,
     /// The last fragment, while others are missing.
-    Tail,
+    LastFragment,
     /// The whole sample.
-    Whole,
+    Complete,
 }
 
 impl Sampled {
@@ -135,7 +135,7 @@ impl Sampled {
     /// Returns whether the writer is still sampled.
     #[must_use]
     pub fn is_current(&self, now: Timestamp) -> bool {
-        self.last + HOLD > now
+        self.last + SAMPLED_TIMEOUT > now
     }
 
     /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
@@ -159,7 +159,7 @@ impl Sampled {
     }
 
     /// Processes a sample that [`Self::awaits`] accepts, or a fragment of one, after [`Self::end`].
-    pub fn catch_up(&mut self, number: SequenceNumber, seen: Seen) -> SampledUpdate {
+    pub fn catch_up(&mut self, number: SequenceNumber, seen: Completeness) -> SampledUpdate {
         SampledUpdate {
             finished: self.sight(number, seen),
             ..SampledUpdate::default()
@@ -184,7 +184,7 @@ impl Sampled {
     /// Stops waiting for samples that were already missing at the previous tick.
     pub fn tick(&mut self, now: Timestamp) {
         let (then, next) = self.last_settled;
-        if now - then >= PATIENCE {
+        if now - then >= ARRIVAL_TIMEOUT {
             self.settle(next.min(self.next));
             self.last_settled = (now, self.next);
         }
@@ -246,7 +246,7 @@ impl Sampled {
     /// numbers before it may have been missed.
     pub fn sample(
         &mut self,
-        (number, seen, source): (SequenceNumber, Seen, Option<Timestamp>),
+        (number, seen, source): (SequenceNumber, Completeness, Option<Timestamp>),
         reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
@@ -295,7 +295,7 @@ impl Sampled {
             ..SampledUpdate::default()
         };
         let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
-        if seen != Seen::Part && below == 0 && is_later {
+        if seen != Completeness::Partial && below == 0 && is_later {
             update.arrived = true;
             update.interval = self
                 .arrived
@@ -378,7 +378,7 @@ impl Sampled {
     /// Processes a sample whose number is not confirmed.
     fn unconfirmed(
         &mut self,
-        (number, seen): (SequenceNumber, Seen),
+        (number, seen): (SequenceNumber, Completeness),
         new: bool,
         sequence: &mut Sequence,
     ) -> SampledUpdate {
@@ -388,7 +388,7 @@ impl Sampled {
         SampledUpdate {
             samples,
             alike: samples,
-            finished: seen != Seen::Part && sequence.complete_unconfirmed(number),
+            finished: seen != Completeness::Partial && sequence.complete_unconfirmed(number),
             unconfirmed: true,
             ..SampledUpdate::default()
         }
@@ -409,13 +409,13 @@ impl Sampled {
 
     /// Marks a sample as seen. Returns whether nothing more of it is waited for, for the first
     /// time.
-    fn sight(&mut self, number: SequenceNumber, seen: Seen) -> bool {
+    fn sight(&mut self, number: SequenceNumber, seen: Completeness) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
         if self.sighted & bit != bit {
             self.sighted |= bit;
             self.seen += 1;
         }
-        let finished = seen != Seen::Part && self.awaits(number);
+        let finished = seen != Completeness::Partial && self.awaits(number);
         if finished {
             self.finished |= bit;
         }

@@ -35,7 +35,7 @@ const MAX_FINISHED: usize = 2048;
 /// Memory for bitmaps of fragments in bytes.
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements after this time have no span.
-const PATIENCE: Duration = Duration::from_secs(10);
+const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
 /// An arriving message is not a copy of one sent from here if no record shows that within this
 /// time.
 const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
@@ -203,7 +203,7 @@ impl Tracer {
         record: &Record,
         about: impl FnOnce() -> Option<(WriterDescription, f64)>,
     ) {
-        const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+        const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
         let writer = record.writer();
         if !self.writers.contains_key(&writer) {
             let Some((description, ratio)) = about() else {
@@ -235,7 +235,7 @@ impl Tracer {
         for traced in self.writers.values_mut().flatten() {
             traced.release(now, &mut self.shared);
             while let Some(first) = traced.waiting.front()
-                && now - first.at > PATIENCE
+                && now - first.at > ACKNACK_TIMEOUT
             {
                 traced.waiting.pop_front();
                 self.shared.open = self.shared.open.saturating_sub(1);

@@ -444,7 +444,7 @@ impl Writer {
             Outcome::Duplicate => {
                 self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
             }
-            Outcome::Whole(whole) if whole.is_message => {
+            Outcome::Complete(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
                 let wall_clock = context.wall_clock.wall_time(now);
                 let (source, stamp) = (whole.source, whole.stamp);
@@ -467,7 +467,7 @@ impl Writer {
                     unconfirmed: whole.unconfirmed,
                 });
             }
-            Outcome::Whole(_) => {}
+            Outcome::Complete(_) => {}
         }
         None
     }

@@ -144,8 +144,11 @@ fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()>
                 &elsewhere,
                 "http://127.0.0.1:17401/events?after=0&follow=false",
             )?;
-            let told = events.matches(what).count();
-            ensure!(told == round, "{told} of {round} {what} in {events}");
+            let reported = events.matches(what).count();
+            ensure!(
+                reported == round,
+                "{reported} of {round} {what} in {events}"
+            );
             Ok(())
         })
     };
@@ -198,8 +201,8 @@ fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
         eventually(|| {
             let page = agent.scrape()?;
             for name in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
-                let told = page.sum("ros2probe_events_total", &[("name", name)]);
-                ensure!(told == f64::from(round), "{told} of {round} {name}");
+                let reported = page.sum("ros2probe_events_total", &[("name", name)]);
+                ensure!(reported == f64::from(round), "{reported} of {round} {name}");
             }
             Ok(())
         })?;

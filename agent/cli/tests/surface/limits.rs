@@ -25,7 +25,7 @@ use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
-use ros2probe_testing::model::host::{self, BOB, Host, Seen};
+use ros2probe_testing::model::host::{self, BOB, CapturePoint, Host};
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use tokio_util::sync::CancellationToken;
@@ -234,7 +234,7 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     };
     let mut host = Host::with(Settings::default().with_limits(&limits));
     let bob = host.reader(BOB, 7411);
-    let at = |socket: u64| Seen {
+    let at = |socket: u64| CapturePoint {
         socket,
         ..bob.multicast(socket)
     };

@@ -28,7 +28,7 @@ const FORM: Form<Document> = Form {
     readers: &[(VERSION, from_json)],
 };
 /// Changes within this time are written once.
-const TOGETHER: Duration = Duration::from_millis(50);
+const WRITE_DELAY: Duration = Duration::from_millis(50);
 /// Time after a failure until the next attempt.
 const AGAIN: Duration = Duration::from_secs(30);
 
@@ -261,7 +261,7 @@ impl Mailbox {
         let pending = pending.unwrap_or_else(PoisonError::into_inner);
         // Further changes may follow immediately.
         let open = |pending: &mut Pending| !pending.is_closed;
-        let waited = self.changed.wait_timeout_while(pending, TOGETHER, open);
+        let waited = self.changed.wait_timeout_while(pending, WRITE_DELAY, open);
         let mut pending = waited.unwrap_or_else(PoisonError::into_inner).0;
         pending.latest.take()
     }

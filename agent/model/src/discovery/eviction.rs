@@ -25,7 +25,7 @@ const ESTABLISHED: Duration = Duration::from_secs(2);
 const UNESTABLISHED_SILENCE: Duration = Duration::from_secs(5);
 /// Any participant is silent after this time without a packet, whatever its lease: real ones
 /// announce themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
-pub(super) const FORSAKEN: Duration = Duration::from_secs(90);
+pub(super) const MAX_SILENCE: Duration = Duration::from_secs(90);
 /// Minimum time between two searches of a full table; it grows with the number of entries.
 const SEARCH: Duration = Duration::from_millis(100);
 const SEARCH_EACH: Duration = Duration::from_micros(10);
@@ -252,7 +252,7 @@ fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priorit
     if priority.local {
         return None;
     }
-    if is_silent_for(FORSAKEN) {
+    if is_silent_for(MAX_SILENCE) {
         return Some(Priority::NOTHING);
     }
     let is_established = last - participant.first_seen >= ESTABLISHED;

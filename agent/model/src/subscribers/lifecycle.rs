@@ -13,7 +13,7 @@ use crate::receivers::{Matched, readers};
 use crate::route::Route;
 
 /// A route is dropped after this long without a record, unless it leads to a known reader.
-const FORGET: Duration = Duration::from_secs(60);
+const ROUTE_TIMEOUT: Duration = Duration::from_secs(60);
 
 impl Subscribers {
     /// Settles samples whose waiting time is over, and drops routes that have been silent for long.
@@ -29,8 +29,9 @@ impl Subscribers {
         }
         self.expect(context, false);
         if now.0.is_multiple_of(SECOND) {
-            self.routes
-                .retain(|known| known.matched == Matched::Yes || known.last_seen + FORGET > now);
+            self.routes.retain(|known| {
+                known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
+            });
             self.drop_orphans(context);
         }
     }

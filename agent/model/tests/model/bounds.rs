@@ -315,7 +315,7 @@ fn forged_record(dice: &mut Dice, newest: u64, now: u64) -> Record {
     if is_sent {
         flags |= flag::OUTGOING;
     } else if dice.pick(3) == 0 {
-        flags |= [flag::NO_ROOM, flag::NOT_REASSEMBLED][dice.pick(2) as usize];
+        flags |= [flag::SOCKET_FULL, flag::NOT_REASSEMBLED][dice.pick(2) as usize];
     }
     let directed = match dice.pick(3) {
         0 if kind != kind::ACKNACK => Guid::default(),

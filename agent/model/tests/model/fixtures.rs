@@ -419,14 +419,14 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
         }
         let at = line.t + SETTLED;
         // A node knows itself before it announces itself.
-        let told = facts
+        let reported = facts
             .ros_discovery_info
             .iter()
             .filter(|sample| sample.t < at as f64 / 1e9);
-        let told: BTreeSet<_> = told
+        let reported: BTreeSet<_> = reported
             .flat_map(|sample| sample.nodes.iter().map(truth::FactsNode::name))
             .collect();
-        if !line.nodes.iter().all(|node| told.contains(node)) {
+        if !line.nodes.iter().all(|node| reported.contains(node)) {
             continue;
         }
         let Some(view) = replayed.view_at(at) else {

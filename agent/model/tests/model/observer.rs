@@ -133,8 +133,8 @@ impl World {
     /// Returns the events since the last call, with their times since the start.
     fn events(&mut self) -> Vec<(u64, EventKind)> {
         let events = self.observer.drain().events.events.into_iter();
-        let told = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
-        told.collect()
+        let reported = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
+        reported.collect()
     }
 
     fn node_names(&self) -> Vec<String> {

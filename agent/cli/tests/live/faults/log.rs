@@ -55,7 +55,7 @@ fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
     outcome(
         "nobody reads the log (stderr is a full pipe), 20 reloads of 200 mistakes",
         &format!(
-            "every message counted, {missed} lines lost and counted, told in the log when it was read again; \
+            "every message counted, {missed} lines lost and counted, reported in the log when it was read again; \
              ended in {took:?}"
         ),
     )
