@@ -20,6 +20,9 @@ MIRI_THREADS := ring::turns
 
 SOURCES := https://github.com/ros2probe/ros2probe/blob/main
 
+# Tests and demo select the whole workspace: a part of it has other features, and its dependencies
+# would be built once more.
+
 # Node of target/tools is there only where the system's is too old for the page's tests.
 export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 # Comes with Rust and links for both architectures: no cross toolchain.
@@ -34,7 +37,7 @@ help: ## this list
 
 demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (needs root)
 	@.ci/prerequisites.sh demo
-	cargo build --package ros2probe --bin rp --example robot --example demo
+	cargo build --workspace --bin rp --example robot --example demo
 	@$(SUDO) $(TARGET)/debug/examples/demo $(if $(DEMO_SECONDS),--seconds $(DEMO_SECONDS))
 
 test: ## format, spelling, lints, kernel object, and all tests with real DDS participants (needs root)
@@ -48,7 +51,7 @@ test: ## format, spelling, lints, kernel object, and all tests with real DDS par
 	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
-	cargo test --package ros2probe --features tls --test surface --quiet -- web_config:: otlp_tls::
+	cargo test --workspace --features ros2probe/tls --test surface --quiet -- web_config:: otlp_tls::
 	cargo nextest run --workspace $$(.ci/prerequisites.sh --left-out)
 	@if [ -d "$(CORPUS)" ]; then $(MAKE) --no-print-directory test-corpus; fi
 
@@ -57,11 +60,11 @@ test-fast: ## unit tests, model and surface, without root and namespaces: under 
 	@env -u CARGO_TARGET_$(HOST)_RUNNER cargo nextest run --workspace --profile fast
 
 test-corpus: ## tests against the whole corpus of captures in ROS2PROBE_FIXTURES (../shared/fixtures)
-	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --package ros2probe --package ros2probe-model --run-ignored only --filterset 'test(corpus)'
+	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --workspace --run-ignored only --filterset 'test(corpus)'
 
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2
-	cargo nextest run --package ros2probe --run-ignored only --filterset 'binary(humble)'
+	cargo nextest run --workspace --run-ignored only --filterset 'binary(humble)'
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf
@@ -85,7 +88,7 @@ page-bench: ## first paint with 500 topics, layout and memory of the page; MEASU
 
 screenshots: ## the pictures of README and docs, from the demo, in target/screenshots (needs root)
 	@.ci/prerequisites.sh demo page
-	cargo build --package ros2probe --bin rp --example robot --example demo
+	cargo build --workspace --bin rp --example robot --example demo
 	$(SUDO) env PATH=$(PATH) node agent/cli/tests/page/screenshots.mjs $(TARGET)/debug/examples/demo $(TARGET)/screenshots
 
 peers: ## build the Fast DDS and Cyclone DDS test peers into target/peers
@@ -137,7 +140,7 @@ miri: ## rings and the walk under Miri, which finds what the compiler may not as
 
 book: ## the documentation as a website in target/book, with its links, sizes and prose checked
 	@.ci/prerequisites.sh book
-	cargo test --package ros2probe-testing --test documents --test prose --quiet
+	cargo test --workspace --test documents --test prose --quiet
 	mdbook build docs --dest-dir $(TARGET)/book
 	@# Links out of the book lead to the repository.
 	sed -i -E 's#href="\.\./([^"#]*)\.html#href="$(SOURCES)/\1.md#g; s#href="\.\./#href="$(SOURCES)/#g' $(TARGET)/book/*.html

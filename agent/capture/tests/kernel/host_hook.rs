@@ -16,7 +16,6 @@ use ros2probe_capture::filter::{Filter, FilterSettings};
 use ros2probe_capture::netns;
 use ros2probe_capture::sockets::Sockets;
 use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_testing::forged;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::{PREFIX, run};
@@ -90,7 +89,7 @@ impl Observed {
     fn make<T: Send>(&self, host: &Namespace, make: impl FnOnce() -> T + Send) -> Result<T> {
         Ok(self
             .cgroup
-            .hold(|| netns::within(&forged::path(host), make))??)
+            .hold(|| netns::within(&host.network(), make))??)
     }
 }
 
@@ -364,7 +363,7 @@ fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go()
     let host = Namespace::alone()?;
     let mut observed = Observed::new(Verdict::Meter)?;
     let bind = || UdpSocket::bind("127.0.0.1:0");
-    let sender = netns::within(&forged::path(&host), bind)??;
+    let sender = netns::within(&host.network(), bind)??;
     let used = observed.socket(&host, "127.0.0.1:0")?;
     let mut numbers = 1..;
     let mut arrives = |observed: &mut Observed, cpu, socket: &UdpSocket| -> Result<()> {

@@ -85,7 +85,7 @@ impl Observed {
     /// Opens a socket of the cgroup in a host's network.
     fn socket(&self, host: &Namespace, address: &str) -> UdpSocket {
         let address: SocketAddr = address.parse().unwrap();
-        let path = forged::path(host);
+        let path = host.network();
         let open = || netns::within(&path, || shared_socket(address));
         self.cgroup.hold(open).unwrap().unwrap()
     }
@@ -183,7 +183,7 @@ fn a_socket_of_another_network_and_process_id_namespace_is_known_by_both_its_pro
     let observed = Observed::new();
     let host = Namespace::alone().unwrap();
     let bind = || UdpSocket::bind("127.0.0.1:0").unwrap();
-    let socket = netns::within(&forged::path(&host), bind).unwrap();
+    let socket = netns::within(&host.network(), bind).unwrap();
     let cookie = cookie(&socket);
     // A thread's children belong to the PID namespace that it has created.
     let contained = std::thread::spawn(|| {

@@ -135,7 +135,7 @@ impl Start {
         configuration: &Path,
         directory: &Path,
     ) -> Result<Start> {
-        let network = Path::new("/run/netns").join(host.name());
+        let network = host.network();
         let mut starts = Vec::new();
         for number in 0..STARTS {
             let notify = directory.join(format!("notify{number}"));

@@ -99,7 +99,7 @@ impl Open {
 
 impl Tab {
     fn open(host: &Namespace) -> Result<Tab> {
-        let network = Path::new("/run/netns").join(host.name());
+        let network = host.network();
         let mut stream = netns::within(&network, || TcpStream::connect("127.0.0.1:17401"))??;
         stream.write_all(b"GET /live HTTP/1.0\r\nHost: localhost:17401\r\n\r\n")?;
         let bytes = Arc::new(AtomicU64::new(0));

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result, anyhow, ensure};
 use clock::ClockStep;
 use ros2probe_testing::forged::crowd::{Crowd, Graph, Scale, Tally};
-use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, talk};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{
     Agent, METRICS, ON_THE_WIRE, Scrape, at_the_sockets_of, get,
@@ -339,7 +339,7 @@ fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
 fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()> {
     let link = Link::new()?;
     let other = Namespace::alone()?;
-    let place = forged::path(&other);
+    let place = other.network();
     let text = format!(
         "watch: [/**]\ncapture: {{source: wire, network_namespaces: [{}]}}\n",
         place.display()

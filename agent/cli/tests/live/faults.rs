@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::{Carrier as _, Sender, Talker, path, talk};
+use ros2probe_testing::forged::{Carrier as _, Sender, Talker, talk};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -93,7 +93,7 @@ impl<'a> Scene<'a> {
 
     /// A connection to one of its listeners.
     fn connect(&self, port: u16) -> Result<TcpStream> {
-        let stream = netns::within(&path(self.agent.host), || {
+        let stream = netns::within(&self.agent.host.network(), || {
             TcpStream::connect(("127.0.0.1", port))
         })??;
         stream.set_read_timeout(Some(Duration::from_secs(20)))?;

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Result;
 use ros2probe_testing::forged::frames::{Shuffle, Tun, Wire};
-use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
+use ros2probe_testing::forged::{Carrier, Sender, Talker, introduce, talk};
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
@@ -251,7 +251,7 @@ fn interfaces_that_came_and_went_do_not_use_up_the_filters_table() -> Result<()>
 #[test]
 fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
     let link = Link::new()?;
-    let path = forged::path(&link.robot);
+    let path = link.robot.network();
     let observed = Observed::start(
         &link.monitor,
         &format!(
@@ -275,7 +275,7 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
 #[test]
 fn a_network_namespace_whose_path_is_gone_for_a_while_is_missed_meanwhile() -> Result<()> {
     let link = Link::new()?;
-    let path = forged::path(&link.robot);
+    let path = link.robot.network();
     let place = path.display();
     let capture =
         format!("watch: [/**]\ncapture: {{source: wire, network_namespaces: [{place}]}}\n");

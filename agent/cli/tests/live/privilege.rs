@@ -236,7 +236,7 @@ fn an_agent_that_cannot_get_rid_of_its_capabilities_serves_nothing() -> Result<(
 #[test]
 fn a_collector_is_found_by_its_name_and_connected_to() -> Result<()> {
     let host = Namespace::alone()?;
-    let network = PathBuf::from(format!("/run/netns/{}", host.name()));
+    let network = host.network();
     let (names, collector) = netns::within(&network, || -> Result<_> {
         let names = UdpSocket::bind("127.0.0.1:53")?;
         names.set_read_timeout(Some(Duration::from_millis(100)))?;

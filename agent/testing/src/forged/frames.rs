@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU16, Ordering};
 use anyhow::{Context as _, Result};
 use ros2probe_capture::netns;
 
-use super::{Carrier, DISCOVERY_PORT, path};
+use super::{Carrier, DISCOVERY_PORT};
 use crate::harness::network::Namespace;
 
 const IPV4: [u8; 2] = [0x08, 0x00];
@@ -32,7 +32,7 @@ pub struct Wire {
 
 impl Wire {
     pub fn new(host: &Namespace, other: &Namespace, interface: &str) -> Result<Wire> {
-        let socket = netns::within(&path(host), || packet_socket(interface))?
+        let socket = netns::within(&host.network(), || packet_socket(interface))?
             .with_context(|| format!("no packet socket on {interface}"))?;
         Ok(Wire {
             socket: File::from(socket),
@@ -74,7 +74,7 @@ pub struct Tun {
 
 impl Tun {
     pub fn new(host: &Namespace, name: &str, from: [u8; 4], to: [u8; 4]) -> Result<Tun> {
-        let device = netns::within(&path(host), || tun_device(name))?
+        let device = netns::within(&host.network(), || tun_device(name))?
             .with_context(|| format!("no tun device {name}"))?;
         Ok(Tun { device, from, to })
     }

@@ -6,7 +6,6 @@ pub mod frames;
 pub mod storm;
 
 use std::net::{SocketAddr, UdpSocket};
-use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
@@ -171,7 +170,7 @@ pub struct Sender {
 impl Sender {
     pub fn new(host: &Namespace, from: &str, to: &str) -> Result<Sender> {
         let (from, to): (SocketAddr, SocketAddr) = (from.parse()?, to.parse()?);
-        let socket = netns::within(&path(host), || UdpSocket::bind(from))?
+        let socket = netns::within(&host.network(), || UdpSocket::bind(from))?
             .with_context(|| format!("cannot bind {from}"))?;
         Ok(Sender { socket, to })
     }
@@ -215,11 +214,6 @@ pub fn talk(
         std::thread::sleep(Duration::from_millis(2));
     }
     Ok(())
-}
-
-/// Returns the path of a host's network namespace.
-pub fn path(host: &Namespace) -> PathBuf {
-    PathBuf::from("/run/netns").join(host.name())
 }
 
 /// Appends a DATA submessage (RTPS 2.5, 9.4.5.3).

@@ -3,11 +3,14 @@
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::fs::File;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, Result, bail};
+use anyhow::{Context as _, Result, bail, ensure};
+use ros2probe_capture::netns;
 
 use super::network::Namespace;
 use super::process::Process;
@@ -24,6 +27,8 @@ pub const ON_THE_WIRE: &str = "capture: {source: wire}\n";
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Longest wait for the kernel to verify the programs there.
 const START: Duration = Duration::from_secs(60);
+/// Longest wait for more of an answer.
+const ANSWER: Duration = Duration::from_secs(20);
 /// Longer than the second after which a gap of a best-effort stream is settled.
 const STILL: Duration = Duration::from_millis(1800);
 /// Wait if the agent reports lost records or frames: some messages may never be counted.
@@ -231,24 +236,27 @@ fn has_label(labels: &str, pair: &str) -> bool {
         .any(|(at, _)| at == 0 || labels.as_bytes().get(at - 1) == Some(&b','))
 }
 
-/// GETs a URL from inside a host.
+/// GETs a URL such as `http://127.0.0.1:17400/metrics` on a host's network. Fails unless the status
+/// is a success.
 pub fn get(host: &Namespace, url: &str) -> Result<String> {
-    let [program, arguments @ ..] = &host.outside();
-    let output = Command::new(program)
-        .args(arguments)
-        .args([
-            "curl",
-            "--silent",
-            "--show-error",
-            "--fail",
-            "--max-time",
-            "20",
-            url,
-        ])
-        .output()
-        .context("cannot run curl")?;
-    if !output.status.success() {
-        bail!("{url}: {}", String::from_utf8_lossy(&output.stderr).trim());
-    }
-    Ok(String::from_utf8_lossy(&output.stdout).into_owned())
+    let (address, path) = url
+        .strip_prefix("http://")
+        .and_then(|rest| rest.split_at_checked(rest.find('/')?))
+        .with_context(|| format!("{url} is not http://ADDRESS/PATH"))?;
+    let answer = (|| {
+        let mut stream = netns::within(&host.network(), || TcpStream::connect(address))??;
+        stream.set_read_timeout(Some(ANSWER))?;
+        // HTTP/1.0: the answer is not chunked and ends with the connection.
+        write!(stream, "GET {path} HTTP/1.0\r\nHost: {address}\r\n\r\n")?;
+        let mut answer = Vec::new();
+        stream.read_to_end(&mut answer)?;
+        anyhow::Ok(String::from_utf8_lossy(&answer).into_owned())
+    })()
+    .with_context(|| url.to_owned())?;
+    let (head, body) = answer
+        .split_once("\r\n\r\n")
+        .with_context(|| format!("{url}: {answer}"))?;
+    let status = head.split(' ').nth(1).unwrap_or_default();
+    ensure!(status.starts_with('2'), "{url}: {answer}");
+    Ok(body.to_owned())
 }

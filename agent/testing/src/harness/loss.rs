@@ -16,6 +16,10 @@ use super::run;
 const LEAST_OVERHEAD: usize = 60;
 const MOST_OVERHEAD: usize = 180;
 
+/// Kind of the DATA's writer (RTPS 2.5, 9.3.1.2), behind UDP, RTPS header and INFO_TS, or behind these
+/// and INFO_DST.
+const NO_BUILT_IN_WRITER: &str = "@th,440,8 != 0xc2 @th,568,8 != 0xc2";
+
 /// Marks selected datagrams on their way from the socket to the interface.
 const MARK: u32 = 0x7232;
 
@@ -43,8 +47,9 @@ pub struct Counts {
 
 impl<'a> Loss<'a> {
     /// Drops `per_mille` of the datagrams from `host` to `receiver` that carry one unfragmented
-    /// sample of `stream`. Selects them by length and by port, excluding discovery. RustDDS
-    /// multicasts samples, the others send them to each reader.
+    /// sample of `stream`. Selects them by length, excluding discovery by port and by writer: Cyclone
+    /// DDS announces its participant on the port of samples, too. RustDDS multicasts samples, the
+    /// others send them to each reader.
     pub fn of_samples(
         host: &'a Namespace,
         receiver: &Namespace,
@@ -53,7 +58,8 @@ impl<'a> Loss<'a> {
     ) -> Result<Loss<'a>> {
         let base = 7400 + 250 * u32::from(stream.domain);
         let datagrams = format!(
-            "ip daddr {{ {}, 239.255.0.1 }} udp dport != {{ {base}, {}, {}, {}, {} }} udp length {}-{}",
+            "ip daddr {{ {}, 239.255.0.1 }} udp dport != {{ {base}, {}, {}, {}, {} }} udp length {}-{} \
+             {NO_BUILT_IN_WRITER}",
             receiver.address(),
             base + 10,
             base + 12,

@@ -2,7 +2,7 @@
 //! cgroup for its processes.
 
 use std::net::Ipv4Addr;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Once;
 use std::sync::atomic::{AtomicU16, Ordering};
 
@@ -124,8 +124,13 @@ impl Namespace {
     /// Returns the command prefix that runs a program on this host's network but outside of its
     /// cgroup.
     pub fn outside(&self) -> [String; 2] {
-        let network = format!("--net=/run/netns/{}", self.name);
+        let network = format!("--net={}", self.network().display());
         ["nsenter".to_owned(), network]
+    }
+
+    /// Returns the file of its network namespace.
+    pub fn network(&self) -> PathBuf {
+        Path::new("/run/netns").join(&self.name)
     }
 
     fn create(role: &str, subnet: u16, host: u8, above: Option<&Cgroup>) -> Result<Namespace> {

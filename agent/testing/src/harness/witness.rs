@@ -69,7 +69,7 @@ impl Witness {
 
     /// Starts as [`Witness::start`] does, on a host's network.
     pub fn start_on(host: &Namespace, configuration: &str) -> Result<Witness> {
-        let network = PathBuf::from(format!("/run/netns/{}", host.name()));
+        let network = host.network();
         Witness::start_in(Some(network), configuration)
     }
 

@@ -40,7 +40,7 @@ fn fragment(talker: &Talker, number: u32, start: u32, size: u16) -> Vec<u8> {
 /// Returns the receive buffer errors of a host, over IPv4 and over IPv6.
 fn full_buffers(host: &Namespace) -> (u64, u64) {
     let read = |path: &str| std::fs::read_to_string(format!("/proc/thread-self/net/{path}"));
-    let (v4, v6) = netns::within(&forged::path(host), || {
+    let (v4, v6) = netns::within(&host.network(), || {
         (read("snmp").unwrap(), read("snmp6").unwrap())
     })
     .unwrap();
@@ -284,7 +284,7 @@ fn send_at_once(
 ) -> (Sent, Sent) {
     let (mut sent, mut got) = (Sent::new(), Sent::new());
     std::thread::scope(|scope| {
-        let path = forged::path(host);
+        let path = host.network();
         let mut writers = Vec::new();
         for (mut talker, writer) in talkers {
             let noise = netns::within(&path, || UdpSocket::bind("127.0.0.1:0").unwrap()).unwrap();

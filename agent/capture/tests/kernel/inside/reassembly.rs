@@ -4,7 +4,7 @@ use super::*;
 
 /// Sets a host's reassembly timeout to a second.
 fn hurry(host: &Namespace) {
-    netns::within(&forged::path(host), || {
+    netns::within(&host.network(), || {
         for path in ["ipv4/ipfrag_time", "ipv6/ip6frag_time"] {
             std::fs::write(format!("/proc/sys/net/{path}"), "1").unwrap();
         }
@@ -89,7 +89,7 @@ fn one_that_too_many_others_have_overtaken_is_named_when_it_is_given_up() {
     let link = Link::new().unwrap();
     hurry(&link.monitor);
     let limit = || std::fs::write("/proc/sys/net/ipv4/ipfrag_max_dist", "2").unwrap();
-    netns::within(&forged::path(&link.monitor), limit).unwrap();
+    netns::within(&link.monitor.network(), limit).unwrap();
     let (mut talker, writer) = talker(8);
     observed
         .filter
@@ -141,7 +141,7 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
             std::fs::write(format!("/proc/sys/net/{family}_low_thresh"), "1").unwrap();
             std::fs::write(format!("/proc/sys/net/{family}_high_thresh"), bytes).unwrap();
         };
-        netns::within(&forged::path(&link.monitor), || limit("40000")).unwrap();
+        netns::within(&link.monitor.network(), || limit("40000")).unwrap();
         let some = talker.sent() + 1;
         for _ in 0..5 {
             sender.carry(&talker.sample(60_000)).unwrap();
@@ -161,7 +161,7 @@ fn fragments_that_the_kernel_has_no_memory_for_are_named_at_once() {
             (expected, 4),
             "{family}"
         );
-        netns::within(&forged::path(&link.monitor), || limit("4000000")).unwrap();
+        netns::within(&link.monitor.network(), || limit("4000000")).unwrap();
     }
 }
 

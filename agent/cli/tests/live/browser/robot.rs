@@ -2,7 +2,6 @@
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpStream;
-use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result};
@@ -98,7 +97,7 @@ impl Place {
     pub(crate) fn streams(&self) -> Result<usize> {
         let mut held = Vec::new();
         for _ in 0..STREAMS {
-            let path = Path::new("/run/netns").join(self.host.name());
+            let path = self.host.network();
             let connect = || TcpStream::connect("127.0.0.1:17401");
             let mut stream = netns::within(&path, connect)??;
             stream.set_read_timeout(Some(PATIENCE))?;

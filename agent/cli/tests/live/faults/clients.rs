@@ -13,7 +13,6 @@ use anyhow::{Result, anyhow};
 use ros2probe_capture::netns;
 
 use super::{API_PORT, METRICS_PORT};
-use ros2probe_testing::forged::path;
 use ros2probe_testing::harness::network::Namespace;
 
 /// Neither takes longer to answer or to be refused.
@@ -53,7 +52,7 @@ impl Doors {
     /// Those of an agent on a host, which `socket` and `token` open; connected to on that host.
     pub(super) fn new(host: &Namespace, socket: &Path, token: &'static str) -> Doors {
         Doors {
-            network: path(host),
+            network: host.network(),
             address: host.address(),
             socket: socket.to_owned(),
             token,

@@ -16,7 +16,6 @@ use super::clients::{Asker, Clients, Doors, answer};
 use super::memory::{Breathing, NOBODY};
 use super::unit::{Allowance, Confined, mebibytes};
 use super::{Scene, ask};
-use ros2probe_testing::forged::path;
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
@@ -412,5 +411,7 @@ fn on_the_socket(doors: &Doors, method: &str, path: &str, body: &str) -> Result<
 /// Binds the socket that receives the storm.
 fn sink(host: &Namespace) -> Result<UdpSocket> {
     let address = (host.address(), NOBODY);
-    Ok(netns::within(&path(host), || UdpSocket::bind(address))??)
+    Ok(netns::within(&host.network(), || {
+        UdpSocket::bind(address)
+    })??)
 }

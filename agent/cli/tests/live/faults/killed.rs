@@ -15,7 +15,7 @@ use serde_json::Value;
 
 use super::{Counted, PATIENCE, Scene, ask, launch};
 use ros2probe_testing::forged::storm::Dice;
-use ros2probe_testing::forged::{Carrier as _, Sender, Talker, path};
+use ros2probe_testing::forged::{Carrier as _, Sender, Talker};
 use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::bpf::{self, Direction, Object};
 use ros2probe_testing::harness::network::Link;
@@ -245,7 +245,7 @@ fn until(
     let nodes = page.labels_of("ros2_node_info", "ros_node");
     ensure!(nodes.contains("/robot"), "names are lost: {nodes:?}");
     let ask = |method: &str, path: &str, body: &str| -> Result<(u16, Value)> {
-        let mut stream = netns::within(&self::path(host), || {
+        let mut stream = netns::within(&host.network(), || {
             std::net::TcpStream::connect(("127.0.0.1", super::API_PORT))
         })??;
         ask(&mut stream, method, path, body)
@@ -303,7 +303,7 @@ fn kill(mut process: Process, link: &Link) -> Result<usize> {
         }
     }
     wait_until("no packet socket", || {
-        let table = netns::within(&path(&link.robot), || {
+        let table = netns::within(&link.robot.network(), || {
             fs::read_to_string("/proc/thread-self/net/packet")
         })??;
         Ok(table.lines().count() == 1)

@@ -12,7 +12,6 @@ use anyhow::{Result, anyhow, ensure};
 
 use super::{API_PORT, Counted, METRICS_PORT, Scene};
 use ros2probe_capture::netns;
-use ros2probe_testing::forged::path;
 use ros2probe_testing::harness::agent::ON_THE_WIRE;
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::soak::{long, outcome};
@@ -39,7 +38,7 @@ struct Receiver {
 impl Receiver {
     /// Takes connections, and gives each `answer` again and again, or nothing at all.
     fn start(host: &Namespace, answer: Option<Vec<u8>>) -> Result<Receiver> {
-        let listener = netns::within(&path(host), || TcpListener::bind("127.0.0.1:0"))??;
+        let listener = netns::within(&host.network(), || TcpListener::bind("127.0.0.1:0"))??;
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
         let (met, stop) = (Arc::<AtomicUsize>::default(), Arc::<AtomicBool>::default());
