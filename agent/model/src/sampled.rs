@@ -424,7 +424,7 @@ impl Sampled {
 
     /// Returns the bit of a number relative to `next`.
     fn bit(&self, number: SequenceNumber, next: SequenceNumber) -> Option<u128> {
-        let below = next.0.checked_sub(number.0)?.checked_sub(1)?;
+        let below = (number < next).then(|| next - number.next())?;
         1_u128.checked_shl(u32::try_from(below).ok()?)
     }
 

@@ -128,7 +128,7 @@ impl Message {
             )
             .end();
         let (reader, writer) = (SUBSCRIPTIONS_READER, EntityId::SEDP_SUBSCRIPTIONS_WRITER);
-        let numbers = [number(SequenceNumber(1)); 2].concat();
+        let numbers = [number(SequenceNumber::FIRST); 2].concat();
         let heartbeat = [&reader.0[..], &writer.0, &numbers, &1u32.to_le_bytes()];
         self.data(reader, writer, 1, &payload).submessage(
             SubmessageId::HEARTBEAT,

@@ -143,7 +143,7 @@ impl Session {
     /// Packets of a conversation without losses, with requests of maximal size.
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
-        let first = SequenceNumber(1);
+        let first = SequenceNumber::FIRST;
         let full = || (first, first.until(first + MOST_NUMBERS));
         let mut plan = vec![
             self.to_discovery("introduction", self.message().announce(self.local)),

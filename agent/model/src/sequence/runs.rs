@@ -104,7 +104,7 @@ impl Sequence {
         let Some((first, _)) = run.numbers.first() else {
             return run;
         };
-        let jump = first.0.checked_sub(self.next.0);
+        let jump = (*first >= self.next).then(|| *first - self.next);
         // A run of only a few samples has no losses far from it.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,

@@ -62,7 +62,7 @@ impl UnconfirmedRun {
             return (false, false);
         }
         let last = numbers.last().map(|(last, _)| *last);
-        let opens = last.is_none_or(|last| last.0.abs_diff(number.0) > FAR);
+        let opens = last.is_none_or(|last| last.distance(number) > FAR);
         if opens {
             self.run.numbers.clear();
             self.evidence = 0;
@@ -94,7 +94,7 @@ impl UnconfirmedRun {
     /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
         let last = self.run.numbers.last().filter(|_| self.evidence > 0);
-        last.is_some_and(|(last, _)| *last < live && last.0.abs_diff(number.0) <= FAR)
+        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= FAR)
     }
 
     pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
