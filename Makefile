@@ -5,11 +5,11 @@ SHELL := /bin/bash
 TARGET := $(abspath $(or $(CARGO_TARGET_DIR),target))
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo -E)
 CORPUS := $(abspath $(or $(ROS2PROBE_FIXTURES),../shared/fixtures))
-# What is shipped for this machine.
+# The released target for this machine.
 SHIPPED := $(shell uname -m)-unknown-linux-musl
 HOST := $(shell rustc -vV 2>/dev/null | sed -n 's/^host: //p' | tr 'a-z-' 'A-Z_')
 
-# Nothing here is optimized or hidden from Miri: few random cases, and its own directory.
+# Miri runs unoptimized code: few random cases, and a separate build directory.
 MIRI := MIRIFLAGS="-Zmiri-strict-provenance -Zmiri-disable-isolation $$MIRI_MORE" PROPTEST_CASES=4 \
     CARGO_TARGET_DIR=$(TARGET)/miri cargo "+$$(.ci/prerequisites.sh --nightly)" miri test
 # Floods and tests that change every byte would take hours under Miri, and queues wake their readers
@@ -23,9 +23,9 @@ SOURCES := https://github.com/ros2probe/ros2probe/blob/main
 # Tests and demo select the whole workspace: a part of it has other features, and its dependencies
 # would be built once more.
 
-# Node of target/tools is there only where the system's is too old for the page's tests.
+# target/tools has Node only if the system's is too old for the page's tests.
 export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
-# Comes with Rust and links for both architectures: no cross toolchain.
+# A part of Rust that links for both architectures: no cross toolchain is needed.
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER := rust-lld
 # The tests make network namespaces: build as the user, run the tests as root.
 ifneq ($(SUDO),)
@@ -35,7 +35,7 @@ endif
 help: ## this list
 	@sed -n 's/^\([a-z0-9-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 16
 
-demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it by itself (needs root)
+demo: ## watch a small robot, no ROS needed; DEMO_SECONDS=N ends it (needs root)
 	@.ci/prerequisites.sh demo
 	cargo build --workspace --bin rp --example robot --example demo
 	@$(SUDO) $(TARGET)/debug/examples/demo $(if $(DEMO_SECONDS),--seconds $(DEMO_SECONDS))
@@ -102,10 +102,10 @@ dist: ## release both binaries, packages, bills of materials and checksums into 
 	packaging/dist.sh
 	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored
 
-distcheck: ## build what make dist has built again, elsewhere, and compare every byte
+distcheck: ## repeat the build of make dist in another directory and compare every byte
 	packaging/dist.sh --again
 
-bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
+bench: ## benchmarks, and the cost of the agent and of a subscriber (needs root)
 	@.ci/prerequisites.sh test dist
 	cargo bench --workspace
 	@$(MAKE) --no-print-directory peers
@@ -113,7 +113,7 @@ bench: ## benchmarks, and what observing costs beside a subscriber (needs root)
 	cargo build --release --package ros2probe --example robot --example workloads
 	@$(SUDO) $(TARGET)/release/examples/workloads $(BENCH_OPTIONS)
 
-soak: ## an hour of a changing graph, and faults, on what is shipped; SOAK_SECONDS=N; results in target/soak (needs root)
+soak: ## an hour of a changing graph and faults with the released binary; SOAK_SECONDS=N; results in target/soak (needs root)
 	@.ci/prerequisites.sh test dist
 	cargo build --release --package ros2probe --bin rp --target $(SHIPPED)
 	@mkdir -p $(TARGET)/soak && rm -f $(TARGET)/soak/faults.md
@@ -132,7 +132,7 @@ fuzz: ## run every fuzz target for FUZZ_SECONDS (60)
 	        -max_total_time=$(or $(FUZZ_SECONDS),60) || exit 1; \
 	done) || exit 1; done
 
-miri: ## rings and the walk under Miri, which finds what the compiler may not assume
+miri: ## rings and the walk under Miri, which finds undefined behaviour
 	@.ci/prerequisites.sh miri
 	@$(MIRI) --package ros2probe-wire --lib -- $(MIRI_WIRE)
 	@$(MIRI) --package ros2probe-capture --lib -- $(MIRI_CAPTURE)
@@ -145,7 +145,7 @@ book: ## the documentation as a website in target/book, with its links, sizes an
 	@# Links out of the book lead to the repository.
 	sed -i -E 's#href="\.\./([^"#]*)\.html#href="$(SOURCES)/\1.md#g; s#href="\.\./#href="$(SOURCES)/#g' $(TARGET)/book/*.html
 
-deny: ## licences, sources, and known faults of dependencies; DENY=bans licenses sources: without network
+deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans licenses sources: without network
 	@.ci/prerequisites.sh deny
 	cargo deny check $(DENY)
 

@@ -278,7 +278,7 @@ pub struct Scratch {
     pub pending: Record,
     /// How many of `records` are filled.
     pub count: u32,
-    /// The capture is owed to an unclassified writer.
+    /// The capture is needed only for an unclassified writer.
     pub unknown: u32,
     /// Host hook: a copy of the datagram was captured just before.
     pub repeated: u32,
@@ -467,14 +467,14 @@ pub fn count_outside(counter: Counter, by: u64) {
 #[inline(always)]
 pub fn add(to: *mut u64, by: u64) {
     // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
-    // every BPF verifier knows.
+    // every BPF verifier accepts.
     unsafe {
         asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
     }
 }
 
-/// Returns the same number with bounds hidden from the optimizer, so that a mask that follows is
-/// kept and every verifier sees it.
+/// Returns the same number with its bounds hidden from the optimizer, so that a mask that follows
+/// is kept and every verifier sees it.
 #[inline(always)]
 pub fn opaque(value: u32) -> u64 {
     let mut value = u64::from(value);

@@ -93,7 +93,7 @@ fn load_anywhere<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
     Some(unsafe { value.assume_init() })
 }
 
-/// Returns whether the current packet is an IP fragment.
+/// Returns whether the current packet is an IP fragment; `None` without working memory.
 #[inline(always)]
 pub fn is_fragment(slot: u32) -> Option<bool> {
     Some(scratch(slot)?.get().packet.fragmented != 0)

@@ -154,7 +154,7 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
     if parsed.is_none() || this.protocol != UDP {
         return None;
     }
-    // A first fragment of a datagram that became complete does not look like one any more.
+    // After reassembly, a first fragment has lost its offset and the flag for more fragments.
     if why != Why::GaveUp && (this.offset != 0 || this.more == 0) {
         return None;
     }
@@ -211,7 +211,8 @@ fn fragment(skb: u64, why: Why) -> Option<()> {
 }
 
 /// Returns whether the namespace has no memory for further fragments: the kernel's own condition,
-/// with a margin for what changed since the kernel tested it.
+/// with a margin for what changed since the kernel tested it. `None` if a kernel structure cannot
+/// be read.
 #[inline(always)]
 fn is_full(skb: u64, ipv6: bool) -> Option<bool> {
     let device: u64 = member(skb, Layout::BufferDevice)?;

@@ -140,7 +140,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
     };
     let scratch = scratch.get();
     if scratch.walk.record.datagram != token {
-        // Preempted: the slot holds another datagram by now.
+        // Another run took the slot after a preemption, so it holds another datagram.
         count_outside(Counter::SocketFullUnseen, 1);
         return 0;
     }

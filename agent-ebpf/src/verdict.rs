@@ -286,13 +286,14 @@ fn unknown(slot: u32, scratch: &mut Scratch, key: [u32; 4]) -> u32 {
     progress::ON
 }
 
-/// Charges bytes of unclassified traffic to the capture budget.
+/// Charges bytes of unclassified traffic to the capture budget; returns whether any of it was left.
 #[inline(always)]
 pub fn charge(len: u32) -> bool {
     spend(Budget::CaptureBytes, len)
 }
 
-/// Charges a budget if any of it is left. CPUs that race may overdraw it by a datagram.
+/// Charges a budget if any of it is left, and returns whether it was. CPUs that race may overdraw
+/// it by a datagram.
 #[inline(always)]
 pub fn spend(budget: Budget, amount: u32) -> bool {
     let Some(budget) = BUDGET.get(budget as u32) else {

@@ -92,7 +92,7 @@ function App() {
     <main id="main" tabindex="-1" ref=${main}>
       ${state.batches > 0 || route?.view === 'token'
         ? html`<${View} key=${place} route=${route} />`
-        : html`<h1 tabindex="-1">${refused ? 'The agent asks for a token' : 'Connecting …'}</h1>`}
+        : html`<h1 tabindex="-1">${refused ? 'The agent requires a token' : 'Connecting …'}</h1>`}
     </main>
     <${News} />
     ${dialog === 'search' && html`<${Search} close=${() => show(null)} />`}

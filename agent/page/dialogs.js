@@ -147,7 +147,7 @@ export function Token({ close }) {
     <p>${access
       ? html`This address grants the right <strong>${access}</strong>. Live messages, recordings and
         snapshots need <strong>all</strong>.`
-      : 'The agent asks for a token at this address.'}</p>
+      : 'This address requires a token.'}</p>
     <p>Run <code>rp page</code> on the robot and open the address it prints, or paste the token here.
       It stays in this tab and is sent in a header only.</p>
     ${stream.problem && html`<p><${Mark} severity="warning" /> ${stream.problem.message}</p>`}

@@ -129,7 +129,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The next `len` bytes.
+    /// Reads the next `len` bytes.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -143,7 +143,7 @@ impl<'a> Cursor<'a> {
         Ok(head)
     }
 
-    /// The next `N` bytes as an array.
+    /// Reads the next `N` bytes as an array.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -157,7 +157,7 @@ impl<'a> Cursor<'a> {
         Ok(*head)
     }
 
-    /// A cursor over the next `len` bytes; this one moves past them.
+    /// Returns a cursor over the next `len` bytes, and moves this one past them.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -170,7 +170,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// One octet.
+    /// Reads one octet.
     ///
     /// # Errors
     /// [`Reason::Truncated`] at the end.
@@ -178,7 +178,7 @@ impl<'a> Cursor<'a> {
         Ok(u8::from_ne_bytes(self.array(what)?))
     }
 
-    /// Two octets in the cursor's byte order.
+    /// Reads two octets in the cursor's byte order.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -190,7 +190,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Four octets in the cursor's byte order.
+    /// Reads four octets in the cursor's byte order.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -202,7 +202,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Four octets, signed.
+    /// Reads four octets as a signed number.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.
@@ -210,7 +210,7 @@ impl<'a> Cursor<'a> {
         Ok(self.u32(what)?.cast_signed())
     }
 
-    /// Eight octets in the cursor's byte order.
+    /// Reads eight octets in the cursor's byte order.
     ///
     /// # Errors
     /// [`Reason::Truncated`] when fewer remain.

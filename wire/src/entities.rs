@@ -339,7 +339,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn both_layouts_come_back_and_are_told_apart(
+        fn both_layouts_are_restored_and_distinguished(
             prefix in any::<[u8; 12]>(),
             nodes in prop::collection::vec(node(), 0..5),
             long in any::<bool>(),

@@ -6,7 +6,7 @@
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
 
-/// Bytes of a datagram in one piece. The largest UDP payload (65,507) comes in four.
+/// Bytes of a datagram in one piece. The largest UDP payload (65,507) needs four.
 pub const PIECE_BYTES: u32 = 16_384;
 /// Sockets that the hook remembers.
 pub const SOCKET_CAPACITY: u32 = 4_096;

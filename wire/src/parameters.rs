@@ -73,8 +73,8 @@ impl ParameterId {
         self.0 & 0x8000 != 0
     }
 
-    /// Returns the must-understand bit: a reader that does not know the parameter should ignore the
-    /// list.
+    /// Returns whether the must-understand bit is set: a reader that does not know the parameter
+    /// should ignore the list.
     #[must_use]
     pub const fn must_understand(self) -> bool {
         self.0 & 0x4000 != 0

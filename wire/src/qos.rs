@@ -43,7 +43,7 @@ macro_rules! kind {
                 }
             }
 
-            /// The word ROS has for it, or `UNKNOWN`.
+            /// Returns ROS's word for the value, or `UNKNOWN`.
             #[must_use]
             pub const fn label(self) -> &'static str {
                 match self.name() {

@@ -128,7 +128,7 @@ impl RtpsDuration {
         Self::Finite(Duration::from_nanos(nanoseconds))
     }
 
-    /// Returns the duration; `None` if it never ends.
+    /// Returns the duration; `None` if it is infinite.
     #[must_use]
     pub const fn finite(self) -> Option<Duration> {
         match self {

@@ -145,8 +145,8 @@ impl Walk {
         self.record.datagram_len = datagram_len as u16;
     }
 
-    /// Returns whether `len` bytes at `offset` lie in the datagram and among the first `present`
-    /// bytes.
+    /// Returns where `len` bytes at `offset` lie: among the first `present` bytes, later in the
+    /// datagram, or outside of it.
     #[inline(always)]
     const fn reach(&self, offset: u32, len: u32, present: u32) -> Reach {
         // Offsets stay below 2^27: a 16-bit length from a position below `MAX_MESSAGE`.

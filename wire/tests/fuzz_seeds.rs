@@ -1,5 +1,5 @@
 //! Runs the fuzz targets' entry functions over their seeds and all truncations of them, so that
-//! their checks run without a fuzzer. Of the seeds, `found-*` are what fuzzing came upon: kept for
+//! their checks run without a fuzzer. Of the seeds, `found-*` were found by fuzzing: kept for
 //! what they reach, and taken as they are.
 
 #![expect(

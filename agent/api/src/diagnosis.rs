@@ -44,15 +44,15 @@ pub enum Diagnosis<'a> {
         /// GUID of the writer.
         writer: String,
         /// The nearest mismatch: an endpoint with other QoS (`qos`), of another `type`, or in
-        /// another `partition`; `nobody` if the topic has no reader at all.
+        /// another `partition`; `nobody` (no endpoint) if the topic has no reader.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
     UnfedSubscriber {
         /// GUID of the reader.
         reader: String,
-        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` if the topic has no writer
-        /// at all.
+        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` (no endpoint) if the topic
+        /// has no writer.
         reason: Cow<'static, str>,
     },
     /// One node appears in several domains on one machine.

@@ -219,7 +219,7 @@ pub enum ReasonCode {
     SameProcess,
     /// Messages use Cyclone DDS's iceoryx, which cannot be observed.
     Iceoryx,
-    /// No problem is known, but no message has been seen at all or recently.
+    /// No problem is known, but no message was ever seen, or none recently.
     Quiet,
 }
 

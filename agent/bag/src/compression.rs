@@ -59,7 +59,7 @@ impl Compression {
         }
     }
 
-    /// Parses that name.
+    /// Parses the name of a compression; `None` for an unknown one.
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         let all = [Self::None, Self::Lz4, Self::Zstd];
@@ -94,7 +94,7 @@ impl Compression {
         if out.len() as u64 > limit {
             return Err(io::Error::new(
                 io::ErrorKind::InvalidData,
-                "is larger than it says",
+                "decompresses to more than its declared size",
             ));
         }
         Ok(out)
@@ -166,7 +166,7 @@ impl<R: Read> Read for ProgressReader<'_, R> {
             return Ok(0);
         }
         if self.progress.is_given_up() {
-            self.failed = Some(io::Error::other("given up"));
+            self.failed = Some(io::Error::other("abandoned"));
             return Ok(0);
         }
         loop {
@@ -226,7 +226,7 @@ impl<W: Write> SizedFrame<W> {
                 Some(descriptor) if *descriptor & Self::OTHERWISE == 0 => {
                     *descriptor |= Self::SIZE_FLAG;
                 }
-                _ => return Err(io::Error::other("zstd began a frame in another form")),
+                _ => return Err(io::Error::other("zstd wrote an unexpected frame header")),
             }
             self.inner.write_all(&self.head)?;
             self.inner.write_all(&self.size.to_le_bytes())?;
@@ -308,7 +308,7 @@ mod tests {
         for compression in [Compression::None, Compression::Lz4, Compression::Zstd] {
             let source = File::open(&path).unwrap();
             let error = compression.compress_file(&source, &into, &progress);
-            assert_eq!(error.unwrap_err().to_string(), "given up");
+            assert_eq!(error.unwrap_err().to_string(), "abandoned");
         }
     }
 }

@@ -291,7 +291,8 @@ impl FileWriter {
         &self.statistics.channel_message_counts
     }
 
-    /// Returns the earliest and latest log time, including waiting messages.
+    /// Returns the earliest and latest log time, including waiting messages; `None` without a
+    /// message.
     pub(super) fn times(&self) -> Option<(u64, u64)> {
         let written = self.statistics.message_count > 0;
         let written = written.then_some((self.statistics.start, self.statistics.end));

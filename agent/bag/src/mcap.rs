@@ -417,20 +417,21 @@ pub fn metadata_index(out: &mut Vec<u8>, offset: u64, length: u64, name: &str) {
     });
 }
 
-/// Returns offset and length, given the content of such a record.
+/// Parses a metadata index: offset and length of the record. `None` if it is malformed.
 #[must_use]
 pub fn read_metadata_index(content: &[u8]) -> Option<(u64, u64)> {
     let mut cursor = Cursor(content);
     Some((cursor.u64()?, cursor.u64()?))
 }
 
-/// Returns the profile, given the first record's content.
+/// Parses the header and returns its profile. `None` if it is malformed.
 #[must_use]
 pub fn read_header(content: &[u8]) -> Option<String> {
     Cursor(content).text().map(str::to_owned)
 }
 
-/// Returns the compression and the available records, given the content of a truncated chunk.
+/// Parses a truncated chunk: its compression and the available records. `None` if it ends before
+/// them.
 #[must_use]
 pub fn cut_chunk(content: &[u8]) -> Option<(&str, &[u8])> {
     let mut cursor = Cursor(content);

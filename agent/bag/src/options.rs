@@ -175,12 +175,12 @@ impl Storage {
         let keys: Keys = serde_yaml::from_str(yaml).map_err(|error| wrong(error.to_string()))?;
         for (key, value) in keys.needed() {
             if value {
-                let why = "is always written: without it a bag cannot be played or seen through";
-                return Err(wrong(format!("`{key}: true`: that part of a file {why}")));
+                let why = "is always written, because readers need it";
+                return Err(wrong(format!("`{key}: true`: this part of a file {why}")));
             }
         }
         if keys.force_compression {
-            let why = "a chunk that compression makes larger is stored as it is";
+            let why = "a chunk that would grow is stored uncompressed";
             return Err(wrong(format!("`forceCompression: true`: {why}")));
         }
         let compression = match keys.compression.as_deref() {
@@ -190,7 +190,7 @@ impl Storage {
             Some("Zstd") => Compression::Zstd,
             Some(other) => {
                 return Err(wrong(format!(
-                    "compression: `{other}` is none of None, Lz4, Zstd"
+                    "compression: `{other}` must be None, Lz4 or Zstd"
                 )));
             }
         };
@@ -199,7 +199,7 @@ impl Storage {
             Some(other) => {
                 let levels = "Fastest, Fast, Default, Slow, Slowest";
                 return Err(wrong(format!(
-                    "compressionLevel: `{other}` is none of {levels}"
+                    "compressionLevel: `{other}` must be one of {levels}"
                 )));
             }
         }

@@ -138,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn a_history_that_nobody_announced_is_unknown() {
+    fn a_history_that_was_not_announced_is_unknown() {
         let publisher = Qos {
             history: None,
             ..publisher()

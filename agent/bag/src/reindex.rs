@@ -365,7 +365,7 @@ impl fmt::Display for FileReport {
             Found::Complete => write!(f, "{name}: complete, {messages} messages"),
             Found::NotMcap => write!(
                 f,
-                "{name}: not an MCAP file, left as it is and out of the bag"
+                "{name}: not an MCAP file; left unchanged, not in the bag"
             ),
             Found::Unfinished {
                 salvaged,
@@ -373,16 +373,19 @@ impl fmt::Display for FileReport {
                 kept,
                 unreadable_chunks,
             } => {
-                write!(f, "{name}: was not finished, is now, {messages} messages")?;
+                write!(
+                    f,
+                    "{name}: was unfinished, now complete, {messages} messages"
+                )?;
                 if *salvaged > 0 {
                     write!(f, ", {salvaged} of them from a chunk that was cut")?;
                 }
                 if *unreadable_chunks > 0 {
-                    write!(f, ", {unreadable_chunks} chunks cannot be looked into")?;
+                    write!(f, ", {unreadable_chunks} chunks are unreadable")?;
                 }
                 match kept {
                     Some(kept) => {
-                        write!(f, ", {cut} bytes were no whole record: kept in {kept}")
+                        write!(f, ", {cut} bytes of an incomplete record kept in {kept}")
                     }
                     None => Ok(()),
                 }

@@ -310,8 +310,8 @@ impl Writer {
         self.close_with(custom_data, |work| work.run().map(Some))
     }
 
-    /// Does the same as [`Self::close`], compressing files with `compress`. If it returns `None`,
-    /// the file stays uncompressed, as [`super::reindex`] accepts it.
+    /// Does the same as [`Self::close`], compressing files with `compress`. If `compress` returns
+    /// `None`, the file stays uncompressed, which [`super::reindex`] accepts.
     pub fn close_with(
         mut self,
         custom_data: BTreeMap<String, String>,

@@ -69,7 +69,8 @@ pub fn short_name(path: &str) -> &str {
         .unwrap_or("/")
 }
 
-/// Returns the shortened id of `docker-<id>.scope`, `cri-containerd-<id>.scope` or `<id>`.
+/// Returns the shortened id of `docker-<id>.scope`, `cri-containerd-<id>.scope` or `<id>`; `None`
+/// for other names.
 fn container(part: &str) -> Option<&str> {
     let name = part.strip_suffix(".scope").unwrap_or(part);
     let id = name.rsplit(['-', ':']).next()?;

@@ -290,7 +290,7 @@ impl Filter {
             .collect()
     }
 
-    /// Removes and returns the oldest record.
+    /// Removes and returns the oldest record; `None` if the ring is empty.
     pub fn next_record(&mut self) -> Option<Record> {
         let item = self.records.next()?;
         Record::read_from_bytes(&item).ok()
@@ -298,7 +298,7 @@ impl Filter {
 }
 
 impl FilterError {
-    /// Maps the loader's error, telling a missing privilege apart from a defect of the object.
+    /// Maps the loader's error, and distinguishes a missing privilege from a defect of the object.
     fn load(error: EbpfError) -> Self {
         if let Some(error) = not_permitted(&error) {
             Self::NotPermitted(error)

@@ -131,7 +131,8 @@ impl HostTap {
         self.cgroup.is_whole_host()
     }
 
-    /// Returns which losses behind the hook can be named.
+    /// Returns the losses behind the hook that this kernel can attribute; `None` if no tracepoint
+    /// program is attached.
     #[must_use]
     pub fn abilities(&self) -> Option<&Abilities> {
         Some(self.filter().tracepoints()?.abilities())

@@ -99,7 +99,7 @@ impl Interfaces {
         self.known.values()
     }
 
-    /// Returns the interface with this index.
+    /// Returns the interface with this index; `None` if it is unknown.
     #[must_use]
     pub fn by_index(&self, index: u32) -> Option<&Interface> {
         self.known.get(&index)

@@ -151,14 +151,14 @@ impl KernelTypes {
             })
     }
 
-    /// Returns the size of a structure in bytes.
+    /// Returns the size of a structure in bytes; `None` if the kernel does not have it.
     #[must_use]
     pub fn size(&self, structure: &str) -> Option<u32> {
         let head = self.named(structure, &[kind::STRUCT]).next()?;
         Some(head.size)
     }
 
-    /// Returns the value of an enumerator.
+    /// Returns the value of an enumerator; `None` if the kernel does not have it.
     #[must_use]
     pub fn enumerator(&self, enumeration: &str, name: &str) -> Option<u32> {
         self.named(enumeration, &[kind::ENUM]).find_map(|head| {
@@ -170,7 +170,8 @@ impl KernelTypes {
         })
     }
 
-    /// Returns bit offset and type id of a member, searching anonymous structures and unions.
+    /// Returns bit offset and type id of a member, searching anonymous structures and unions;
+    /// `None` if none has this name.
     fn member(&self, of: Head, name: &str, depth: u32) -> Option<(u32, u32)> {
         (0..of.count()).find_map(|index| {
             let at = of.at + Head::LEN + 12 * index;
@@ -225,7 +226,7 @@ fn head(bytes: &[u8], at: usize) -> Option<Head> {
     })
 }
 
-/// Reads a word in the kernel's own byte order, in which BTF is written.
+/// Reads a word in the kernel's own byte order, in which BTF is written; `None` beyond the end.
 fn word(bytes: &[u8], at: usize) -> Option<u32> {
     let bytes = bytes.get(at..)?.first_chunk()?;
     Some(u32::from_ne_bytes(*bytes))

@@ -202,7 +202,8 @@ impl LiveSource {
         !self.wires.is_empty()
     }
 
-    /// Returns why the host hook is not used although it would show more, as a sentence.
+    /// Returns why the host hook is not used although it would show more, as a sentence; `None` if
+    /// it is used, or not configured.
     #[must_use]
     pub fn without_host(&self) -> Option<&str> {
         self.without_host.as_deref()
@@ -237,7 +238,7 @@ impl LiveSource {
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
-            // News seldom comes alone. After a timeout it has had time to accumulate.
+            // Packets arrive in bursts. After a timeout some have had time to accumulate.
             std::thread::sleep(if observer.wants_payloads() {
                 GATHER_PAYLOADS
             } else {
@@ -286,7 +287,7 @@ impl LiveSource {
         Ok(())
     }
 
-    /// Passes what the model wants of shared memory to its readers, ten times a second.
+    /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
         if now.wrapping_sub(self.wanted_asked) < TENTH {
             return;
@@ -456,20 +457,22 @@ impl LiveSource {
         self.exact.as_ref().map(Uprobe::facts)
     }
 
-    /// Returns the number of messages captured whole in the processes that sent them.
+    /// Returns the number of messages captured whole in the processes that sent them; `None`
+    /// without uprobes.
     #[must_use]
     pub fn messages_of_processes(&self) -> Option<u64> {
         Some(self.exact.as_ref()?.reader().datagrams())
     }
 
     /// Returns why messages are not read in their senders although that is configured, as a
-    /// sentence.
+    /// sentence; otherwise `None`.
     #[must_use]
     pub fn without_exact(&self) -> Option<&str> {
         self.without_exact.as_deref()
     }
 
-    /// Returns which observed objects are gone, as a sentence: nothing is seen there.
+    /// Returns which observed object is gone, as a sentence; `None` if all exist. Nothing is seen
+    /// there.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);

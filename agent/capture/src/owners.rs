@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn drops_are_told_where_the_kernel_counts_them() {
+    fn drops_are_reported_where_the_kernel_counts_them() {
         let known = host::Owner {
             drops: 7,
             drops_known: 1,

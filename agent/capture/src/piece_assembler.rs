@@ -29,8 +29,8 @@ struct Open {
 }
 
 impl PieceAssembler {
-    /// Accepts a piece and the bytes that follow it; returns the complete datagram with its first
-    /// piece.
+    /// Accepts a piece and the bytes that follow it; returns the datagram with its first piece if
+    /// it is complete now.
     pub fn piece<'a>(&mut self, piece: &Piece, bytes: &'a [u8]) -> Option<(Piece, Cow<'a, [u8]>)> {
         let bytes = bytes.get(..piece.len as usize).unwrap_or_default();
         let end = piece.offset.checked_add(piece.len);

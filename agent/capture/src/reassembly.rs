@@ -235,7 +235,7 @@ impl Reassembly {
         ]
     }
 
-    /// Accepts a fragment; returns the datagram that it completes.
+    /// Accepts a fragment; returns the datagram if this fragment completes it.
     pub fn fragment(
         &mut self,
         at: Timestamp,

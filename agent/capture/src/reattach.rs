@@ -107,7 +107,7 @@ impl Drop for Reattach {
     fn drop(&mut self) {
         self.end = None;
         if let Some(thread) = self.thread.take() {
-            // It can only have ended; how does not matter any more.
+            // The thread has ended in any case; its result has no user.
             let _ = thread.join();
         }
     }
@@ -186,14 +186,14 @@ impl Follow {
     }
 }
 
-/// Returns the identity of an open directory.
+/// Returns the identity of an open directory; `None` if the kernel refuses to read it.
 #[must_use]
 pub fn of(directory: &File) -> Option<Identity> {
     let metadata = directory.metadata().ok()?;
     Some((metadata.dev(), metadata.ino()))
 }
 
-/// Returns the current identity of the directory at a path.
+/// Returns the current identity of the directory at a path; `None` if it does not exist.
 #[must_use]
 pub fn identity(path: &Path) -> Option<Identity> {
     let metadata = fs::metadata(path).ok()?;

@@ -273,7 +273,7 @@ mod tests {
     }
 
     #[test]
-    fn no_room_is_said_before_everything_of_its_time_or_later() {
+    fn no_room_is_reported_before_everything_of_its_time_or_later() {
         let mut order = ReorderBuffer::default();
         order.kernel(of_the_kernel(1, 5));
         order.kernel(of_the_kernel(2, 10));

@@ -303,12 +303,13 @@ impl Mapping {
 
 impl Drop for Mapping {
     fn drop(&mut self) {
-        // SAFETY: mapped by `new` with this length, and nothing borrows it any more.
+        // SAFETY: mapped by `new` with this length, and no borrow of it is left.
         unsafe { libc::munmap(self.start.as_ptr(), self.length) };
     }
 }
 
-/// Returns the page size: 4 KiB, but 16 on a Raspberry Pi 5 and 64 on some servers.
+/// Returns the page size in bytes: 4 KiB, but 16 KiB on a Raspberry Pi 5 and 64 KiB on some
+/// servers.
 fn page_bytes() -> Option<usize> {
     // SAFETY: sysconf accesses no memory of this process.
     usize::try_from(unsafe { libc::sysconf(libc::_SC_PAGESIZE) }).ok()

@@ -141,7 +141,7 @@ impl Sockets {
             known.questions = known.questions.saturating_add(1);
             let owner = owners.remove(cookie);
             if owner.is_none() && known.owner.is_some() {
-                // No process has it open any more.
+                // The last process that held the socket has closed it.
                 *known = Known {
                     questions: MOST_QUESTIONS,
                     ..Known::default()
@@ -158,12 +158,13 @@ impl Sockets {
 }
 
 impl Known {
-    /// Returns whether some process may have it open.
+    /// Returns whether a process may hold the socket open.
     const fn may_be_open(&self) -> bool {
         self.owner.is_some() || self.questions < MOST_QUESTIONS
     }
 
-    /// Returns the drops of the socket beyond the attributed ones.
+    /// Returns the drops of the socket beyond the attributed ones; `None` if the kernel does not
+    /// count them.
     fn unnamed(&self, socket: &Socket) -> Option<u64> {
         let dropped = u64::from(self.owner.as_ref()?.drops?);
         Some(dropped.saturating_sub(socket.rcvbuf_errors))
@@ -229,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_that_nobody_holds_any_more_is_told_as_closed_and_not_asked_for_again() {
+    fn a_socket_without_a_holder_is_reported_as_closed_and_not_requested_again() {
         let mut observer = Observer::new(Settings::default());
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
         let met = sockets(&[1, 2], 0);

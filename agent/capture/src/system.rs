@@ -338,7 +338,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_that_is_created_ends_the_sleep_and_is_told_once() {
+    fn a_created_file_ends_the_sleep_and_is_reported_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut watch = DirectoryWatch::new().unwrap();
         watch.add(directory.path());

@@ -1,5 +1,5 @@
 //! One network namespace observed on its interfaces: packet socket, ring, kernel filter, and the
-//! way of their output to the model.
+//! path of their output to the model.
 //!
 //! Frames and records arrive through two rings, either of which may be faster; both are merged by
 //! time. Nothing is ever sent.
@@ -33,7 +33,7 @@ const STALLED_NANOSECONDS: u64 = 60_000_000;
 /// Most records read per round: several rings of the default size.
 const RECORDS_PER_ROUND: usize = 32_768;
 
-/// Why an interface cannot be observed any more.
+/// Why the interfaces of a namespace cannot be observed.
 #[derive(Debug, thiserror::Error)]
 pub enum WireTapError {
     /// The kernel filter failed.
@@ -154,8 +154,8 @@ impl WireTap {
         }
     }
 
-    /// Returns what is gone, as a sentence: the namespace, or an interface that the configuration
-    /// names.
+    /// Returns which object is gone, as a sentence: the namespace, or an interface that the
+    /// configuration names. `None` if all exist.
     #[must_use]
     pub fn gone(&self) -> Option<String> {
         if let (Some(path), true) = (&self.path, self.is_gone) {

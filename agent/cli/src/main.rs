@@ -50,7 +50,7 @@ fn main() -> ExitCode {
 fn check_config(file: &Path) -> Result<()> {
     let config = Config::load(file)?;
     println!(
-        "{} is good: {} watched",
+        "{} is valid: {} watched",
         file.display(),
         config.watches.len()
     );

@@ -4,8 +4,8 @@
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: only so many events of one name are kept per second, and the rest is one
-//! count. Seconds of robot events are those of the source's clock, so a capture gives the same
+//! Bursts are limited: of one name, at most [`MOST`] events per second are kept, and the others are
+//! counted. Seconds of robot events are those of the source's clock, so a capture gives the same
 //! events at any speed.
 //!
 //! A number belongs to one run of the agent. An event id also names the run, so that a position

@@ -17,7 +17,7 @@ use tracing_subscriber::{Layer as _, Registry, fmt, reload};
 #[derive(Debug)]
 pub(crate) struct Log {
     level: reload::Handle<EnvFilter, Registry>,
-    /// Whether `RUST_LOG` is set, which then stays in force.
+    /// Whether `RUST_LOG` is set, which then takes precedence.
     fixed: bool,
     lost: Arc<AtomicU64>,
 }

@@ -56,7 +56,8 @@ impl CaptureBell {
         }
     }
 
-    /// Descriptor that is readable after [`Self::ring`] until [`Self::silence`].
+    /// Descriptor that is readable after [`Self::ring`] until [`Self::silence`]. `None` without a
+    /// socket pair.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         Some(self.0.as_ref()?.descriptor())

@@ -301,7 +301,7 @@ pub(crate) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> serde_json::Result
     serde_json::from_slice(bytes)
 }
 
-/// Version at the start of a file; all versions begin with it.
+/// Version at the start of a file; all versions begin with it. `None` if it is unreadable.
 fn begins_with_version(bytes: &[u8]) -> Option<u32> {
     let rest = bytes.strip_prefix(b"{\"version\":")?;
     let digits = rest.iter().take_while(|byte| byte.is_ascii_digit());

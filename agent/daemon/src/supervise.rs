@@ -312,7 +312,8 @@ impl Surfaces {
 }
 
 impl Worker {
-    /// Starts the thread, already confined to its role; the caller can drop its own privileges.
+    /// Starts the thread, already confined to its role, so that the caller can drop its own
+    /// privileges.
     pub(crate) fn start(role: Role) -> Result<Self, SpawnError> {
         let (begin, begins) = oneshot::channel::<Run>();
         let (report, ended) = oneshot::channel();

@@ -149,7 +149,7 @@ impl InForce {
         patterns.filter(|pattern| pattern.contains('*'))
     }
 
-    /// The watch with this pattern and domain.
+    /// The watch with this pattern and domain. `None` if it does not exist.
     #[must_use]
     pub fn find(&self, pattern: &str, domain_id: Option<u32>) -> Option<&Entry> {
         let place = self.watchlist.position(pattern, domain_id.map(DomainId))?;

@@ -16,7 +16,7 @@ use crate::value::{Array, Items, Message, Scalar, ScalarKind, Scalars, Value};
 
 /// Every XCDR structure is aligned relative to the first byte behind this.
 const ENCAPSULATION: usize = 4;
-/// Padding of submessages in RTPS: most bytes behind the last field.
+/// Padding of submessages in RTPS: most bytes after the last field.
 const PADDING: usize = 3;
 
 /// Limits of one decoded message.
@@ -52,7 +52,7 @@ pub struct Decoded<'a> {
 /// Deviations that do not prevent a message from being shown.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Oddities {
-    /// Bytes behind the last field, more than padding.
+    /// Bytes after the last field, more than padding.
     pub trailing: usize,
     /// Strings that are not UTF-8 (UTF-16 for `wstring`).
     pub texts: usize,
@@ -82,7 +82,7 @@ pub enum DecodeError {
         name: &'static str,
     },
     /// The bytes are not a message of this type.
-    #[error("{0} (counted behind the encapsulation header)")]
+    #[error("{0} (offset after the encapsulation header)")]
     Malformed(#[from] WireError),
     /// The message has more or deeper values than the limits allow.
     #[error("more than {0}")]
@@ -180,13 +180,13 @@ impl<'a> Reader<'a> {
     fn structure(&self, name: &TypeName) -> Result<&'a Structure, DecodeError> {
         self.message_type
             .structure(name)
-            .ok_or(DecodeError::Limit("the definition tells"))
+            .ok_or(DecodeError::Limit("the definition describes"))
     }
 
     fn count(&mut self, values: usize) -> Result<(), DecodeError> {
         self.values = self.values.saturating_add(values);
         if self.values > self.limits.values {
-            return Err(DecodeError::Limit("the values kept of one message"));
+            return Err(DecodeError::Limit("the allowed number of values"));
         }
         Ok(())
     }
@@ -214,7 +214,7 @@ impl<'a> Reader<'a> {
         depth: usize,
     ) -> Result<Message<'a>, DecodeError> {
         if depth >= self.limits.depth {
-            return Err(DecodeError::Limit("the levels of nested messages"));
+            return Err(DecodeError::Limit("the allowed levels of nested messages"));
         }
         let mut inner = self.delimited(self.encoding.delimited, cursor, "size of a structure")?;
         let cursor = inner.as_mut().unwrap_or(cursor);
@@ -379,7 +379,7 @@ impl<'a> Reader<'a> {
         depth: usize,
     ) -> Result<(), DecodeError> {
         if depth >= self.limits.depth {
-            return Err(DecodeError::Limit("the levels of nested messages"));
+            return Err(DecodeError::Limit("the allowed levels of nested messages"));
         }
         if self
             .delimited(self.encoding.delimited, cursor, "size of a structure")?

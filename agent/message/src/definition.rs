@@ -292,7 +292,7 @@ impl MessageType {
         Ok(depth)
     }
 
-    /// Returns the fields of the type itself or of a nested one.
+    /// Returns the fields of the type itself or of a nested one; `None` for another type.
     pub fn structure(&self, name: &TypeName) -> Option<&Structure> {
         self.structures.get(name).map(Arc::as_ref)
     }

@@ -93,7 +93,7 @@ struct Embedded {
     text: &'static str,
 }
 
-/// Returns the text of a file in a distribution.
+/// Returns the text of a file in a distribution, if it is embedded.
 pub(super) fn find(file: &TypeName, dialect: Dialect) -> Option<&'static str> {
     let (_, text) = PACKAGES
         .iter()
@@ -282,7 +282,7 @@ mod tests {
         assert_eq!(
             failure.to_string(),
             format!(
-                "the definition of std_msgs/msg/String that comes with ros2probe differs from the \
+                "the definition of std_msgs/msg/String built into ros2probe differs from the \
                  nodes': its hash is \
                  RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18, theirs \
                  {announced}; install their version of std_msgs, or name a directory that has it \

@@ -400,7 +400,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_missing_is_told_with_what_to_do() {
+    fn missing_messages_are_reported_with_a_remedy() {
         let here = prefix(&[("a/msg/B.msg", "c/D d")]);
         let message = |name| library(&[&here]).find(name, None).unwrap_err().to_string();
         assert_eq!(
@@ -419,7 +419,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mistake_is_told_with_its_file_and_line() {
+    fn a_mistake_is_reported_with_its_file_and_line() {
         let here = prefix(&[("a/msg/B.msg", "int8 x\nint9 y\n")]);
         let path = here.path().join("share/a/msg/B.msg");
         let failure = library(&[&here]).find("a/msg/B", None).unwrap_err();

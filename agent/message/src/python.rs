@@ -130,8 +130,8 @@ fn quote(single: bool, double: bool) -> char {
     if single && !double { '"' } else { '\'' }
 }
 
-/// Implements `str.isprintable()`, by the same Unicode categories in a newer version than Humble's
-/// Python.
+/// Returns whether `str.isprintable()` is true, by the same Unicode categories in a newer version
+/// than Humble's Python.
 fn is_printable(character: char) -> bool {
     if character.is_ascii() {
         return !character.is_control();

@@ -38,7 +38,8 @@ impl Truncation {
         }
     }
 
-    /// Returns the text for an array that is not printed.
+    /// Returns the text for an array that is printed by type and length; `None` if its elements are
+    /// printed.
     pub fn array(&self, array: &Array<'_>) -> Option<String> {
         if !self.no_arrays {
             return None;

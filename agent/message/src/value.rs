@@ -37,7 +37,7 @@ impl<'a> Message<'a> {
         self.structure.fields.iter().zip(&self.values)
     }
 
-    /// Returns a field's value.
+    /// Returns a field's value; `None` if the type has no such field.
     pub fn get(&self, name: &str) -> Option<&Value<'a>> {
         self.fields()
             .find(|(field, _)| field.name == name)
@@ -118,7 +118,7 @@ impl<'a> Scalars<'a> {
         self.len() == 0
     }
 
-    /// Returns one element.
+    /// Returns one element; `None` beyond the last one.
     pub fn get(&self, index: usize) -> Option<Scalar> {
         let start = index.checked_mul(self.kind.size())?;
         Scalar::read(self.kind, self.endianness, self.bytes.get(start..)?)
@@ -215,7 +215,7 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    /// Reads a scalar from the start of `bytes`.
+    /// Reads a scalar from the start of `bytes`; `None` if they are too short.
     pub fn read(kind: ScalarKind, endianness: Endianness, bytes: &[u8]) -> Option<Self> {
         let word = |size: usize| -> Option<u64> {
             let bytes = bytes.get(..size)?;

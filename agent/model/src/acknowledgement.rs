@@ -261,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn an_hour_of_silence_is_told_in_bounded_memory() {
+    fn an_hour_of_silence_is_reported_in_bounded_memory() {
         let mut all = Acknowledgements::default();
         put(&mut all, &acknack(1, 1, 0, 0));
         for number in 1..=360_000 {

@@ -164,7 +164,7 @@ impl Delivery {
         self.main = route;
     }
 
-    /// Returns whether the delivery is outgoing or incoming.
+    /// Returns the direction, outgoing or incoming.
     #[must_use]
     pub const fn direction(&self) -> Direction {
         self.main.direction

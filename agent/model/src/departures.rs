@@ -55,7 +55,7 @@ impl Departures {
         });
     }
 
-    /// Returns the time at which the sample left for this destination.
+    /// Returns the time at which the sample left for this destination, if it is remembered.
     #[must_use]
     pub fn find(&self, number: SequenceNumber, destination: Destination) -> Option<Timestamp> {
         let mut latest = self.latest.iter().rev();
@@ -69,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn departures_for_several_places_are_told_apart_and_bounded() {
+    fn departures_for_several_places_are_separate_and_bounded() {
         let mut departures = Departures::default();
         let destination = |port| Destination {
             port,

@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn losses_of_one_writer_are_told_once_until_the_burst_ends() {
+    fn losses_of_one_writer_are_reported_once_until_the_burst_ends() {
         let mut events = Events::default();
         events.lose(&loss(guid(1), 10, 5, 7));
         events.lose(&loss(guid(2), 11, 1, 1));

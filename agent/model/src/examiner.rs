@@ -230,7 +230,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_finding_keeps_the_time_when_it_was_found_also_when_it_says_something_else() {
+    fn a_finding_keeps_its_time_when_its_text_changes() {
         let duplicate = |node: &str, participants: Vec<Guid>| Diagnosis::DuplicateNode {
             domain_id: DomainId(0),
             node: node.into(),

@@ -19,8 +19,8 @@ use super::snapshot::TableFacts;
 
 /// Largest number of rows in all seconds, 24 bytes each: 10 minutes of 436 topics.
 const ROWS: usize = 262_144;
-/// Topic names kept per topic that may be measured. Names of topics that are not measured any more
-/// stay until this factor is reached.
+/// Largest number of names per measurable topic. Topics that stopped being measured keep their
+/// names up to this factor.
 const NAMES: usize = 2;
 
 /// A ring of the last seconds.
@@ -262,7 +262,8 @@ impl History {
 }
 
 impl Past {
-    /// Returns each second of one topic, oldest first; `None` for seconds without a measurement.
+    /// Returns each second of one topic, oldest first, with `None` for seconds without a
+    /// measurement. Returns `None` for a topic without a history.
     pub fn topic(
         &self,
         domain_id: DomainId,
@@ -276,7 +277,7 @@ impl Past {
         Some(readings)
     }
 
-    /// Returns the id of the topic for [`Second::row`].
+    /// Returns the id of the topic for [`Second::row`]; `None` for a topic without a history.
     #[must_use]
     pub fn id(&self, domain_id: DomainId, dds_name: &str) -> Option<u32> {
         self.names.find(domain_id, dds_name)
@@ -288,7 +289,8 @@ impl Past {
         &self.seconds
     }
 
-    /// Returns one second of a topic, with its rates over the window that ends there.
+    /// Returns one second of a topic, with its rates over the window that ends there; `None` if it
+    /// was not measured.
     fn reading(&self, place: usize, id: u32) -> Option<Reading> {
         let row = self.seconds.get(place)?.row(id)?;
         let window = usize::try_from(WINDOW).unwrap_or(usize::MAX);
@@ -321,7 +323,7 @@ impl Past {
 }
 
 impl Second {
-    /// Returns the row of a topic.
+    /// Returns the row of a topic; `None` if it was not measured in this second.
     #[must_use]
     pub fn row(&self, topic: u32) -> Option<Row> {
         let place = self.rows.binary_search_by_key(&topic, |row| row.topic);
@@ -343,14 +345,14 @@ impl Row {
     }
 
     /// Returns the median and 99th percentile of the time from the writer's timestamp to the
-    /// capture, in seconds.
+    /// capture, in seconds; `None` without a message.
     #[must_use]
     pub fn latency(&self) -> Option<[f32; 2]> {
         pair(self.latency)
     }
 
     /// Returns the median and 99th percentile of the time between messages of one writer, in
-    /// seconds.
+    /// seconds; `None` without two messages.
     #[must_use]
     pub fn interarrival(&self) -> Option<[f32; 2]> {
         pair(self.interarrival)

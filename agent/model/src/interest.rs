@@ -116,7 +116,8 @@ impl Interest {
         (self.entries.len(), self.limit, self.evictions)
     }
 
-    /// Drops one uninteresting entry, if possible one that the kernel does not have.
+    /// Drops one uninteresting entry, if possible one that the kernel does not have. Returns
+    /// whether one was dropped.
     fn give_up_one(&mut self) -> bool {
         let mut ignored = self
             .entries

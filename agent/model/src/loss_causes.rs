@@ -108,8 +108,8 @@ impl LossCauses {
         }
     }
 
-    /// Keeps the cause of these samples open until then. Returns a run that must be decided now to
-    /// make room.
+    /// Keeps the cause of these samples open until `until`. Returns a run that must be decided now
+    /// to make room.
     pub fn wait(
         &mut self,
         first: SequenceNumber,
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn both_lists_are_bounded_and_what_is_pushed_out_is_told() {
+    fn both_lists_are_bounded_and_evictions_are_reported() {
         let mut loss_causes = LossCauses::default();
         let forgotten = (0..10_000).filter(|number| {
             loss_causes.note(SequenceNumber(2 * number), LossCause::SocketBuffer, at(1))

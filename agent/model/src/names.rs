@@ -17,19 +17,19 @@ macro_rules! name {
         pub struct $name(Arc<str>);
 
         impl $name {
-            /// As text.
+            /// Returns the name as text.
             #[must_use]
             pub fn as_str(&self) -> &str {
                 &self.0
             }
 
-            /// As shared text.
+            /// Returns the name as shared text.
             #[must_use]
             pub fn shared(&self) -> Arc<str> {
                 Arc::clone(&self.0)
             }
 
-            /// This name, or as much of it as fits into so many bytes.
+            /// Returns this name, truncated to at most this many bytes.
             #[must_use]
             pub fn bounded(&self, bytes: usize) -> Self {
                 if self.0.len() <= bytes {
@@ -129,7 +129,7 @@ name!(
 );
 
 impl TopicName {
-    /// The name of a topic that has none in ROS.
+    /// Returns the DDS name as the name of a topic that has none in ROS.
     #[must_use]
     pub fn of_dds(name: &DdsName) -> Self {
         Self(name.shared())

@@ -218,7 +218,7 @@ impl Profiler {
         self.writers.iter()
     }
 
-    /// Returns how far the samples of this writer are decided.
+    /// Returns how far the samples of this writer are decided; `None` if it is not measured.
     pub fn progress(
         &mut self,
         guid: Guid,

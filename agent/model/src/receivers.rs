@@ -363,7 +363,7 @@ impl Receivers {
 }
 
 impl GraphView<'_> {
-    /// Returns whether this participant reads the topic.
+    /// Returns whether this participant reads the topic, as far as that is known.
     #[must_use]
     pub fn matched(&self, topic: Option<&Topic>, prefix: GuidPrefix) -> Matched {
         let Some(topic) = topic else {

@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_tells_ways_apart_only_where_it_receives() {
+    fn a_socket_distinguishes_paths_only_where_it_receives() {
         let record = Record {
             destination: [
                 0,

@@ -3,9 +3,8 @@
 //!
 //! Shared memory is polled, so samples that are overwritten between two polls are not seen.
 //! Sequence numbers still show how many were written: messages are counted by the span of their
-//! numbers, and unseen numbers are no losses. While a writer is sampled, its network samples are
-//! counted here too.
-//! the network counts here too: it adds to what was seen.
+//! numbers, and unseen numbers are no losses. While a writer is sampled, its samples on the network
+//! are counted here, too.
 
 use std::time::Duration;
 
@@ -195,13 +194,13 @@ impl Sampled {
         self.settle(self.next);
     }
 
-    /// Returns the time since which a sample is waited for.
+    /// Returns the time since which a sample is waited for; `None` if no sample is.
     #[must_use]
     pub fn unseen_since(&self) -> Option<Timestamp> {
         self.unseen().map(|_| self.last_settled.0)
     }
 
-    /// Returns the lowest number that is waited for.
+    /// Returns the lowest number that is waited for; `None` if no sample is.
     #[must_use]
     pub fn unseen(&self) -> Option<SequenceNumber> {
         let open = self.next.steps_since(self.settled);
@@ -361,7 +360,8 @@ impl Sampled {
         samples
     }
 
-    /// Keeps the stamp of a sample's first fragment, or returns the stamp that was kept.
+    /// Stores `stamp` if the record has one. Returns the stored stamp of this sample; `None` if it
+    /// was not seen.
     pub fn stamp(
         &mut self,
         number: SequenceNumber,

@@ -237,7 +237,8 @@ impl Subscribers {
         self.acknowledgements.wrote(number, at);
     }
 
-    /// Processes an outgoing sample.
+    /// Processes an outgoing sample. Returns whether it had left for this unicast destination
+    /// before.
     fn leave(&mut self, index: usize, sample: Sample<'_>, context: &mut WriterContext<'_>) -> bool {
         let Some(route) = self.routes.get(index).map(|known| known.route) else {
             return false;

@@ -406,7 +406,7 @@ impl Topics {
     }
 
     /// Frees the slot of the topic that vanished first. A topic watched by exact name keeps its
-    /// slot unless the newcomer is watched so, too.
+    /// slot unless the newcomer is watched so, too. Returns whether a slot was freed.
     fn give_up_vanished(&mut self, keep: TopicId, is_named: bool) -> bool {
         let places = || self.vanished_watched.iter().map(|(_, id)| *id);
         let unnamed = places().find(|id| *id != keep && self.yielding.contains(id));

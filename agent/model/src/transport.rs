@@ -150,7 +150,7 @@ mod tests {
     }
 
     #[test]
-    fn fast_dds_tells_host_and_process_by_its_prefix_and_others_do_not() {
+    fn a_fast_dds_prefix_contains_host_and_process_and_others_do_not() {
         let discovery = Discovery::new(Caps {
             participants: 1,
             endpoints: 1,

@@ -271,7 +271,7 @@ fn iron_and_later_say_the_type_hash() {
 }
 
 #[test]
-fn all_four_forms_of_disposal_name_who_is_gone() {
+fn all_four_forms_of_disposal_name_the_participant_or_endpoint() {
     let gone = |text: &str, entity: [u8; 4]| {
         let prefix: Vec<u8> = (0..12)
             .map(|i| u8::from_str_radix(&text[2 * i..2 * i + 2], 16).unwrap())
@@ -308,7 +308,7 @@ fn all_four_forms_of_disposal_name_who_is_gone() {
 }
 
 #[test]
-fn a_disposal_of_nobody_is_an_error() {
+fn a_disposal_without_a_guid_is_an_error() {
     let status = InlineQos {
         status_info: StatusInfo(1),
         ..NO_INLINE_QOS

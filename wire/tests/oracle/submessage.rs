@@ -288,7 +288,7 @@ fn info<'a>(
         SubmessageId::INFO_SRC => {
             body.take("INFO_SRC unused", 4)?;
             let [major, minor] = body.array("INFO_SRC version")?;
-            // RTPS 2.5, 8.3.8.9.4: the time in force ends with the source it came from.
+            // RTPS 2.5, 8.3.8.9.4: a timestamp applies until the source changes.
             *receiver = Receiver {
                 version: ProtocolVersion { major, minor },
                 vendor: VendorId(body.array("INFO_SRC vendor")?),

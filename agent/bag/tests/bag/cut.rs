@@ -227,7 +227,7 @@ fn metadata_is_made_anew_from_all_files_in_their_order() {
 }
 
 #[test]
-fn what_is_no_mcap_file_is_left_alone_and_said() {
+fn a_file_that_is_not_mcap_is_left_alone_and_reported() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("bag");
     super::bag(&path, Options::default(), 5);

@@ -364,7 +364,7 @@ fn the_form_follows_the_distribution() {
 }
 
 #[test]
-fn whole_files_are_compressed_by_whoever_takes_the_work() {
+fn whole_files_are_compressed_by_the_thread_that_takes_the_work() {
     let directory = tempfile::tempdir().unwrap();
     for compression in [Compression::Zstd, Compression::Lz4] {
         let path = directory.path().join(compression.name());

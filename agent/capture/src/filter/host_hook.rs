@@ -138,7 +138,8 @@ impl Filter {
         }
     }
 
-    /// Returns what [`Filter::attach_tracepoints`] has attached.
+    /// Returns the programs that [`Filter::attach_tracepoints`] has attached; `None` before that
+    /// and on the wire hook.
     #[must_use]
     pub fn tracepoints(&self) -> Option<&Tracepoints> {
         self.host.as_ref()?.tracepoints.as_ref()
@@ -157,7 +158,8 @@ impl Filter {
         self.pieces.as_ref().map(RingBuf::as_fd)
     }
 
-    /// Returns the oldest unread piece of a captured datagram.
+    /// Returns the oldest unread piece of a captured datagram; `None` if the ring is empty, and on
+    /// the wire hook.
     pub fn next_piece(&mut self) -> Option<CapturedPiece<'_>> {
         self.pieces.as_mut()?.next().map(CapturedPiece)
     }

@@ -49,7 +49,9 @@ impl Filter {
         within: Option<u64>,
     ) -> Result<(Self, Probes), FilterError> {
         if !Path::new(KIND).exists() {
-            return Err(FilterError::Missing("place to attach to: no uprobes"));
+            return Err(FilterError::Missing(
+                "place to attach: uprobes are disabled",
+            ));
         }
         let sizes = [
             ("PIECES", ring_size(settings.piece_ring_bytes)),

@@ -279,7 +279,7 @@ fn body_length(total: u32, packets: u64) -> Result<u32, PcapError> {
         .filter(|body| body.is_multiple_of(4))
         .ok_or(PcapError::Malformed {
             packets,
-            what: "a block length that cannot be",
+            what: "an impossible block length",
         })
 }
 

@@ -329,7 +329,7 @@ fn announced_lengths_are_not_believed() {
 }
 
 #[test]
-fn what_is_not_a_capture_says_so() {
+fn a_file_that_is_not_a_capture_is_reported() {
     let (_, error) = read(b"%PDF-1.7 and so on");
     let text = error.unwrap().to_string();
     assert_eq!(

@@ -166,7 +166,8 @@ impl Flow {
         self.pieces.partition_point(|piece| piece.end() <= offset)
     }
 
-    /// Returns the first missing range within `from..to`, and the index of the piece after it.
+    /// Returns the first missing range within `from..to`, and the index of the piece after it;
+    /// `None` if nothing is missing.
     fn gap(&self, mut from: u32, to: u32) -> Option<(usize, u32, u32)> {
         let mut index = self.first_ending_after(from);
         if let Some(piece) = self.pieces.get(index)

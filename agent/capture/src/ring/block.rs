@@ -108,7 +108,7 @@ impl<'a> Iterator for Frames<'a> {
     }
 }
 
-/// Returns the frame at `at`, and the distance to the next one.
+/// Returns the frame at `at`, and the distance to the next one; `None` if it exceeds the block.
 fn frame(block: &[u8], at: usize) -> Option<(RingFrame<'_>, usize)> {
     let block = block.get(at..)?;
     let step = size(word(block, offset_of!(tpacket3_hdr, tp_next_offset))?);
@@ -239,7 +239,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_block_cut_anywhere_ends_early_and_says_so() {
+    fn a_block_cut_anywhere_ends_early_and_reports_it() {
         let bytes = block();
         for end in 0..bytes.len() {
             let mut frames = Frames::new(&bytes[..end]);

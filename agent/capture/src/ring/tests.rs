@@ -249,7 +249,7 @@ fn an_interface_that_appears_later_is_seen() {
         ip("link set far up");
         let socket = UdpSocket::bind("10.99.0.1:0").unwrap();
         ip("neighbour add 10.99.0.2 lladdr 02:00:00:00:00:02 dev later");
-        // A link takes a moment to come up.
+        // A link needs a moment until it is up.
         let hello = (0..400).find_map(|_| {
             socket.send_to(b"hello", "10.99.0.2:7400").unwrap();
             let seen = sent(&mut ring, Duration::from_millis(50));

@@ -131,7 +131,7 @@ impl Name {
         is_id.then_some(Self::Segment(generation, SegmentId(id)))
     }
 
-    /// Returns the file whose lock this lock file represents.
+    /// Returns the file that this lock file protects; `None` if it is no lock file.
     fn of_lock(name: &str) -> Option<Self> {
         let suffix = |suffix: &&str| name.strip_suffix(*suffix).and_then(Self::parse);
         LOCKED.iter().find_map(suffix)

@@ -57,7 +57,7 @@ impl Inbox {
         }
     }
 
-    /// Returns a descriptor that is readable when the queue fills up.
+    /// Returns a descriptor that is readable when the queue fills up; `None` without a bell.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         Some(self.bell.as_ref()?.descriptor())

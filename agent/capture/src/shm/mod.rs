@@ -123,7 +123,7 @@ impl SharedMemory {
         self.shared.is_paused.store(is_paused, Ordering::Release);
     }
 
-    /// Returns a descriptor that is readable when the queue fills up.
+    /// Returns a descriptor that is readable when the queue fills up; `None` without a bell.
     #[must_use]
     pub fn descriptor(&self) -> Option<BorrowedFd<'_>> {
         self.shared.inbox.descriptor()
@@ -181,7 +181,7 @@ impl Drop for SharedMemory {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take() {
-            // It can only have ended; how does not matter any more.
+            // The thread has ended in any case; its result has no user.
             let _ = thread.join();
         }
     }

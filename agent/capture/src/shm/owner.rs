@@ -69,7 +69,7 @@ impl Locks {
 }
 
 /// Returns the file of a line such as `1: FLOCK  ADVISORY  WRITE 1234 00:1a:5678 0 EOF`; a process
-/// that waits for a lock (`1: -> FLOCK ...`) holds none.
+/// that waits for a lock (`1: -> FLOCK ...`) holds no lock.
 fn file_of(line: &str) -> Option<FileId> {
     let mut words = line.split_whitespace().skip(1);
     if words.next() != Some("FLOCK") {
@@ -101,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_is_abandoned_when_nobody_holds_the_lock_beside_it() {
+    fn a_file_is_abandoned_when_no_process_holds_the_lock_beside_it() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("fastrtps_port7411");
         fs::write(&path, "x").unwrap();

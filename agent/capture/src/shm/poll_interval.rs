@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn when_somebody_comes_it_looks_closely_but_not_for_ever() {
+    fn after_a_new_participant_it_polls_closely_for_a_limited_time() {
         let mut interval = PollInterval::new(BUDGET);
         interval.newcomer(100.0);
         let microseconds = |interval: &mut PollInterval, now, cpu| {

@@ -176,7 +176,8 @@ impl Port {
         })
     }
 
-    /// Reads `count` cells starting at `first`, wrapping around the ring's end.
+    /// Reads `count` cells starting at `first`, wrapping around the ring's end; `None` if the file
+    /// is too short.
     fn cells<S: Source + ?Sized>(
         &mut self,
         source: &S,
@@ -333,7 +334,7 @@ mod tests {
     }
 
     #[test]
-    fn one_that_is_being_filled_is_waited_for_but_not_for_ever() {
+    fn an_entry_that_is_being_filled_is_awaited_for_a_limited_time() {
         let mut image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
         let begun = image.begin_push();

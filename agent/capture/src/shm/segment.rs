@@ -84,8 +84,8 @@ impl Buffer {
         status.is_some_and(|status| status & VALIDITY == u64::from(self.validity))
     }
 
-    /// Reads the whole message; check [`Self::is_valid`] afterwards. Allocates at most the size of
-    /// the file.
+    /// Reads the whole message; returns `false` if the file ends before it does. Allocates at most
+    /// the size of the file. Check [`Self::is_valid`] afterwards.
     pub fn read<S: Source + ?Sized>(&self, source: &S, into: &mut Vec<u8>) -> bool {
         let last = u64::from(self.length).saturating_sub(1);
         if !source.read(self.data.saturating_add(last), &mut [0]) {

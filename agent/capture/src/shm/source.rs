@@ -17,14 +17,14 @@ pub trait Source {
     /// Fills `into` from `offset`; returns `false` if some of the bytes do not exist.
     fn read(&self, offset: u64, into: &mut [u8]) -> bool;
 
-    /// Reads a little-endian 32-bit word.
+    /// Reads a little-endian 32-bit word; `None` if its bytes do not exist.
     fn word(&self, offset: u64) -> Option<u32> {
         let mut bytes = [0; 4];
         self.read(offset, &mut bytes)
             .then(|| u32::from_le_bytes(bytes))
     }
 
-    /// Reads a little-endian 64-bit word as two 32-bit words.
+    /// Reads a little-endian 64-bit word as two 32-bit words; `None` if its bytes do not exist.
     fn long(&self, offset: u64) -> Option<u64> {
         let mut bytes = [0; 8];
         self.read(offset, &mut bytes)
@@ -144,7 +144,7 @@ mod tests {
     }
 
     #[test]
-    fn only_regular_files_are_opened_and_nobody_is_waited_for() {
+    fn only_regular_files_are_opened_and_none_is_awaited() {
         let directory = tempfile::tempdir().unwrap();
         let (file, link) = (directory.path().join("f"), directory.path().join("l"));
         fs::write(&file, "x").unwrap();

@@ -541,8 +541,9 @@ impl Tap {
         }
     }
 
-    /// Closes a port in favour of this user if another user has more ports than this one would
-    /// have: the one that has been idle longest. So no user can exclude another.
+    /// Closes the longest idle port of another user in favour of this one, and returns whether it
+    /// did. It does so only if the other user has more ports than this one would have, so no user
+    /// can exclude another.
     fn make_room(&mut self, user: u32) -> bool {
         let mut open: HashMap<u32, usize> = HashMap::new();
         for port in &self.ports {

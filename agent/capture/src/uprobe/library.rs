@@ -363,7 +363,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_library_without_it_says_so() {
+    fn a_library_without_the_function_is_reported() {
         let newer = format!("{FUNCTION}RKNS1_10OtherThingE");
         for name in ["_ZN4sendE", &newer] {
             assert!(matches!(

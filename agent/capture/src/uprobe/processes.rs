@@ -179,7 +179,7 @@ impl Processes {
     }
 
     /// Returns a process that cannot be inspected and may use Fast DDS, because it holds one of its
-    /// locks.
+    /// locks. Without a list of locks, every such process may use it.
     #[must_use]
     pub fn closed(&self) -> Option<u32> {
         let mut closed = self.known.iter().filter(|(_, process)| process.is_closed);

@@ -34,7 +34,7 @@ const RETRY: Duration = Duration::from_secs(5);
 const OVERLAP: Duration = Duration::from_millis(400);
 /// Why nothing is attached on demand.
 const RESTING: &str =
-    "capture.shm.exact is auto, and no samples are read of a topic that goes through shared memory";
+    "capture.shm.exact is auto, and no client reads samples of a topic in shared memory";
 /// Most libraries with a probe: images of containers on one host.
 const MAX_LIBRARIES: usize = 64;
 
@@ -404,8 +404,8 @@ impl Attachments {
         for (process, used) in processes.using() {
             if used.libraries.is_empty() {
                 return Some(format!(
-                    "process {process} uses Fast DDS's shared memory without a library: it is \
-                     linked into it"
+                    "process {process} has Fast DDS linked statically: there is no library to \
+                     attach to"
                 ));
             }
             for Mapped { id, path, .. } in &used.libraries {
@@ -482,7 +482,7 @@ mod tests {
     }
 
     #[test]
-    fn a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used() {
+    fn a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used() {
         let directory = tempfile::tempdir().unwrap();
         for number in 0..=MAX_LIBRARIES {
             let path = directory.path().join(format!("library.{number}"));

@@ -13,7 +13,7 @@ requests the announcements again: at most 6 unicast packets for each, from a par
 for a few milliseconds and says goodbye. A running agent on this host sees the answers too. Without
 --participant and --all it lists the participants.
 Participants with DDS security receive no requests. Needs the same capabilities as `rp run`.
-Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is invalid, 1 otherwise.
 
 Examples:
   sudo rp discover --all --dry-run                print what would be sent

@@ -304,7 +304,7 @@ pub(crate) fn is_sampled(topic: &PublishedTopic) -> bool {
     topic.subscribed && topic.other_transport.as_deref() == Some("shared_memory")
 }
 
-/// Text about sampled topics: the consequence and the remedy.
+/// Text about sampled topics: the consequence and the remedy. `None` without a topic.
 pub(crate) fn sampled(topics: &[String], consequence: &str) -> Option<String> {
     let names = few(topics);
     let verb = if topics.len() == 1 { "is" } else { "are" };

@@ -10,7 +10,7 @@ use ros2probe_daemon::config::{Access, Watch};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Signals: SIGHUP reloads the configuration, SIGTERM and SIGINT end the agent.
-Exit codes: 0 ended on request, 77 a capability is missing, 78 the configuration is wrong, 1 otherwise.
+Exit codes: 0 ended on request, 77 a capability is missing, 78 the configuration is invalid, 1 otherwise.
 RUST_LOG, read at the start, overrides the configured log level.
 
 Examples:

@@ -133,7 +133,7 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> 
 }
 
 /// Note about announcements that were made before the agent or the capture started. Endpoints are
-/// announced once, and only to other participants.
+/// announced once, and only to other participants. `None` if nothing is missing.
 fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
@@ -148,7 +148,7 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
                 format!("{what} announces none")
             } else {
                 format!(
-                    "{what} announces them when a second one starts; `rp discover --all` asks for \
+                    "{what} announces them when a second one starts; `rp discover --all` requests \
                      them"
                 )
             });

@@ -101,7 +101,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_interval_is_neither_too_short_nor_for_ever() {
+    fn an_interval_is_neither_too_short_nor_endless() {
         assert_eq!(interval("0.5"), Ok(Duration::from_millis(500)));
         for wrong in ["0", "-1", "inf", "nan", "", "1s", "1e9"] {
             assert!(interval(wrong).is_err(), "{wrong}");

@@ -168,7 +168,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_refusal_is_told_from_an_answer_of_somebody_else() {
+    fn a_refusal_is_distinguished_from_an_answer_of_another_server() {
         let body = br#"{"type":"urn:ros2probe:problem:no-such-topic","title":"","status":404,
             "detail":"nobody has /x"}"#;
         let refusal = Refusal::read(404, body).unwrap();

@@ -76,7 +76,7 @@ pub fn misconfigured(path: &Path, mistakes: &str) -> Finding {
     } else {
         String::new()
     };
-    let sentence = format!("the configuration is wrong: {first}{more}");
+    let sentence = format!("the configuration is invalid: {first}{more}");
     let finding = Finding::new(AREA, "configuration", Severity::Problem, sentence);
     let finding = finding.seen(mistakes, path.display().to_string());
     finding.remedy("rp check-config    # prints all mistakes")
@@ -259,7 +259,7 @@ fn evictions(health: &Health) -> Vec<Finding> {
     findings
 }
 
-/// Configuration key of a table's limit; most tables have none.
+/// Configuration key of a table's limit. `None` for most tables, which have a fixed limit.
 fn limit(table: &str) -> Option<&'static str> {
     const KEYS: [(&str, &str); 7] = [
         ("deliveries", "flows"),
@@ -351,8 +351,10 @@ fn busy(key: &str, address: SocketAddr) -> Finding {
     let finding = Finding::new(AREA, "ports", Severity::Problem, sentence);
     let finding = finding.seen(port.to_string(), SOCKETS.join(", "));
     finding
-        .remedy(format!("sudo ss -ltnp 'sport = :{port}'    # who"))
-        .configure(key.replace('.', ": {") + ": 127.0.0.1:PORT}    # another one")
+        .remedy(format!(
+            "sudo ss -ltnp 'sport = :{port}'    # names the program"
+        ))
+        .configure(key.replace('.', ": {") + ": 127.0.0.1:PORT}    # a free port")
 }
 
 fn listening(host: &HostState) -> Vec<u16> {

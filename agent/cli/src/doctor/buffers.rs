@@ -100,7 +100,8 @@ pub fn check(host: &HostState, answers: Option<&Answers>) -> Vec<Finding> {
     findings
 }
 
-/// Topic with the largest mean message size. Sizes vary little within a topic.
+/// Topic with the largest mean message size. `None` without measurements. Sizes vary little within
+/// a topic.
 fn largest(topics: &[Topic<'_>]) -> Option<Largest> {
     let mean = |measured: &Measurement| measured.bytes.checked_div(measured.messages);
     let of_topic = |topic: &Topic<'_>| {
@@ -237,7 +238,7 @@ fn reassembly(files: &Files, largest: Option<&Largest>) -> Vec<Finding> {
     findings
 }
 
-/// Finding for messages lost at one place.
+/// Finding for messages lost at one place. `None` if no message was.
 fn lost(
     topics: &[Topic<'_>],
     check: &'static str,

@@ -123,7 +123,7 @@ mod tests {
     }
 
     #[test]
-    fn a_good_clock_is_said_with_its_error_and_its_keeper() {
+    fn a_good_clock_is_reported_with_its_error_and_its_keeper() {
         let good = found(Ok(state(true, 120, 3_400)));
         assert_eq!(good.severity, Severity::Ok);
         assert_eq!(
@@ -133,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coarse_a_free_and_an_unknown_clock_are_told_apart() {
+    fn a_coarse_a_free_and_an_unknown_clock_are_distinguished() {
         assert_eq!(
             found(Ok(state(true, 50_000, 90_000))).severity,
             Severity::Note

@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_is_a_problem_only_where_somebody_should_be() {
+    fn an_empty_graph_is_a_problem_only_where_participants_are_expected() {
         let nobody = answers("{}", "", "");
         assert_eq!(check(&nobody, None)[0].severity, Severity::Note);
         assert_eq!(check(&nobody, Some(0))[0].severity, Severity::Note);
@@ -395,7 +395,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_agent_came_too_late_for_is_said_with_the_command() {
+    fn announcements_before_the_agents_start_are_reported_with_the_command() {
         let late = r#"{"participants":[
             {"enclave":"/","nodes":[],"writers":3},
             {"enclave":"/","nodes":["/a"],"writers":3,"restored":true},
@@ -451,7 +451,7 @@ mod tests {
     }
 
     #[test]
-    fn topics_beside_the_network_are_told_by_their_way() {
+    fn topics_beside_the_network_are_reported_by_passage() {
         let topic =
             |name: &str, passages: &str| format!(r#"{{"name":"{name}","passages":[{passages}]}}"#);
         let pairs = |way: &str| format!(r#"{{"passage":"{way}","pairs":2}}"#);

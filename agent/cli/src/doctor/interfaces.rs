@@ -83,7 +83,7 @@ pub fn check(host: &HostState, agent: Option<&Health>, localhost: bool) -> Vec<F
     findings
 }
 
-/// `/sys` shows the network namespace in which it was mounted, which may differ from this one.
+/// Finding for a `/sys` that shows another network namespace: the one in which it was mounted.
 fn elsewhere(host: &HostState, names: &[String]) -> Option<Finding> {
     let table = host.files.text(OWN).ok()?;
     let own = table
@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn loopback_matters_to_those_who_are_limited_to_it() {
+    fn loopback_is_reported_for_participants_limited_to_it() {
         assert_eq!(
             severity(&found(&[LO, ETH], false), "loopback"),
             Some(Severity::Ok)
@@ -354,7 +354,7 @@ mod tests {
     }
 
     #[test]
-    fn where_the_agent_looks_is_said() {
+    fn the_source_of_the_agent_is_reported() {
         let agent: Health = serde_json::from_str(
             r#"{"source":"host","interfaces":[{"interface":"sockets","packets":7}]}"#,
         )

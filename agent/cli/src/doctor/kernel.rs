@@ -294,7 +294,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_kernel_lacks_is_said() {
+    fn missing_kernel_features_are_reported() {
         gives((RELEASE, "5.4.0-42"), "version", Severity::Problem);
         gives((RELEASE, "5.10.120-tegra"), "version", Severity::Ok);
         gives((RELEASE, "new"), "version", Severity::Unknown);

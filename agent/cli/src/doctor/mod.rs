@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn without_files_and_privileges_everything_is_still_said_once_and_in_order() {
+    fn without_files_and_privileges_each_line_is_still_printed_once_in_order() {
         let (_directory, host) = host(&[]);
         let report = examine(&host, &configured(), &Reach::Nobody("no agent".to_owned()));
         let listed = areas(&report);

@@ -134,7 +134,7 @@ pub fn is_installed(host: &HostState) -> bool {
     host.files.exists(SYSTEMD) && installed(host).is_some()
 }
 
-/// Path of the service's unit.
+/// Path of the service's unit. `None` if it is not installed.
 fn installed(host: &HostState) -> Option<&'static str> {
     let mut places = UNITS.into_iter();
     places.find(|place| host.files.exists(&format!("{place}/{UNIT}")))
@@ -214,7 +214,7 @@ mod tests {
     const RUNNING: (&str, &str) = (SERVICES[0], "811\n");
 
     #[test]
-    fn the_service_is_told_in_each_of_its_states() {
+    fn the_service_is_reported_in_each_of_its_states() {
         let of = |files: &[(&str, &str)]| {
             let (_directory, host) = host(files);
             unit(&host, false).map(|finding| finding.severity)
@@ -228,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_without_capabilities_is_told_which_and_how() {
+    fn a_shell_without_capabilities_gets_their_names_and_the_command() {
         let (_directory, mut host) = host(&[]);
         let settings = Config::default().capture;
         let finding = own(&host, &settings, false);
@@ -250,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_agent_kept_is_told_and_a_missing_sandbox_with_its_reason() {
+    fn kept_capabilities_are_reported_and_a_missing_sandbox_with_its_reason() {
         let health = |held: &[&str], reason: Option<&str>| Health {
             capabilities: held.iter().map(|held| (*held).to_owned()).collect(),
             unfiltered_reason: reason.map(|reason| reason.to_owned().into()),

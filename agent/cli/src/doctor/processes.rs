@@ -150,7 +150,7 @@ impl Processes {
         findings
     }
 
-    /// Finding for processes that cannot be inspected.
+    /// Finding for processes that cannot be inspected. `None` if all can.
     fn unseen(&self, is_root: bool) -> Option<Finding> {
         let first = self.closed.first()?;
         let which = match self.closed.len() {
@@ -295,7 +295,7 @@ fn read_process(
     }))
 }
 
-/// RMW implementation, from the mapped libraries.
+/// RMW implementation, from the mapped libraries. `None` if no library is one.
 fn implementation(map: &str) -> Option<&'static str> {
     const LIBRARIES: [(&str, &str); 7] = [
         ("librmw_zenoh_cpp.so", "Zenoh"),
@@ -485,7 +485,7 @@ mod tests {
     }
 
     #[test]
-    fn a_shell_in_another_domain_than_all_is_told_the_command() {
+    fn a_shell_in_another_domain_than_all_others_gets_the_command() {
         let one = [(11, "talker", "ROS_DOMAIN_ID=3", FAST)];
         let findings = found(&one, &[("ROS_DISTRO", "jazzy")]);
         let finding = findings

@@ -81,7 +81,7 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
     finding.seen(shown, format!("ROS_DOMAIN_ID, {FROM}"))
 }
 
-/// Range of ephemeral ports.
+/// Range of ephemeral ports, if it is readable.
 fn ephemeral(host: &HostState) -> Option<(u32, u32)> {
     let text = host.files.text(PORTS).ok()?;
     let mut numbers = text.split_whitespace().map(str::parse);
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn domains_without_ports_of_their_own_are_told_apart_from_good_ones() {
+    fn domains_without_ports_are_distinguished_from_valid_ones() {
         for (domain, severity) in [
             ("0", Severity::Ok),
             ("101", Severity::Ok),
@@ -473,7 +473,7 @@ mod tests {
     }
 
     #[test]
-    fn what_the_old_variable_makes_ros_ignore_is_said() {
+    fn variables_that_ros_ignores_because_of_the_old_one_are_reported() {
         let findings = found(&[
             ("ROS_LOCALHOST_ONLY", "1"),
             ("ROS_STATIC_PEERS", "10.0.0.9"),

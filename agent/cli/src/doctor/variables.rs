@@ -81,13 +81,13 @@ impl Variables {
         Self(known)
     }
 
-    /// Value of a variable.
+    /// Value of a variable. `None` if it is unset.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&str> {
         self.0.get(name).map(String::as_str)
     }
 
-    /// Value of a variable, cut to the longest value shown.
+    /// Value of a variable, cut to the longest value shown. `None` if it is unset.
     #[must_use]
     pub fn shown(&self, name: &str) -> Option<String> {
         let value = self.get(name)?;
@@ -117,7 +117,7 @@ impl Variables {
         number.ok_or_else(|| self.shown("ROS_DOMAIN_ID").unwrap_or_default())
     }
 
-    /// Value of `ROS_LOCALHOST_ONLY` as rcl reads it.
+    /// Returns whether `ROS_LOCALHOST_ONLY` restricts discovery to this host, as rcl reads it.
     #[must_use]
     pub fn is_localhost_only(&self) -> bool {
         self.get("ROS_LOCALHOST_ONLY") == Some("1")

@@ -225,14 +225,14 @@ mod tests {
     }
 
     #[test]
-    fn who_sees_everything_is_told_so_in_two_lines() {
+    fn with_all_abilities_doctor_prints_two_lines() {
         let findings = check(&host(&Ability::ALL));
         assert_eq!(findings.len(), 2);
         assert!(findings.iter().all(|each| each.severity == Severity::Ok));
     }
 
     #[test]
-    fn what_the_kernel_does_not_allow_is_said_with_its_reason() {
+    fn what_the_kernel_does_not_allow_is_reported_with_its_reason() {
         let mut able = Ability::ALL.to_vec();
         able.retain(|each| *each != Ability::ReassemblyLosses);
         let mut visibility = host(&able);

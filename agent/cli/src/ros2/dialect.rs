@@ -8,8 +8,8 @@ use super::Dialect;
 #[must_use]
 pub fn parser() -> impl TypedValueParser<Value = Dialect> {
     let values = [
-        (Dialect::Humble, "Humble, and what is older"),
-        (Dialect::Jazzy, "Jazzy, and Iron"),
+        (Dialect::Humble, "Humble and older"),
+        (Dialect::Jazzy, "Iron and Jazzy"),
         (Dialect::Kilted, "Kilted"),
         (Dialect::Rolling, "Lyrical and rolling"),
     ]
@@ -21,7 +21,7 @@ pub fn parser() -> impl TypedValueParser<Value = Dialect> {
         }
     });
     PossibleValuesParser::new(values)
-        .try_map(|name| Dialect::of_distro(&name).ok_or("no distribution that is known"))
+        .try_map(|name| Dialect::of_distro(&name).ok_or("unknown distribution"))
 }
 
 #[cfg(test)]

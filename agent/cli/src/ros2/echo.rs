@@ -185,14 +185,14 @@ impl Echo {
                 let trailing = decoded.oddities.trailing;
                 let strange = (trailing > 0).then(|| {
                     format!(
-                        "a message has {trailing} bytes behind its last field: is the definition \
-                         of {name} the one that the node uses?"
+                        "a message has {trailing} bytes after its last field: the node may use \
+                         another definition of {name}"
                     )
                 });
                 (Some(decoded), strange)
             }
             Err(error) => {
-                let strange = format!("a message is no {name}: {error}");
+                let strange = format!("a message cannot be decoded as {name}: {error}");
                 (None, Some(strange))
             }
         };

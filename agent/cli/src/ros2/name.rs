@@ -37,7 +37,7 @@ pub fn is_hidden_node(name: &str) -> bool {
         .is_some_and(|name| name.starts_with('_'))
 }
 
-/// The first mistake of a name, with the index of its character.
+/// The first mistake of a name, with the index of its character. `None` for a valid name.
 fn mistake(name: &str) -> Option<(&'static str, usize)> {
     if name.is_empty() {
         return Some(("topic name must not be empty", 0));

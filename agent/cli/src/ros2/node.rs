@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_not_there_or_hidden_is_not_found() {
+    fn a_missing_or_hidden_node_is_not_found() {
         let hidden = node("/_ros2cli_1", 1);
         let said = |name, node, all| info(name, node, all);
         let refused = said("/_ros2cli_1", Some(&hidden), false).unwrap_err();

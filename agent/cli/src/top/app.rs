@@ -208,7 +208,7 @@ impl App {
         &self.rows
     }
 
-    /// Index of the selected topic in the table.
+    /// Index of the selected topic in the table. `None` if it is not shown.
     #[must_use]
     pub fn place_of_selected(&self) -> Option<usize> {
         let selected = self.selected.as_ref()?;
@@ -531,7 +531,7 @@ impl App {
         Vec::new()
     }
 
-    /// Heading of the details.
+    /// Name of the selected topic, for the heading of the details.
     #[must_use]
     pub fn selected_name(&self) -> Option<String> {
         let details = self

@@ -4,7 +4,7 @@ use super::details::Styled;
 use super::theme::Kind;
 
 const HELP: &str = "\
-rp top: a robot's topics as its agent sees them     any key goes back
+rp top: a robot's topics as its agent sees them     any key: back
 
  up down k j       select a topic         PgUp PgDn Home End g G   by pages
  / text            only names, types or states with this text; Esc: as before
@@ -16,14 +16,14 @@ rp top: a robot's topics as its agent sees them     any key goes back
  e                 events                 v   warnings only
  Tab               next pane: arrows scroll it      z   give it the screen
  w                 measure the selected topic while rp top runs (+); again: stop
- W                 go on measuring it after rp top has ended (=)
+ W                 keep measuring it after rp top ends (=)
  Esc               one step back          q Ctrl-C   quit
 
  HZ B/S     of the last seconds          WANTED   what a watch expects of HZ
  LOSS       of 30 s: lost by a writer, or on the way to a receiver, the worse
  MED P99    from the writer's timestamp to the capture; across hosts this needs
             synchronised clocks          P/S      publishers/subscribers
- STATE      ok, quiet (nothing comes), no pub, no sub, unwatched (not measured),
+ STATE      ok, quiet (no message), no pub, no sub, unwatched (not measured),
             gone; with !: slow fast late loss silent against what is expected,
             qos type hash: endpoints do not match; unseen: agent is blind here";
 

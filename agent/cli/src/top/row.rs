@@ -466,7 +466,7 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_counts_while_it_is_new_and_whoever_suffers_it() {
+    fn a_loss_counts_while_it_is_new_for_any_receiver() {
         let start = Instant::now();
         let at = |seconds: u64| start + Duration::from_secs(seconds);
         let facts = |messages: u64, lost: u64, undelivered: u64| {

@@ -19,7 +19,7 @@ pub struct Messages {
 }
 
 impl Messages {
-    /// Adds a line without its end. Returns the event that it completes.
+    /// Adds a line without its end. Returns the event if this line completes it.
     pub fn line(&mut self, line: &[u8]) -> Option<Message> {
         let line = String::from_utf8_lossy(line);
         let line = line.trim_end_matches('\r');

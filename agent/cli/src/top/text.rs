@@ -140,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_says_so() {
+    fn truncated_text_shows_a_mark() {
         assert_eq!(beginning("/camera/front", 7, '~'), "/camer~");
         assert_eq!(end("/camera/front", 7, '~'), "~/front");
         for width in [0, 1, 13, 20] {

@@ -101,7 +101,7 @@ fn version_help_and_what_is_generated_are_the_same() {
     assert_eq!(help[1], help[0]);
     assert!(both(&["completions", "bash"]).stdout.len() > 1000);
     let checked = both(&["check-config", &data("../../config/ros2probe.yaml")]);
-    assert!(checked.status.success() && text(&checked.stdout).contains("is good"));
+    assert!(checked.status.success() && text(&checked.stdout).contains("is valid"));
     let refused = both(&["check-config", "/nowhere.yaml"]);
     assert_eq!(refused.status.code(), Some(78));
 
@@ -134,7 +134,7 @@ fn tree(directory: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// The page without what is of the process, its build and its time.
+/// The page without values of the process, its build and its time.
 fn of_the_robot(page: &str) -> String {
     let other = [
         "ros2probe_build_info{",

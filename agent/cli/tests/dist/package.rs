@@ -1,4 +1,4 @@
-//! The Debian package: what is in it, and what a host is like after it was installed, upgraded,
+//! The Debian package: its content, and the state of a host after it was installed, upgraded,
 //! removed and purged, with systemd and without.
 //!
 //! Tried is a package of the binary that the tests are built with, or, where `ROS2PROBE_PACKAGES`

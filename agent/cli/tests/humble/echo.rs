@@ -105,7 +105,7 @@ fn compare(middleware: &str, part: usize) -> Compared {
             let printed = echo.message(&sample(&line.r#type), Some(&message_type), &payload);
             let printed = printed.unwrap();
             // Fast DDS estimates the length where it serializes into a buffer, not where it sends.
-            let is_estimated = printed.err.contains("bytes behind its last field");
+            let is_estimated = printed.err.contains("bytes after its last field");
             let is_plain = printed.err.is_empty();
             assert!(
                 is_plain || is_estimated && middleware == "rmw_fastrtps_cpp",

@@ -30,7 +30,7 @@ const TOPICS: [(&str, u64); 6] = [
     ("/points", 50),
     ("/tf", 1000),
 ];
-/// `echo` prints the messages of this topic by their numbers, which stand in the header's frame.
+/// `echo` prints the messages of this topic by their numbers, which are in the header's frame.
 const ECHOED: [&str; 3] = ["/imu", "/cam", "/odom"];
 /// Polling of shared memory captures at least this share of small messages, also on a busy machine.
 /// Large messages are seldom captured: their pieces reuse the same memory. The rest is always counted.
@@ -119,7 +119,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         Ok(robot.log("subscribe")? == published)
     })
     .with_context(|| robot.unreceived(&published))?;
-    // The last HEARTBEAT comes up to 3 s later, and the agent waits for missing messages.
+    // The last HEARTBEAT is sent up to 3 s later, and the agent waits for missing messages.
     std::thread::sleep(Duration::from_secs(4));
     let page = agent.scrape()?;
     hz.interrupt()?;
@@ -143,7 +143,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     let rates = hz.rates()?;
     println!("hz /imu: {rates:?}");
     let last = rates.last().context("hz printed nothing")?;
-    // Repaired messages come late: the subscriber's own rate is lower then.
+    // Repaired messages arrive late: the subscriber's own rate is lower then.
     let received = robot.rate("subscribe", "/imu")?;
     let expected = received.min(200.0) - 4.0..204.0;
     ensure!(expected.contains(last), "{rates:?}, received {received}");
@@ -227,7 +227,7 @@ struct Commands {
     hz: Rp,
 }
 
-/// The host of the nodes, with a `/dev/shm` of its own.
+/// The host of the nodes, with its own `/dev/shm`.
 struct Robot<'n> {
     network: &'n Namespace,
     shared_memory: SharedMemory,
@@ -289,7 +289,7 @@ impl<'n> Robot<'n> {
         self.directory.path().join("api.sock").display().to_string()
     }
 
-    /// A node of `humble/robot.py` in a process of its own.
+    /// A node of `humble/robot.py` in a separate process.
     fn node(&self, role: &str) -> Result<Process> {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/humble/robot.py");
         let mut enter = self.shared_memory.inside(self.network);

@@ -149,7 +149,7 @@ fn nothing_stays(agent: &Agent<'_>, api: &Api<'_>) -> Result<()> {
     for number in 0..MANY {
         let (status, answer) = api.ask("POST", &format!("r{number}/points"))?;
         ensure!(status == 201, "{number}: {status} {answer}");
-        // One that the kernel has to know of comes and goes among them.
+        // A watch that the kernel needs is added and removed among them.
         match number % 100 {
             0 => ensure!(api.ask("POST", "imu")?.0 == 201),
             50 => ensure!(api.ask("DELETE", "imu")?.0 == 204),

@@ -37,7 +37,7 @@ fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
     let above = Cgroup::create(&format!("{PREFIX}-{}-attach", std::process::id()))?;
     let link = Link::below(&above)?;
     let configuration = Configuration::at(above.path())?;
-    // The same without any agent comes first: what the machine itself cannot do shows there.
+    // The same without an agent is the baseline of the machine.
     let mut alone = Talks::start(&link)?;
     std::thread::sleep(Duration::from_secs(3));
     alone.ensure_lossless().context("without any agent")?;
@@ -101,7 +101,7 @@ fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
 }
 
 #[test]
-fn where_a_stranger_wants_to_be_alone_the_agent_looks_at_the_wire_and_says_why() -> Result<()> {
+fn beside_an_exclusive_program_the_agent_reads_the_wire_and_reports_why() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let above = Cgroup::create(&format!("{PREFIX}-{}-alone", std::process::id()))?;
     let link = Link::below(&above)?;
@@ -130,7 +130,7 @@ fn where_a_stranger_wants_to_be_alone_the_agent_looks_at_the_wire_and_says_why()
 }
 
 #[test]
-fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()> {
+fn a_recreated_cgroup_is_seen_again_and_reported_while_it_is_missing() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let name = format!("{PREFIX}-{}-anew", std::process::id());
     // The agent is in none of the groups that go.
@@ -186,7 +186,7 @@ fn a_cgroup_that_is_made_anew_is_seen_again_and_missed_meanwhile() -> Result<()>
 }
 
 #[test]
-fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
+fn a_briefly_missing_cgroup_is_reported_and_seen_again() -> Result<()> {
     let _turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
     let elsewhere = Namespace::alone()?;
     let above = Cgroup::create(&format!("{PREFIX}-{}-moment", std::process::id()))?;
@@ -221,7 +221,7 @@ fn a_cgroup_that_is_gone_for_a_moment_is_told_and_seen_again() -> Result<()> {
     ensure_nothing_attached(above.path(), 0)
 }
 
-/// Removes a cgroup that has no processes any more, and waits.
+/// Removes a cgroup after its last process, and waits.
 fn remove_until(cgroup: &Path, noticed: impl Fn() -> bool) -> Result<()> {
     eventually(|| Ok(std::fs::remove_dir(cgroup)?))?;
     eventually(|| {
@@ -397,7 +397,7 @@ fn eventually(what: impl Fn() -> Result<()>) -> Result<()> {
     }
 }
 
-/// Kills a process, and returns how many programs it held, all gone by then.
+/// Kills a process and returns how many programs it held. All are unloaded on return.
 fn kill(agent: &mut Process) -> Result<usize> {
     let programs = bpf::programs_of(agent.pid())?;
     agent.signal("KILL")?;

@@ -115,7 +115,7 @@ fn best_effort(source: Source, stack: Stack) -> Result<()> {
         "{} of {lost} noticed by the receiver",
         seen.before_host
     );
-    // Each rate is of what came after the first scrape, which was during the first stretch.
+    // Each rate starts with the first scrape, during the first stretch.
     let lost_of = |received: u64, published: u64| 1.0 - received as f64 / published as f64;
     let least = lost_of(seen.received, seen.published - STRETCH);
     let most = lost_of(seen.received - STRETCH, seen.published);

@@ -103,7 +103,7 @@ fn a_recording_goes_from_its_start_to_the_files_that_are_downloaded() -> Result<
 }
 
 #[test]
-fn the_page_goes_on_with_an_agent_that_hung_ended_or_was_killed() -> Result<()> {
+fn the_page_continues_after_the_agent_hung_ended_or_was_killed() -> Result<()> {
     let place = Place::new()?;
     let mut agent = Some(place.agent(SENSORS)?);
     let mut robot = Some(Robot::start(&place.host)?);

@@ -286,7 +286,7 @@ impl Exchange {
         std::thread::sleep(capture::SETTLE);
         let counts = loss.as_ref().map(Loss::counts).transpose()?;
         publisher.process.terminate().context("the publisher")?;
-        // Once the writer has gone everything about it is decided.
+        // Once the writer is gone, all its losses have a cause.
         let sent = publisher.log()?;
         let writer = writer_of(&sent, &stream.topic)?;
         let ends = [

@@ -54,7 +54,7 @@ fn an_agent_that_starts_after_half_of_the_rust_dds_nodes_shows_all() -> Result<(
 
 #[test]
 fn a_late_agent_shows_writers_it_cannot_name_with_their_rate() -> Result<()> {
-    // Each on a link of its own, so none has to wait for the others.
+    // Each on a separate link, so none has to wait for the others.
     std::thread::scope(|scope| {
         let stacks = Stack::ALL.map(|stack| scope.spawn(move || late_agent_shows_rate(stack)));
         stacks
@@ -137,7 +137,7 @@ fn the_same_topic_of_two_domains_is_two_topics() -> Result<()> {
 fn nodes_that_stop_are_gone_at_once_and_killed_ones_when_their_lease_ends() -> Result<()> {
     let link = Link::new()?;
     let watcher = Watcher::start(&link.robot)?;
-    // Each in a domain of its own: an assertion of Fast DDS 2.9 ends it when it meets RustDDS.
+    // Each in a separate domain: an assertion of Fast DDS 2.9 fails when it discovers RustDDS.
     let node = |stack, name| {
         let stream = Stream {
             domain: stack as u16,
@@ -245,7 +245,7 @@ fn watchers(link: &Link) -> Result<[Watcher<'_>; 2]> {
     ])
 }
 
-/// Sixteen processes of one node each, on both hosts, that all publish or subscribe one topic.
+/// Sixteen processes of one node each, on both hosts, that all publish or subscribe to one topic.
 struct Robot<'a> {
     link: &'a Link,
     stack: Stack,
@@ -263,7 +263,7 @@ impl<'a> Robot<'a> {
         }
     }
 
-    /// Starts so many more nodes at the same time, and waits until they have their endpoints.
+    /// Starts this many more nodes at the same time, and waits until they have their endpoints.
     fn launch(&mut self, count: usize) -> Result<()> {
         let first = self.peers.len();
         for number in first..first + count {

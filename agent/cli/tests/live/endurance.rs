@@ -156,7 +156,7 @@ fn memory_is_flat(curve: &Curve, long: Duration) -> Result<()> {
 }
 
 #[test]
-fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() -> Result<()> {
+fn an_agent_stopped_for_seconds_removes_no_participant_and_counts_what_it_missed() -> Result<()> {
     let link = Link::new()?;
     // Its ring holds a second and a half; one of the default size holds six.
     let robot = Robot::start(
@@ -169,7 +169,7 @@ fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() 
     views.compare(&mut crowd)?;
     let pauses = soak::long().map_or(&[5][..], |_| &[5, 60]);
     for pause in pauses.iter().copied().map(Duration::from_secs) {
-        // Until those are gone that went without a word.
+        // Until participants that left silently have expired.
         crowd.rest(Duration::from_secs(5))?;
         let expired = robot.expired()?;
         robot.agent.process.signal("STOP")?;
@@ -210,8 +210,7 @@ fn who_was_stopped_for_seconds_believes_nobody_gone_and_counts_what_it_missed() 
 }
 
 #[test]
-fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_exact() -> Result<()>
-{
+fn an_overloaded_agent_counts_what_it_drops_and_is_exact_afterwards() -> Result<()> {
     let link = Link::new()?;
     // Room for some 500 records.
     let small = "watch: [/**]\ncapture: {source: wire, record_ring_bytes: 65536}\n";
@@ -235,7 +234,7 @@ fn what_an_overloaded_agent_cannot_take_is_counted_and_what_comes_afterwards_is_
         }
         std::thread::sleep(Duration::from_millis(10));
     }
-    // A stopped agent reads no record at all.
+    // A stopped agent reads no record.
     robot.agent.process.signal("STOP")?;
     for _ in 0..2000 {
         sender.carry(&flood.sample(1200))?;
@@ -336,7 +335,7 @@ fn fragments_count_once_while_the_mtu_changes() -> Result<()> {
 }
 
 #[test]
-fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()> {
+fn a_removed_network_namespace_is_reported_and_affects_no_other() -> Result<()> {
     let link = Link::new()?;
     let other = Namespace::alone()?;
     let place = other.network();
@@ -369,12 +368,12 @@ fn a_network_namespace_that_goes_is_told_and_takes_nothing_along() -> Result<()>
         "{}",
         page.0
     );
-    // Another one at the path is not the one that is captured.
+    // Another namespace at the path is not the captured one.
     run(&format!("ip netns add {}", name))?;
     std::thread::sleep(Duration::from_secs(2));
     ensure!(robot.readiness()? == "503", "another namespace is observed");
     run(&format!("ip netns delete {}", name))?;
-    // The robot's whole network goes: the cable with it.
+    // Removes the robot's whole network, with the cable.
     drop(sender);
     run(&format!("ip -n {} link delete eth0", link.robot.name()))?;
     std::thread::sleep(Duration::from_secs(2));

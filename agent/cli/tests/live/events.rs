@@ -47,7 +47,7 @@ fn wait_for(receiver: &Rotel, name: &str, attribute: &str, value: &str) -> Resul
 }
 
 #[test]
-fn a_receiver_is_told_who_came_what_was_lost_and_who_fell_silent() -> Result<()> {
+fn a_receiver_gets_events_of_new_nodes_losses_and_silence() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let [enter, words @ ..] = &link.monitor.outside();

@@ -41,7 +41,7 @@ const REPEAT: Duration = Duration::from_secs(3);
 /// machine.
 const ENDING: Duration = Duration::from_secs(8);
 
-/// An agent on a host of its own, and a place for its files.
+/// An agent on a separate host, with a directory for its files.
 struct Scene<'a> {
     agent: Agent<'a>,
     log: PathBuf,

@@ -111,7 +111,7 @@ fn counted_as_logged(stack: Stack) -> Result<()> {
 }
 
 #[test]
-fn who_receives_is_named_by_process_and_control_group() -> Result<()> {
+fn a_receiver_is_named_by_process_and_control_group() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let socket = directory.path().join("api.sock");
@@ -220,7 +220,7 @@ fn a_mirrored_interface_shows_what_no_socket_receives_and_counts_nothing_twice()
 }
 
 #[test]
-fn left_to_itself_the_agent_looks_at_the_sockets_and_says_so() -> Result<()> {
+fn by_default_the_agent_reads_at_the_sockets_and_reports_it() -> Result<()> {
     let host = Namespace::alone()?;
     let cgroup = host.cgroup().display();
     let observed = Observed::start(&host, &format!("capture: {{cgroup: {cgroup}}}\n"))?;
@@ -460,7 +460,7 @@ fn write_start(directory: &TempDir, capabilities: &str) -> Result<()> {
     Ok(())
 }
 
-/// A publisher that holds its samples, and a subscriber that knows it.
+/// A publisher that holds its samples, and a subscriber matched with it.
 fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
     let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
     let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
@@ -474,7 +474,7 @@ fn count(page: &Scrape, what: &str, topic: &str) -> u64 {
     page.sum(&name, &[("topic", topic)]) as u64
 }
 
-/// The topic's publisher came and went.
+/// Returns whether the topic's publisher appeared and left.
 fn gone(page: &Scrape, topic: &str) -> bool {
     publishers(page, topic) == Some(0.0)
 }

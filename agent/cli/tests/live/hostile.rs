@@ -80,8 +80,8 @@ fn a_flood_of_samples_of_a_watched_topic_takes_nothing_from_the_others() -> Resu
 }
 
 #[test]
-fn a_crowd_of_forgeries_that_fills_every_table_leaves_memory_bounded_and_goes_with_its_leases()
--> Result<()> {
+fn forgeries_that_fill_every_table_leave_memory_bounded_and_expire_with_their_leases() -> Result<()>
+{
     let link = Link::new()?;
     let target = format!("{}:{NOBODY}", link.robot.address());
     let source = format!("{}:0", link.monitor.address());
@@ -93,19 +93,19 @@ fn a_crowd_of_forgeries_that_fills_every_table_leaves_memory_bounded_and_goes_wi
 }
 
 #[test]
-fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_on_a_topic_watched_by_name()
+fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_if_watched_by_name()
 -> Result<()> {
     behind_a_flood(|_| ON_THE_WIRE.to_owned())
 }
 
 #[test]
-fn who_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets() -> Result<()>
-{
+fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_at_the_sockets()
+-> Result<()> {
     behind_a_flood(|link| at_the_sockets_of(&link.robot))
 }
 
 #[test]
-fn three_capabilities_are_enough_for_a_user_who_has_nothing_else() -> Result<()> {
+fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| directory.path().join(name);

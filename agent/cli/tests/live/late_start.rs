@@ -17,7 +17,7 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use tempfile::TempDir;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Endpoints are announced once: a restarted agent knows a name by then, or never.
+/// Endpoints are announced once: a restarted agent has a name by then, or never.
 const AT_ONCE: Duration = Duration::from_secs(5);
 /// Two announcements of each participant.
 const AFTERWARDS: Duration = Duration::from_secs(7);
@@ -28,22 +28,22 @@ const TALKATIVE: &str = "CYCLONEDDS_URI=<Discovery><SPDPInterval>3s</SPDPInterva
 const NODES: [&str; 3] = ["/camera", "/listener", "/talker"];
 
 #[test]
-fn an_agent_restarted_on_a_running_fast_dds_robot_knows_all_names() -> Result<()> {
+fn an_agent_restarted_on_a_running_fast_dds_robot_has_all_names() -> Result<()> {
     restarted_on_a_running_robot(Stack::Fast)
 }
 
 #[test]
-fn an_agent_restarted_on_a_running_cyclone_dds_robot_knows_all_names() -> Result<()> {
+fn an_agent_restarted_on_a_running_cyclone_dds_robot_has_all_names() -> Result<()> {
     restarted_on_a_running_robot(Stack::Cyclone)
 }
 
 #[test]
-fn a_running_fast_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+fn a_running_fast_dds_robot_repeats_all_names_on_request() -> Result<()> {
     asked(Stack::Fast)
 }
 
 #[test]
-fn a_running_cyclone_dds_robot_that_is_asked_tells_all_names() -> Result<()> {
+fn a_running_cyclone_dds_robot_repeats_all_names_on_request() -> Result<()> {
     asked(Stack::Cyclone)
 }
 

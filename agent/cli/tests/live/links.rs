@@ -133,7 +133,7 @@ fn a_tunnel_without_a_link_layer_is_seen() -> Result<()> {
 }
 
 #[test]
-fn an_interface_that_appears_later_is_seen_and_one_that_goes_down_does_not_make_the_agent_spin()
+fn an_interface_that_appears_later_is_seen_and_one_set_down_does_not_make_the_agent_spin()
 -> Result<()> {
     let link = Link::new()?;
     let observed = Observed::start(&link.monitor, WATCH_ALL)?;
@@ -273,7 +273,7 @@ fn a_container_is_looked_into_by_the_path_of_its_network() -> Result<()> {
 }
 
 #[test]
-fn a_network_namespace_whose_path_is_gone_for_a_while_is_missed_meanwhile() -> Result<()> {
+fn a_network_namespace_is_reported_while_its_path_is_missing() -> Result<()> {
     let link = Link::new()?;
     let path = link.robot.network();
     let place = path.display();

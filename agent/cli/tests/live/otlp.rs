@@ -1,5 +1,5 @@
 //! Two hosts of the demo robot, an agent and a real OpenTelemetry receiver on each: both report the
-//! same traces, and a receiver that goes and comes back costs no capture.
+//! same traces, and a receiver that stops and returns costs no capture.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -60,7 +60,7 @@ fn field(item: &Item, name: &str) -> Result<String> {
 }
 
 #[test]
-fn two_hosts_report_the_same_traces_and_a_receiver_that_goes_costs_no_capture() -> Result<()> {
+fn two_hosts_report_the_same_traces_and_a_stopped_receiver_costs_no_capture() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let mut at_robot = Rotel::start(&mut on(&link.robot), directory.path(), None);

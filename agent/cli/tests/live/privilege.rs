@@ -83,7 +83,7 @@ fn three_capabilities_are_enough_at_the_sockets() -> Result<()> {
 }
 
 #[test]
-fn an_agent_that_may_only_look_at_the_wire_says_so() -> Result<()> {
+fn an_agent_permitted_only_on_the_wire_reports_it() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let agent = start(
@@ -107,7 +107,7 @@ fn an_agent_that_may_only_look_at_the_wire_says_so() -> Result<()> {
     Ok(())
 }
 
-/// A host that knows the package's user, and the files that package and service manager make.
+/// A host with the package's user and the files that package and service manager create.
 fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     for (name, line) in [
@@ -148,7 +148,7 @@ fn installed(host: &Namespace, file: &impl Fn(&str) -> PathBuf) -> Result<()> {
 }
 
 #[test]
-fn who_root_starts_becomes_the_package_s_user_and_writes_no_file_of_root_s() -> Result<()> {
+fn started_by_root_the_agent_becomes_the_packages_user_and_writes_no_file_of_roots() -> Result<()> {
     let host = Namespace::alone()?;
     let directory = tempfile::tempdir()?;
     let file = |name: &str| -> PathBuf { directory.path().join(name) };
@@ -217,7 +217,7 @@ fn an_agent_that_cannot_get_rid_of_its_capabilities_serves_nothing() -> Result<(
         .args(["run", "--replay"])
         .arg(capture)
         .args(listeners);
-    // SAFETY: what is done between fork and exec is two system calls on memory that was there before.
+    // SAFETY: between fork and exec are only two system calls, on memory allocated before.
     unsafe {
         command.pre_exec(move || seccompiler::apply_filter(&lie).map_err(io::Error::other));
     }
@@ -376,7 +376,7 @@ fn confined(process: u32, user: u32) -> Result<BTreeSet<String>> {
             let kept: &[&str] = match name {
                 // Before Linux 5.19 that is what changing maps takes.
                 "capture" if may_keep => &[NOTHING, BPF_ALONE],
-                // It attaches to a control group that is made anew.
+                // It attaches to a control group that is created again.
                 "cgroup" if may_keep => &[NET_ADMIN_ALONE, NET_ADMIN_AND_BPF],
                 _ => &[NOTHING],
             };

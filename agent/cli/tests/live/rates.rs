@@ -229,7 +229,7 @@ fn open(agent: &Agent<'_>, wanted: u32) -> Result<()> {
     page.map(drop)
 }
 
-/// Ends when its reader has gone, without a word, as any program does.
+/// Ends silently once its reader is gone, as any program does.
 fn piped_into_head(socket: &Path) -> Result<()> {
     let rp = env!("CARGO_BIN_EXE_rp");
     let script = format!(
@@ -301,7 +301,7 @@ impl Client {
         })
     }
 
-    /// So many more lines than now.
+    /// This many more lines than now.
     fn reports(&self, more: usize) -> Result<()> {
         let now = self.printed().len();
         let what = format!("{} goes on", self.name);

@@ -197,7 +197,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
             let all = recorded.len() as u64 + missing;
             ensure!(all == *count, "{topic}: {report:#}\n{}", page.doubts());
         }
-        // The largest goes first, so that what is small is whole.
+        // The largest is dropped first, so small messages stay complete.
         let is_large = *topic == "/front";
         ensure!((dropped > 10) == is_large, "{topic}: {report:#}");
         ensure!(is_large || dropped == 0, "{topic}: {report:#}");
@@ -212,7 +212,7 @@ fn a_slow_reader_loses_the_largest(robot: &Robot<'_>, pairs: &mut [Pair]) -> Res
 }
 
 #[test]
-fn a_recording_is_led_by_its_client_and_outlives_whoever_is_killed() -> Result<()> {
+fn a_recording_is_controlled_by_its_client_and_outlives_it() -> Result<()> {
     let _shared = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
     let host = Namespace::alone()?;
     let settings = "watch: [{topic: /imu, max_silence_s: 4}]\n\
@@ -460,7 +460,7 @@ fn whole(bag: &Path, report: &Value) -> Result<()> {
         recorded.len()
     );
     ensure!(report["bytes"] == recorded.len() * SCAN, "{report:#}");
-    // Without a gap, but for what is reported as missing.
+    // Without a gap, except for messages reported as missing.
     ensure!(
         span(&recorded)? <= recorded.len() as u64 + missing(report, "/points"),
         "{recorded:?} {report:#}"

@@ -27,7 +27,7 @@ use tempfile::TempDir;
 /// Of point clouds.
 const SIZES: [usize; 2] = [644_000, 2_720_000];
 const PATIENCE: Duration = Duration::from_secs(60);
-/// After so long nothing more comes of what a publisher has sent, where the agent lost some of it.
+/// After this time no more of a publisher's samples arrive, even if the agent lost some of them.
 const QUIET: Duration = Duration::from_secs(6);
 /// As the peers announce it, ROS style.
 const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
@@ -66,7 +66,7 @@ fn payloads_are_what_was_sent(
     for size in sizes.iter().copied() {
         let link = Link::new()?;
         let source = source(&link.robot);
-        // Frames that find no room in a packet ring are not seen at all.
+        // Frames that find no room in a packet ring are not seen.
         let lossless_metering = source != ON_THE_WIRE;
         let observed = Observed::start(&link.robot, &source)?;
         let stream = Stream {
@@ -132,7 +132,7 @@ fn payloads_are_what_was_sent(
     Ok(())
 }
 
-/// Checks that each sample is there or reported as missing.
+/// Checks that each sample is delivered or reported as missing.
 fn all_is_there_or_counted(
     observed: &Observed<'_>,
     received: usize,
@@ -192,7 +192,7 @@ fn check(payload: &[u8], pattern: &[u8]) -> Result<u64> {
     Ok(u64::from_le_bytes(*number))
 }
 
-/// Opens a stream, and again until it knows this topic.
+/// Opens streams until one has this topic.
 fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines<'a>> {
     let deadline = Instant::now() + PATIENCE;
     loop {
@@ -216,7 +216,7 @@ fn open<'a>(client: &'a client::Agent, query: &str, topic: &str) -> Result<Lines
 enum News {
     Sample(Sample, Vec<u8>),
     Missed(Missed),
-    /// The clock goes on, and nothing else came.
+    /// Only the clock advanced.
     Nothing,
 }
 
@@ -308,7 +308,7 @@ fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Resu
 /// Ten clients at once: one never reads, one is killed. The others receive everything, the interest
 /// of closed clients ends, and memory stays bounded.
 #[test]
-fn readers_that_stop_or_die_hold_nobody_up() -> Result<()> {
+fn readers_that_stop_or_die_delay_no_other() -> Result<()> {
     let host = Namespace::alone()?;
     let limits = "limits: {payload_bytes: 8388608, subscriptions: 12}\n";
     let observed = Observed::start(&host, &format!("{limits}{}", at_the_sockets_of(&host)))?;

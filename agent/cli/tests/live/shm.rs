@@ -1,7 +1,7 @@
 //! Fast DDS with its default transports on one host: user data, endpoints and node names go through
 //! shared memory, and only participants show on the network. The agent reads it without a trace.
 //!
-//! Each host has a `/dev/shm` of its own, in a mount namespace as a container has it, which the
+//! Each host has its own `/dev/shm`, in a mount namespace as a container has it, which the
 //! agent reaches through `/proc`. The references are the peers' logs, and the agent's system calls
 //! as strace prints them.
 
@@ -22,7 +22,7 @@ use ros2probe_testing::harness::wait_until;
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Share of samples seen that a test requires, on a machine with other load.
 const COVERAGE: f64 = 0.1;
-/// Most attempts to start a pair before the agent knows its names.
+/// Most attempts to start a pair before the agent has its names.
 const MEETINGS: u32 = 12;
 
 #[test]
@@ -248,7 +248,7 @@ fn shows_all_pairs(page: &Scrape) -> bool {
 }
 
 #[test]
-fn where_histories_are_shared_nothing_is_seen_and_the_agent_says_so() -> Result<()> {
+fn with_shared_histories_nothing_is_seen_and_the_agent_reports_it() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -376,7 +376,7 @@ fn whether_peers_lose_or_wait_more_with_an_agent_beside_them() -> Result<()> {
     Ok(())
 }
 
-/// A host with a `/dev/shm` of its own.
+/// A host with its own `/dev/shm`.
 struct Host<'n> {
     network: &'n Namespace,
     /// Keeps the mount namespace.
@@ -403,7 +403,7 @@ impl<'n> Host<'n> {
         Peer::launch_behind(&enter, stack, role, stream, &[&node_of(role, stream)])
     }
 
-    /// A publisher and its subscriber that know each other.
+    /// A publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let mut subscriber = self.launch(Role::Subscriber, stream)?;
         subscriber.wait_ready()?;
@@ -420,7 +420,7 @@ impl<'n> Host<'n> {
         pairs.pop().context("no pair")
     }
 
-    /// As [`Self::pair`] for each stream, until the agent knows all by name. Names are announced
+    /// As [`Self::pair`] for each stream, until the agent has all names. Names are announced
     /// once, and their memory is reused within a moment: a tap without CPU time in that moment
     /// misses them.
     fn known_pairs(&self, agent: &Agent<'_>, streams: &[Stream]) -> Result<Vec<(Peer, Peer)>> {
@@ -486,7 +486,7 @@ fn node_of(role: Role, stream: &Stream) -> String {
     }
 }
 
-/// Returns whether the agent knows both nodes and both endpoints of the stream's topic.
+/// Returns whether the agent has both nodes and both endpoints of the stream's topic.
 fn is_known(page: &Scrape, stream: &Stream) -> bool {
     let nodes = page.labels_of("ros2_node_info", "ros_node");
     let roles = [Role::Publisher, Role::Subscriber];

@@ -87,13 +87,13 @@ fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
     }
     publisher.go()?;
     publisher.wait_sent(PATIENCE)?;
-    // Of the burst itself Fast DDS overwrites what it has not got to its reader, agent or not.
+    // During the burst Fast DDS overwrites unread samples, with or without an agent.
     assert_eq!(received(&mut subscriber, BURST, SAMPLES)?, SAMPLES);
     Ok(())
 }
 
 #[test]
-fn without_what_it_takes_shared_memory_is_sampled_and_the_reason_is_told() -> Result<()> {
+fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reported() -> Result<()> {
     let host = Host::new()?;
     let directory = tempfile::tempdir()?;
     let lacking = ["setpriv", "--bounding-set", "-sys_admin"].map(str::to_owned);
@@ -141,7 +141,7 @@ fn without_what_it_takes_shared_memory_is_sampled_and_the_reason_is_told() -> Re
 }
 
 #[test]
-fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> {
+fn a_recreated_cgroup_is_sampled_and_the_reason_reported() -> Result<()> {
     let mut host = Host::new()?;
     let observed = host.network.cgroup().join("observed");
     fs::create_dir(&observed)?;
@@ -203,7 +203,7 @@ fn a_cgroup_that_is_made_anew_is_sampled_and_the_reason_is_told() -> Result<()> 
     fs::remove_dir(&observed).context("the observed cgroup")
 }
 
-/// A host with a `/dev/shm` of its own.
+/// A host with its own `/dev/shm`.
 struct Host {
     network: Namespace,
     /// That its nodes are in.
@@ -226,7 +226,7 @@ impl Host {
         })
     }
 
-    /// A publisher and its subscriber that know each other.
+    /// A publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let mut subscriber = self.launch(Role::Subscriber, stream)?;
         subscriber.wait_ready()?;
@@ -261,7 +261,7 @@ fn shared(topic: &str) -> Stream {
     }
 }
 
-/// An agent behind some words of its own.
+/// Starts an agent with `words` as the beginning of its command.
 fn start_agent<'a>(host: &'a Namespace, directory: &Path, words: &[String]) -> Result<Agent<'a>> {
     start_agent_at(host, host.cgroup(), directory, words)
 }

@@ -36,7 +36,7 @@ fn running_nodes_send_the_same_before_beside_and_after_the_agent() -> Result<()>
     phases.push(unix_seconds());
     let mut agent = start_agent(&link.robot, directory.path())?;
     std::thread::sleep(PHASE);
-    // It came too late for most announcements; what goes on it sees all the same.
+    // It started after most announcements, but sees the traffic.
     let messages = |page: &Scrape| {
         page.sum("ros2_topic_messages_total", &[])
             + page.sum("ros2_unknown_writer_messages_total", &[])

@@ -6,7 +6,7 @@ import { reads, scenario, there, until } from './tab.mjs';
 await scenario(async (open) => {
   const tab = await open();
   await tab.live();
-  // The time bar: what all figures are of.
+  // The time bar: the time of all figures.
   const bar = tab.page.locator('.timebar');
   await until('the end of the capture', async () => /finished/.test(await bar.innerText()));
   await reads(bar, /2026-\d\d-\d\d \d\d:\d\d:\d\d, .* after the begin/);

@@ -1,4 +1,4 @@
-// The message of a topic as it comes: a tree that is folded and unfolded, and a chart of a number
+// The current message of a topic: a tree that is folded and unfolded, and a chart of a number
 // in it. The agent decodes only while the tree is open.
 
 import assert from 'node:assert/strict';
@@ -41,7 +41,7 @@ await scenario(async (open) => {
   // At most five a second, whatever the topic's rate; how many were left out is shown.
   await until('what was not shown', async () => /\d+ not shown before it/
     .test(await section.innerText()));
-  // Closed means that the agent decodes nothing any more.
+  // While it is closed, the agent decodes nothing.
   assert.equal((await ask('streams')).messages, 1);
   await section.getByRole('button', { name: 'Close' }).click();
   await until('the agent is left alone', async () => (await ask('streams')).messages === 0);

@@ -1,4 +1,4 @@
-// A best-effort publisher and a reliable subscriber: the finding comes first, and leads to the two
+// A best-effort publisher and a reliable subscriber: the finding is first, and leads to the two
 // endpoints side by side with the policy that does not fit.
 
 import assert from 'node:assert/strict';
@@ -35,6 +35,6 @@ await scenario(async (open) => {
   await there(tab.page.locator('.edge .sign.error'));
   await tab.page.getByRole('combobox', { name: 'Show' }).selectOption('nodes');
   await until('the pair', async () => (await tab.page.locator('.edge.pair, .edge').count()) > 0);
-  // A screen reader hears of new findings only: none came since the page was opened.
+  // A screen reader hears of new findings only: none since the page was opened.
   assert.equal(await tab.page.locator('[aria-live="polite"]').innerText(), '');
 });

@@ -1,4 +1,4 @@
-// A recording from its start to the file on the disk of the one who looks; and a snapshot.
+// A recording from its start to the downloaded file; and a snapshot.
 
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';

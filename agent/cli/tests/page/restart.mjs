@@ -1,5 +1,5 @@
-// The agent stops answering, ends, and starts anew: the page says so, keeps the last figures, and
-// goes on by itself with the new agent's state and nothing of the old one.
+// The agent stops answering, ends, and restarts: the page reports it, keeps the last figures, and
+// continues without a reload with the new agent's state and nothing of the old one.
 
 import assert from 'node:assert/strict';
 import { ask, gone, scenario, until } from './tab.mjs';
@@ -7,12 +7,12 @@ import { ask, gone, scenario, until } from './tab.mjs';
 await scenario(async (open) => {
   const tab = await open({ fragment: '#/topics' });
   await tab.live();
-  // Requests to an agent that is gone leave a line of the browser's own.
+  // The browser logs requests to an agent that is gone.
   tab.expect(/^error: Failed to load resource: net::ERR_/);
   const row = (name) => tab.page.locator('main tbody tr[data-row]', { hasText: name });
   await until('figures', async () => /Hz/.test(await row('/imu').innerText()));
 
-  // It hangs: no line comes and no connection breaks.
+  // It hangs: no line arrives and no connection breaks.
   await ask('freeze');
   await tab.shows('No connection', 'body');
   assert.match(await row('/imu').innerText(), /Hz/, 'the last figures stay');

@@ -67,7 +67,7 @@ async function topic(tab) {
   await until('charts', async () => (await tab.page.locator('.plot canvas').count()) === 5);
   const chart = tab.page.getByRole('img', { name: /^Rate over the last ten minutes/ });
   await until('a rate', async () => /rate: last [1-9]/.test(await chart.getAttribute('aria-label')));
-  // The chart goes on: a second later there is another second.
+  // The chart continues: a second later it has another second.
   const seconds = () => tab.page.evaluate(() =>
     document.querySelector('.plot .uplot') && performance.now());
   assert.ok(await seconds());
@@ -127,7 +127,7 @@ async function graph(tab) {
   });
   const wide = widths.filter(([, width]) => width > 4);
   assert.ok(wide.every(([title]) => /MB\/s/.test(title)), JSON.stringify(widths));
-  // From left to right: a publisher stands left of its topic.
+  // From left to right: a publisher is left of its topic.
   const [lidar, points] = [await vertex('/lidar').boundingBox(), await vertex('/points').boundingBox()];
   assert.ok(lidar.x + lidar.width <= points.x, 'left to right');
   // Keys walk along the edges and choose.
@@ -211,7 +211,7 @@ async function events(tab) {
   await until('filtered events', async () => (await rows()) > 0 && (await rows()) < all);
   await tab.page.getByRole('button', { name: 'Pause' }).last().click();
   const held = await rows();
-  // Another node comes while the list stands still.
+  // Another node appears while the list is not scrolled.
   await ask('another node');
   await tab.page.getByLabel('Filter').fill('late_comer');
   await tab.shows(/Continue \(\d+ new event/);

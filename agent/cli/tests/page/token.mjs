@@ -1,6 +1,6 @@
 // Where loopback lacks the rights, the page requires a token once: in the address that `rp page`
 // prints, or pasted. The page removes it from the address at once and keeps it in its tab only.
-// Arguments: address of an agent whose loopback grants `read`, address of one that wants a token.
+// Arguments: address of an agent whose loopback grants `read`, address of one that requires a token.
 
 import assert from 'node:assert/strict';
 import { ADDRESS, ask, gone, scenario, until } from './tab.mjs';
@@ -22,7 +22,7 @@ async function loopback(open, browser) {
   await tab.page.getByRole('link', { name: 'Agent', exact: true }).click();
   await tab.shows(/Rights at this address\s+read/);
 
-  // A wrong one changes nothing, and says so.
+  // A wrong one changes nothing and is reported.
   await tab.page.getByRole('button', { name: 'Enter a token' }).click();
   await tab.page.getByLabel('Token', { exact: true }).last().fill('0'.repeat(64));
   await tab.page.getByRole('button', { name: 'Use this token' }).click();
@@ -78,7 +78,7 @@ async function strict(open) {
   const tab = await open({ address: STRICT });
   tab.expect(REFUSED);
   await tab.page.getByRole('dialog', { name: 'Token' }).waitFor();
-  await tab.shows('The agent asks for a token at this address.', 'dialog');
+  await tab.shows('This address requires a token.', 'dialog');
   await tab.accessible('login');
   await tab.page.getByLabel('Token', { exact: true }).last().fill('not the right one');
   await tab.page.getByRole('button', { name: 'Use this token' }).click();

@@ -207,7 +207,7 @@ fn what_cannot_be_is_answered_with_a_problem_that_says_why() {
     }
     let refused = ask(&agent, "PATCH", "/watch/a", "", "");
     assert!(refused.headers.contains("allow: "), "{}", refused.headers);
-    // What has no body may say what it likes about it; a name may come whole.
+    // Without a body its content type is irrelevant; a name may contain slashes.
     assert_eq!(ask(&agent, "POST", "/watch/%2Fa", FORM, "").status, 201);
     assert_eq!(ask(&agent, "GET", "/watch/a", "", "").status, 200);
     let document: Value =
@@ -287,7 +287,7 @@ fn the_service_managers_directory_has_the_socket_of_one_agent_and_no_other_takes
 }
 
 #[test]
-fn a_token_a_foreign_name_and_a_foreign_page_are_told_apart() {
+fn a_token_a_foreign_name_and_a_foreign_page_have_separate_answers() {
     let directory = tempfile::tempdir().unwrap();
     let (config, token) = (
         directory.path().join("config.yaml"),
@@ -364,7 +364,7 @@ fn commands(section: &str) -> Vec<(String, String)> {
     commands.collect()
 }
 
-/// Without what is another number each time.
+/// Without values that differ each time.
 fn masked(text: &str) -> String {
     let mut masked = text.to_owned();
     for key in ["\"messages\":", "\"rate_hertz\":", "topic=\"/chatter\"} "] {

@@ -40,7 +40,7 @@ fn get<T: DeserializeOwned + Serialize>(agent: &LocalAgent, path: &str) -> T {
     asked(agent, "GET", path, (), 200)
 }
 
-/// A replay that goes on for longer than the test, with a place for bags.
+/// A replay that outlasts the test, with a directory for bags.
 fn agent(capture: &str, configuration: &Path) -> LocalAgent {
     let configuration = configuration.to_str().unwrap();
     let arguments = ["--speed", "0.5", "--config", configuration];
@@ -103,7 +103,7 @@ fn recordings(agent: &LocalAgent) {
     assert_eq!(list.snapshots.len(), 1);
 }
 
-/// The topic of which most messages come.
+/// The topic with the most messages.
 fn published(agent: &LocalAgent) -> String {
     let list: RecordingList = get(agent, "/recordings");
     let topics = &list.recordings[0].report.topics;

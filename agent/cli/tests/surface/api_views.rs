@@ -29,7 +29,7 @@ use ros2probe_testing::truth::{self, GraphLine, Scenario};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use serde_json::Value;
 
-/// Nodes know announcements after half a second.
+/// Nodes have processed announcements after half a second.
 const SETTLED: u64 = 500_000_000;
 
 /// A capture of which the agent has seen all up to a moment.
@@ -65,7 +65,7 @@ impl Robot {
         serde_json::from_str(&answer.body).unwrap()
     }
 
-    /// Status, code and detail of what is refused.
+    /// Status, code and detail of a refusal.
     fn problem(&self, path: &str) -> (u16, String, String) {
         let answer = self.ask(path);
         let body: Value = serde_json::from_str(&answer.body).unwrap();
@@ -141,7 +141,7 @@ fn topics_services_and_nodes_are_those_that_a_real_node_believed_in() {
     let mut compared = 0;
     for scenario in data("lifecycle-2ns") {
         for (witness, lines) in scenario.graphs() {
-            // The first: the whole robot. The last: what is left of it.
+            // The first: the whole robot. The last: its remainder.
             let all: Vec<_> = settled(&lines).collect();
             let (Some(first), Some(last)) = (all.first(), all.last()) else {
                 continue;
@@ -375,7 +375,7 @@ fn what_is_asked_wrongly_is_refused_with_a_hint(robot: &Robot) {
 #[test]
 fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
     let capture = capture_of("qos-mismatch-2ns");
-    // Before they say goodbye.
+    // Before the participants leave.
     let goodbye = 1_795_142_070_000_000_000;
     let robot = Robot::at(&capture, goodbye, "/chatter_be");
     let topic = robot.get("/topics/chatter_be");
@@ -402,7 +402,7 @@ fn a_mismatch_of_real_participants_is_named_in_the_topic_and_as_a_metric() {
 
 #[test]
 fn each_answer_reads_as_its_type_and_writes_the_same_again() {
-    // Before they say goodbye.
+    // Before the participants leave.
     let goodbye = 1_795_142_070_000_000_000;
     let robot = Robot::at(&capture_of("qos-mismatch-2ns"), goodbye, "/**");
     let topics: TopicList<'_> = read_as(&robot.get("/topics"));
@@ -483,7 +483,7 @@ fn read_all(robot: &Robot) {
 }
 
 #[test]
-fn what_goes_through_shared_memory_is_not_called_silent() {
+fn a_topic_in_shared_memory_is_not_reported_as_silent() {
     let capture = capture_of("fastrtps-default/samehost-any");
     // The time before the first goodbye.
     let goodbye = 1_795_142_305_000_000_000;

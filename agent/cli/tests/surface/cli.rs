@@ -36,14 +36,14 @@ fn fails_with(output: &Output, code: i32, parts: &[&str]) {
 }
 
 #[test]
-fn a_good_configuration_is_called_good() {
+fn a_valid_configuration_is_reported_as_valid() {
     let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/ros2probe.yaml");
     let output = run(&["check-config", shipped]);
     assert!(output.status.success());
     assert!(
         String::from_utf8(output.stdout)
             .unwrap()
-            .contains("is good")
+            .contains("is valid")
     );
 }
 
@@ -227,7 +227,7 @@ fn the_version_is_the_package_s() {
 }
 
 #[test]
-fn a_signal_ends_the_agent_in_order_and_the_log_says_so() {
+fn a_signal_ends_the_agent_in_order_and_is_logged() {
     for signal in ["-TERM", "-INT"] {
         let mut agent = LocalAgent::start(&mut rp(), &[]);
         agent.wait_for_log("ready");

@@ -140,7 +140,7 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
     }
 }
 
-/// Each number of the schema with a bound: where it stands, and the bound.
+/// Each number of the schema with a bound: its path, and the bound.
 fn bounds(schema: &Value, root: &Value, path: &str, found: &mut Vec<(String, f64, f64)>) {
     if let Some(name) = schema["$ref"].as_str() {
         let name = name.trim_start_matches("#/$defs/");

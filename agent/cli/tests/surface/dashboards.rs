@@ -11,7 +11,7 @@ use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::dashboard::{self, DATA_SOURCE, Dashboard, Panel, list, resolved, text};
 use serde_json::{Value, json};
 
-/// A window of its own, because the sentence beneath the panel names it.
+/// A separate window, because the sentence beneath the panel names it.
 const OTHER_WINDOWS: [(&str, &str); 1] = [("Matched but without messages", "[5m]")];
 
 #[test]
@@ -300,7 +300,7 @@ fn kinds() -> BTreeMap<String, Kind> {
     kinds
 }
 
-/// The names in an expression, each with what is before and after it.
+/// The names in an expression, each with the text before and after it.
 fn words(expression: &str) -> Vec<(&str, &str, &str)> {
     let named = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | ':');
     let mut words = Vec::new();

@@ -221,7 +221,7 @@ fn a_participant_that_announces_without_end_costs_no_more_packets() {
 }
 
 #[test]
-fn what_somebody_else_says_is_not_believed() {
+fn packets_of_other_participants_are_not_trusted() {
     for recording in Recording::both() {
         let mut forged = recording.received.clone();
         for (_, bytes) in &mut forged {
@@ -247,7 +247,7 @@ fn what_somebody_else_says_is_not_believed() {
 }
 
 #[test]
-fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
+fn leaving_sends_one_goodbye_and_only_to_contacted_participants() {
     let [recording, _] = Recording::both();
     let mut session = recording.session();
     assert!(session.say_goodbye().is_empty());
@@ -258,7 +258,7 @@ fn hanging_up_says_goodbye_once_and_only_to_whom_we_have_met() {
 }
 
 #[test]
-fn who_has_secrets_or_no_address_is_not_asked() {
+fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
     let participant = |secured, metatraffic: &[&str]| ParticipantFacts {
         guid: Guid::new(GuidPrefix([3; 12]), EntityId::PARTICIPANT),
         domain_id: DomainId(0),
@@ -301,7 +301,7 @@ proptest! {
 
     /// Answers are lost, doubled, late, cut and changed.
     #[test]
-    fn whatever_is_answered_few_packets_are_sent_and_goodbye_is_said(
+    fn whatever_is_answered_few_packets_are_sent_and_the_participant_leaves(
         which in 0usize..2,
         fates in prop::collection::vec(
             (0u8..6, 0u64..1_500, any::<prop::sample::Index>(), any::<u8>()), 15),

@@ -64,7 +64,7 @@ fn without_an_agent_it_looks_at_the_host_and_tries_what_it_may() {
 }
 
 #[test]
-fn nobody_is_told_what_it_cannot_look_at_and_who_can() {
+fn an_unprivileged_user_gets_the_checks_that_need_root() {
     let directory = tempfile::tempdir().unwrap();
     // The build directory may be closed to others.
     let program = directory.path().join("rp");
@@ -124,7 +124,7 @@ fn an_agent_on_a_replay_is_asked_by_its_socket_and_from_elsewhere() {
 }
 
 #[test]
-fn of_a_capture_its_graph_is_told_and_nothing_else() {
+fn doctor_reports_only_the_graph_of_a_capture() {
     let capture = local_agent::capture();
     let capture = capture.to_str().unwrap();
     let report = asked(&["--replay", capture, "--until", "+8"]);
@@ -162,7 +162,7 @@ fn asked(arguments: &[&str]) -> Value {
 }
 
 #[test]
-fn where_a_named_agent_or_configuration_is_not_there_it_says_so_in_one_line() {
+fn a_missing_named_agent_or_configuration_is_one_line() {
     for arguments in [
         &["--host", "127.0.0.1:1"][..],
         &["--config", "/nowhere.yaml"],

@@ -96,12 +96,12 @@ fn idle_connections_and_unfinished_requests_make_room_for_the_next_client() {
     for _ in 0..20 {
         assert_eq!(agent.get("/metrics").status, 200);
     }
-    // The first one has gone, without an answer to nothing.
+    // The first one was closed without an answer.
     assert_eq!(clients[0].read(&mut [0; 16]).unwrap(), 0);
 }
 
 #[test]
-fn a_body_that_does_not_come_ends_its_connection_after_ten_seconds() {
+fn a_body_that_does_not_arrive_ends_its_connection_after_ten_seconds() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let mut client = TcpStream::connect(agent.api).unwrap();
@@ -171,7 +171,7 @@ fn a_flood_without_the_token_takes_no_answer_from_the_client_with_it() {
 }
 
 #[test]
-fn an_agent_without_filters_of_system_calls_says_so_everywhere() {
+fn an_agent_without_system_call_filters_reports_it_everywhere() {
     // A kernel without them.
     let refused = BTreeMap::from([(libc::SYS_seccomp, Vec::new())]);
     let filter = SeccompFilter::new(
@@ -182,7 +182,7 @@ fn an_agent_without_filters_of_system_calls_says_so_everywhere() {
     );
     let filter = BpfProgram::try_from(filter.unwrap()).unwrap();
     let mut command = rp();
-    // SAFETY: what is done between fork and exec is two system calls on memory that was there before.
+    // SAFETY: between fork and exec are only two system calls, on memory allocated before.
     unsafe {
         command.pre_exec(move || seccompiler::apply_filter(&filter).map_err(std::io::Error::other));
     }
@@ -201,7 +201,7 @@ fn an_agent_without_filters_of_system_calls_says_so_everywhere() {
 }
 
 #[test]
-fn a_page_comes_compressed_to_a_scraper_that_accepts_it() {
+fn a_page_is_compressed_for_a_scraper_that_accepts_it() {
     let mut agent = LocalAgent::start(&mut rp(), &["--watch", "/**", "--speed", "max"]);
     agent.wait_for_log("ready");
     let names = |page: &[u8]| {
@@ -311,7 +311,7 @@ fn loopback_gives_what_is_configured_and_the_socket_everything() {
         let config = directory.path().join("config.yaml");
         let text = format!("api: {{socket: {}, loopback: {level}}}\n", socket.display());
         std::fs::write(&config, text).unwrap();
-        // The command line goes first.
+        // The command line takes precedence.
         let configured = ["--config", config.to_str().unwrap(), "--speed", "max"];
         let mut agent = LocalAgent::start(
             &mut rp(),
@@ -365,7 +365,7 @@ fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() 
     assert!(!echo.status.success());
     assert_eq!(said.lines().count(), 1, "{said}");
     assert!(
-        said.contains("loopback gives no message payloads"),
+        said.contains("loopback grants no message payloads"),
         "{said}"
     );
 }
@@ -374,7 +374,7 @@ fn loopback_gives_watches_and_no_payloads_unless_something_else_is_configured() 
 fn a_client_of_a_silent_server_gives_up_after_five_seconds() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
-    // One says nothing; one begins an answer, and one a stream.
+    // Servers that send nothing, half an answer, and a stream without a line.
     let beginnings = [
         "",
         "HTTP/1.1 200 OK\r\ncontent-length: 100\r\n\r\n{",

@@ -1,4 +1,4 @@
-//! `GET /events` of the real binary: the events of a replay come in order, with names and
+//! `GET /events` of the real binary: the events of a replay are in order, with names and
 //! attributes, resumable, filtered, and without delaying the end.
 
 use std::collections::BTreeMap;
@@ -134,7 +134,7 @@ impl Stream {
 }
 
 #[test]
-fn what_a_robot_does_is_told_in_order_and_by_name_and_topic() {
+fn events_of_a_robot_are_in_order_and_filtered_by_name_and_topic() {
     let agent = replayed(&local_agent::capture(), &[]);
     let all = kept(&agent, "");
     let mut counts = BTreeMap::<&str, usize>::new();
@@ -191,7 +191,7 @@ fn what_a_robot_does_is_told_in_order_and_by_name_and_topic() {
 }
 
 #[test]
-fn a_client_that_comes_back_goes_on_where_it_was_or_is_told_what_it_missed() {
+fn a_client_that_reconnects_continues_or_gets_the_number_it_missed() {
     let agent = replayed(&local_agent::capture(), &[]);
     let all = kept(&agent, "");
     let again = |path: &str, header: &str| {
@@ -229,7 +229,7 @@ fn a_client_that_comes_back_goes_on_where_it_was_or_is_told_what_it_missed() {
 }
 
 #[test]
-fn lost_messages_and_unfit_readers_are_told_with_who_and_what() {
+fn lost_messages_and_incompatible_readers_are_events_with_node_and_topic() {
     let directory = tempfile::tempdir().unwrap();
     let capture = directory.path().join("lossy.pcap");
     let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../wire/tests/data");
@@ -295,7 +295,7 @@ fn a_stream_follows_what_happens_and_the_end_of_the_agent_does_not_wait_for_it()
         assert_eq!(stream.wait_for(event).attribute("watch"), "/imu/data");
     }
 
-    // As many as there may be; a further one is refused until one has gone.
+    // As many as permitted; a further one is refused until one has left.
     let others: Vec<_> = (0..15)
         .map(|_| Stream::open(agent.api, "/events", ""))
         .collect();
@@ -350,7 +350,7 @@ fn without_samples(
 }
 
 #[test]
-fn a_replay_tells_every_endpoint_that_the_capture_announces_in_its_own_time() {
+fn a_replay_reports_every_endpoint_in_the_captures_time() {
     use ros2probe_wire::time::SECOND;
     const START: u64 = 1_795_143_000 * SECOND;
     let alice = ros2probe_wire::GuidPrefix(*b"\x01\x10alice-host");

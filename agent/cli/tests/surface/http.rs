@@ -12,7 +12,7 @@ const PROMETHEUS_ACCEPTS: &str = "Accept: application/openmetrics-text;version=1
     application/openmetrics-text;version=0.0.1;q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1\r\n";
 
 #[test]
-fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_told() {
+fn the_program_is_mapped_as_it_was_loaded_and_its_memory_is_reported() {
     let mut agent = LocalAgent::start(&mut rp(), &["--speed", "max"]);
     agent.wait_for_log("ready");
     let page = agent.get("/metrics").body;
@@ -163,7 +163,7 @@ fn series_of_deliveries_come_with_a_reload_that_asks_for_them() {
     assert_eq!(promtool(&page), "");
 }
 
-/// A Prometheus of its own, killed with its value.
+/// A Prometheus, killed when its value is dropped.
 struct Prometheus {
     child: Child,
     address: std::net::SocketAddr,

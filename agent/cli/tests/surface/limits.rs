@@ -277,7 +277,7 @@ fn numbers(subscription: &mut Subscription) -> Vec<u64> {
 }
 
 #[test]
-fn messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_reads() {
+fn messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read() {
     let sources = MetricSources::new(SourceKind::Wire, Default::default());
     let caps = Caps {
         subscriptions: 1,
@@ -337,7 +337,7 @@ fn agent_on(capture: &Path, directory: &Path, speed: &str, limits: &str) -> Loca
     )
 }
 
-/// Waits until a cap stands so.
+/// Waits until a cap has this value.
 fn wait_for(agent: &LocalAgent, limit: &str, used: f64, reached: f64) {
     let series = |name: &str| format!("{name}{{limit=\"{limit}\"}}");
     agent.wait_for_metric(&series("ros2probe_limit_used"), |value| value == used);
@@ -401,7 +401,7 @@ fn recordings_beyond_the_cap_are_refused_until_one_ends() {
 }
 
 #[test]
-fn clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone() {
+fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
     let directory = tempfile::tempdir().unwrap();
     let limits = "api_clients: 2, metrics_clients: 2";
     let agent = agent(directory.path(), limits);
@@ -452,7 +452,7 @@ fn clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone() {
     }
 }
 
-/// A capture of so many UDP datagrams of which the first IP fragment alone is there.
+/// A capture of this many UDP datagrams, with only the first IP fragment of each.
 fn torn(count: u16) -> Vec<u8> {
     let mut capture = Vec::new();
     capture.extend_from_slice(&0xa1b2_c3d4_u32.to_le_bytes());
@@ -497,7 +497,7 @@ fn fragments_beyond_the_bytes_push_out_the_oldest() {
 }
 
 #[test]
-fn an_agent_at_a_limit_says_so_on_readyz_on_the_page_in_health_and_to_rp_doctor() {
+fn an_agent_at_a_limit_reports_it_on_readyz_on_the_page_in_health_and_in_rp_doctor() {
     let directory = tempfile::tempdir().unwrap();
     let limits = "participants: 1, recordings: 1";
     let mut agent = agent_on(&local_agent::capture(), directory.path(), "max", limits);

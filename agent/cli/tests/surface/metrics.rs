@@ -215,7 +215,7 @@ fn values_are_what_the_snapshot_says() {
     }
 }
 
-/// Name, cause and value of what is summed by topic.
+/// Name, cause and value of the sums by topic.
 const SUMS: [(&str, &str, &str); 12] = [
     ("ros2_topic_sent_messages_total", "", "1000"),
     ("ros2_topic_delivered_messages_total", "", "900"),
@@ -421,7 +421,7 @@ fn no_series_appears_twice() {
 }
 
 #[test]
-fn a_watched_topic_that_nobody_announced_begins_with_zero() {
+fn a_watched_topic_without_endpoints_begins_at_zero() {
     let missing = WatchedTopicFacts {
         domain_id: DomainId(0),
         topic: "/cmd_vel".into(),
@@ -474,7 +474,7 @@ fn measured_topics_come_first_when_the_cap_is_reached() {
 }
 
 #[test]
-fn what_the_source_sees_and_why_it_is_not_the_other_one_is_said() {
+fn the_source_its_abilities_and_the_reason_for_it_are_exported() {
     let facts = AgentFacts {
         source_reason: Some("no cgroup v2 hierarchy".to_owned()),
         ..sample_robot::agent()

@@ -1,4 +1,4 @@
-//! A real OpenTelemetry receiver gets what the page shows, and the agent does not mind when it goes.
+//! A real OpenTelemetry receiver gets the values of the page, and the agent continues when it stops.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -198,7 +198,7 @@ fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
     assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
 }
 
-/// An event: its name and what is known of it.
+/// An event: its name and attributes.
 type LoggedEvent = (String, BTreeMap<String, String>);
 
 /// The events of the log.
@@ -220,7 +220,7 @@ fn logged_events(agent: &LocalAgent) -> Vec<LoggedEvent> {
 }
 
 #[test]
-fn a_receiver_that_comes_late_gets_all_events_as_log_records_in_their_order() {
+fn a_late_receiver_gets_all_events_as_log_records_in_order() {
     let directory = tempfile::tempdir().unwrap();
     let address = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
     let address = address.unwrap();

@@ -34,7 +34,7 @@ fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(78), "{said}");
     assert!(
-        said.contains("wants TLS") && said.contains("--features tls"),
+        said.contains("requires TLS") && said.contains("--features tls"),
         "{said}"
     );
 }

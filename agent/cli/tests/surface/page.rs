@@ -21,7 +21,7 @@ pub(crate) fn data(name: &str) -> PathBuf {
     data.join(name).join("capture.pcap.gz")
 }
 
-/// An agent that has come to the end of a capture of which it measured everything.
+/// An agent that has replayed a capture to its end and measured every topic.
 fn ended(name: &str, arguments: &[&str]) -> LocalAgent {
     let mut all = vec!["--speed", "max", "--watch", "/**"];
     all.extend(arguments);
@@ -43,7 +43,7 @@ fn code(answer: &Answer) -> String {
     code.replace("urn:ros2probe:problem:", "")
 }
 
-/// A stream of lines. HTTP/1.0: nothing stands between them.
+/// A stream of lines. HTTP/1.0: nothing separates them.
 pub(crate) struct Lines {
     reader: BufReader<TcpStream>,
 }
@@ -291,7 +291,7 @@ fn a_token_of_the_socket_lets_the_page_do_what_loopback_may_not() {
         line(&live.batch(), "open")["access"].clone()
     };
     assert_eq!((open(""), open(&bearer)), (json!("read"), json!("all")));
-    // A wrong one grants nothing more, and a foreign page nothing at all.
+    // A wrong token grants no right, and a foreign page is refused.
     let wrong = format!("Authorization: Bearer {}\r\n", "0".repeat(64));
     assert_eq!(request(agent.api, "GET", "/recordings", &wrong).status, 403);
     let foreign = format!("{bearer}Origin: http://evil.example\r\n");
@@ -303,7 +303,7 @@ fn a_token_of_the_socket_lets_the_page_do_what_loopback_may_not() {
 }
 
 #[test]
-fn a_listener_that_wants_a_token_serves_files_without_one() {
+fn a_listener_that_requires_a_token_serves_files_without_one() {
     let directory = tempfile::tempdir().unwrap();
     let token = directory.path().join("token");
     std::fs::write(&token, "0123456789abcdef0123\n").unwrap();

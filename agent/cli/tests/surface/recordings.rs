@@ -88,7 +88,7 @@ fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
 }
 
 #[test]
-fn a_headless_robot_is_told_to_record_and_tells_what_it_has() {
+fn a_headless_robot_records_on_request_and_lists_its_recordings() {
     let directory = tempfile::tempdir().unwrap();
     let agent = agent(directory.path(), "");
     let api = agent.api;

@@ -123,7 +123,7 @@ fn answering(answer: &'static [u8]) -> String {
 }
 
 #[test]
-fn who_cannot_be_asked_is_said_in_one_line() {
+fn an_unreachable_agent_is_reported_in_one_line() {
     let ask = |host: &str| run(&["topic", "list", "--host", host]);
     // The port is closed once the listener is dropped.
     let closed = TcpListener::bind("127.0.0.1:0").unwrap().local_addr();
@@ -153,7 +153,7 @@ fn who_cannot_be_asked_is_said_in_one_line() {
 }
 
 #[test]
-fn the_environment_names_domain_and_distribution_and_the_command_line_goes_before() {
+fn the_command_line_takes_precedence_over_the_environments_domain_and_distribution() {
     let capture = graph::own().join("graph.pcap.gz");
     let info = |distro: &str, domain: &str, further: &[&str]| {
         let mut rp = rp();
@@ -216,7 +216,7 @@ fn a_capture_answers_as_an_agent_does_and_only_up_to_the_moment_asked_for() {
 }
 
 #[test]
-fn a_capture_that_was_cut_off_tells_what_came_before() {
+fn a_truncated_capture_shows_what_precedes_the_cut() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("cut.pcap.gz");
     let whole = std::fs::read(local_agent::capture()).unwrap();

@@ -133,7 +133,7 @@ fn unannounced(news: &[SampleOutcome], dds_name: &str) -> u64 {
 }
 
 #[test]
-fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
+fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
     let mut messages = 0;
     for capture in captures() {
         let (alone, none) = replayed(&capture, None);
@@ -157,7 +157,7 @@ fn who_wants_samples_changes_no_number_and_gets_each_that_is_counted_once() {
                 };
                 let key = (topic.domain_id, topic.dds_name.to_string());
                 let given = counts.remove(&key).unwrap_or_default();
-                // A stranger's samples count for its topic once it is announced.
+                // Samples of an unknown writer count for its topic once it is announced.
                 let unannounced = unannounced(&news, &key.1);
                 assert_eq!(given.0 + unannounced, measured.messages, "{name}: {key:?}");
                 if unannounced == 0 {
@@ -305,7 +305,7 @@ impl Robot {
             .input(Input::SampleRequests(Arc::new(sample_requests)));
     }
 
-    /// Writer, number and payload, or the reason why not, of what is given.
+    /// Writer, number and payload, or the reason of a miss.
     fn given(&mut self) -> Vec<(GuidPrefix, u64, Result<Vec<u8>, MissedReason>)> {
         let given = self.observer.drain().samples.into_iter();
         given
@@ -351,7 +351,7 @@ fn fragments_make_the_payload_that_was_sent_in_the_order_of_counting() {
 }
 
 #[test]
-fn a_sample_that_stays_incomplete_is_told_and_not_given() {
+fn a_sample_that_stays_incomplete_is_reported_and_not_delivered() {
     let mut robot = Robot::new(Settings::default());
     robot.subscribe(&["/points"], Depth::Payloads);
     robot.at += SECOND;
@@ -372,7 +372,7 @@ fn a_sample_that_stays_incomplete_is_told_and_not_given() {
 }
 
 #[test]
-fn each_subscription_is_told_of_the_losses_since_it_began() {
+fn each_subscription_gets_the_losses_since_it_began() {
     let mut robot = Robot::new(Settings::default());
     let data = |robot: &mut Robot, number| {
         robot.put(Message::from(ALICE).data(WRITER, number, b"\0\x01\0\0anything"));
@@ -406,7 +406,7 @@ fn each_subscription_is_told_of_the_losses_since_it_began() {
 }
 
 #[test]
-fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
+fn interest_measures_unwatched_topics_and_ends_with_the_last_request() {
     let mut robot = Robot::new(Settings::default());
     let guid = Guid::new(ALICE, WRITER);
     let verdict = |robot: &mut Robot| {
@@ -435,7 +435,7 @@ fn interest_measures_what_nobody_watches_and_ends_with_the_last_wish() {
 }
 
 #[test]
-fn what_finds_no_room_is_told_and_memory_stays_bounded() {
+fn what_finds_no_room_is_reported_and_memory_stays_bounded() {
     let mut robot = Robot::new(Settings {
         payload_bytes: 100_000,
         ..Settings::default()
@@ -469,7 +469,7 @@ fn what_finds_no_room_is_told_and_memory_stays_bounded() {
             .iter()
             .all(|given| given.2 == Err(MissedReason::NotCaptured))
     );
-    // Samples that are begun and never ended make room for one that is.
+    // Samples that never become complete make room for one that does.
     for number in 30..60 {
         robot.fragment(ALICE, number, 1, &payload(50_000));
         assert!(held(&robot) <= 100_000);
@@ -482,7 +482,7 @@ fn what_finds_no_room_is_told_and_memory_stays_bounded() {
 }
 
 #[test]
-fn a_stream_tells_what_comes_and_when_that_was_all() {
+fn a_stream_reports_what_was_missed_and_where_it_is_complete() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "4"]);
     let answer = local_agent::request(agent.api, "GET", "/samples?all=true", "");
     assert_eq!(answer.status, 200, "{}", answer.body);

@@ -1,4 +1,4 @@
-//! `rp top` on a pseudo-terminal, against a real agent: what is on the screen, what keys do to it, and
+//! `rp top` on a pseudo-terminal, against a real agent: the screen, the effect of keys, and
 //! that the terminal is given back clean however it ends.
 
 use std::time::{Duration, Instant};
@@ -41,7 +41,7 @@ fn it_draws_reacts_to_keys_and_gives_the_terminal_back() {
     top.wait_for(TOPIC);
     top.wait_for("agent has replayed its capture to the end");
     top.press("?");
-    top.wait_for("any key goes back");
+    top.wait_for("any key: back");
     top.press("?");
     top.press("/chat\r");
     top.wait_for("only \"chat\": 1 shown");
@@ -77,7 +77,7 @@ fn a_signal_ends_it_cleanly_and_so_does_control_c_when_the_agent_is_gone() {
     // The last known values stay on the screen, and keys work.
     assert!(top.screen().contains(TOPIC), "{}", top.screen());
     top.press("?");
-    top.wait_for("any key goes back");
+    top.wait_for("any key: back");
     top.press("?");
     top.wait_for("AGENT GONE");
     top.press("\x03");

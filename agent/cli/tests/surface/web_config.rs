@@ -60,7 +60,7 @@ fn status(arguments: &[&str]) -> String {
 }
 
 #[test]
-fn who_has_no_password_reads_nothing() {
+fn a_client_without_a_password_reads_nothing() {
     let hash = bcrypt::hash("open sesame", 4).unwrap();
     let web = Web::new(&format!("basic_auth_users:\n  alice: {hash}\n"));
     let agent = web.agent();
@@ -130,7 +130,7 @@ fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
 
 #[cfg(feature = "tls")]
 #[test]
-fn an_encrypted_listener_speaks_with_who_knows_its_certificate_and_with_nobody_else() {
+fn an_encrypted_listener_answers_only_clients_that_trust_its_certificate() {
     let hash = bcrypt::hash("open sesame", 4).unwrap();
     let web = Web::new(&format!(
         "tls_server_config: {{cert_file: a.crt, key_file: a.key, min_version: TLS13}}\n\

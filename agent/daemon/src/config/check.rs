@@ -147,7 +147,7 @@ fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> 
         .map(|(_, new)| *new)
         .find(has);
     if let Some(new) = renamed {
-        return format!("unknown key; its name is `{new}`");
+        return format!("unknown key; use `{new}`");
     }
     let near = known
         .clone()
@@ -157,7 +157,7 @@ fn unknown_key<'a>(name: &str, known: impl Iterator<Item = &'a str> + Clone) -> 
     match near {
         Some((_, key)) => format!("unknown key; did you mean `{key}`?"),
         None => format!(
-            "unknown key; known are {}",
+            "unknown key; known keys: {}",
             known.collect::<Vec<_>>().join(", ")
         ),
     }

@@ -173,7 +173,7 @@ impl Node {
                 for (key, value) in entries {
                     let path = key_path(path, &key.name);
                     if let Some(first) = places.get(&path) {
-                        let message = format!("written twice, first at {first}");
+                        let message = format!("duplicate key, first at {first}");
                         mistakes.add(key.position, &path, message);
                         continue;
                     }
@@ -183,7 +183,7 @@ impl Node {
         }
     }
 
-    /// Version of the file as a whole number, with its position.
+    /// Version of the file as a whole number, with its position. `None` without one.
     pub(super) fn version(&self) -> Option<(i128, Position)> {
         let Content::Map(entries) = &self.content else {
             return None;

@@ -393,10 +393,11 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
             ))
         }
         "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
-            "must be an URL of a gRPC receiver, as in `http://collector:4317`, or `off`".to_owned(),
+            "must be the URL of a gRPC receiver, as in `http://collector:4317`, or `off`"
+                .to_owned(),
         ),
         "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(
-            "wants TLS, which this build has not: use http:// to a collector on this host, or \
+            "requires TLS, which this build lacks: use http:// to a collector on this host, or \
              build with `--features tls`"
                 .to_owned(),
         ),

@@ -1,5 +1,5 @@
-//! The configuration: first the YAML shape, then its meaning; all mistakes are reported with their
-//! position.
+//! The configuration: first the YAML shape, then its meaning. All mistakes are reported with their
+//! positions.
 //!
 //! Nothing is bound, opened or read from the environment here.
 
@@ -175,7 +175,7 @@ pub struct RecordingLimits {
     pub max_bytes: Option<u64>,
     /// Bytes of all bags in the directory; `None` = no limit.
     pub max_total_bytes: Option<u64>,
-    /// Percent of the file system that stays free; `reserve_bytes` applies if it is larger.
+    /// Percent of the file system that stays free; the larger of this and `reserve_bytes` applies.
     pub reserve_percent: u8,
     /// Bytes of the file system that stay free.
     pub reserve_bytes: u64,
@@ -193,7 +193,7 @@ impl Default for RecordingLimits {
 }
 
 impl RecordingSettings {
-    /// Returns settings with the bags in the state directory.
+    /// Returns whether the bags are in the directory of saved state.
     #[must_use]
     pub fn is_in(&self, state: &StateChoice) -> bool {
         self.directory == StateChoice::Auto && *state != StateChoice::Off

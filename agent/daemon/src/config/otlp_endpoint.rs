@@ -6,7 +6,7 @@ use tonic::codegen::http::Uri;
 const PORT: u16 = 4317;
 
 /// Parses a URL for gRPC: scheme and authority. A path after them belongs to OTLP over HTTP and is
-/// dropped.
+/// dropped. `None` if the text is not such a URL.
 #[must_use]
 pub fn otlp_endpoint(text: &str) -> Option<Uri> {
     let uri: Uri = text.parse().ok()?;

@@ -84,7 +84,7 @@ pub fn listen(configured: CaptureSettings, listening: &Listening) -> Result<Vec<
 }
 
 /// Parses a GUID prefix of 24 hexadecimal digits. The entity id that the `participant` label of
-/// metrics appends is accepted.
+/// metrics appends is accepted. `None` for another text.
 #[must_use]
 pub fn prefix(text: &str) -> Option<GuidPrefix> {
     let text = text.strip_suffix(".000001c1").unwrap_or(text);

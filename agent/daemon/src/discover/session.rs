@@ -221,7 +221,7 @@ impl Session {
         self.over
     }
 
-    /// Returns whether the participant answered at all.
+    /// Returns whether the participant sent any answer.
     #[must_use]
     pub const fn was_answered(&self) -> bool {
         self.heard.is_some()
@@ -311,7 +311,7 @@ impl Session {
         }
     }
 
-    /// Payload of a complete sample.
+    /// Payload of a sample. `None` until its last fragment arrives.
     fn complete_payload<'a>(
         &mut self,
         now: Timestamp,
@@ -373,7 +373,7 @@ impl Session {
         }
     }
 
-    /// Writer of the node list, after its announcement.
+    /// Writer of the node list. `None` before its announcement.
     fn nodes_writer(&self) -> Option<EntityId> {
         let mut endpoints = self.endpoints.values();
         let writer = endpoints.find(|endpoint| {

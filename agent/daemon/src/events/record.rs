@@ -225,7 +225,7 @@ impl Occurrence {
         }
     }
 
-    /// Attributes by name, in any order. `None` if unknown.
+    /// Attributes by name, in any order; the value of an unknown one is `None`.
     fn values(&self, at: Timestamp) -> Values {
         match self {
             Self::Robot(kind) => robot(kind, at),

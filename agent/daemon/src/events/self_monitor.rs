@@ -103,7 +103,7 @@ mod tests {
     use crate::agent_facts::{InterfaceFacts, SourceKind};
 
     #[test]
-    fn losses_are_told_as_what_came_since_and_at_most_once_a_second() {
+    fn losses_are_reported_as_differences_at_most_once_a_second() {
         let start = Instant::now();
         let interface = |dropped| InterfaceFacts {
             name: "any".to_owned(),
@@ -128,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn blindness_is_told_once_and_not_of_an_agent_that_starts() {
+    fn blindness_is_reported_once_and_not_during_the_start() {
         let start = Instant::now();
         let mut sight = SourceMonitor::default();
         let blind = Err("stuck".to_owned());
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cgroup_that_is_made_anew_between_two_looks_is_told_once() {
+    fn a_cgroup_recreated_between_two_checks_is_reported_once() {
         let start = Instant::now();
         let second = |number| start + Duration::from_secs(number);
         let mut sight = SourceMonitor::default();

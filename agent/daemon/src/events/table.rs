@@ -256,7 +256,7 @@ pub(super) const CONFIG_REFUSED: Definition = Definition::new(
     "ros2probe.config.reload_failed",
     Severity::Error,
     &["error"],
-    "The agent rejected a new configuration; the previous one stays in force.",
+    "The agent rejected a new configuration; the previous one stays active.",
 );
 pub(super) const RECORDING_STARTED: Definition = Definition::new(
     "ros2probe.recording.started",

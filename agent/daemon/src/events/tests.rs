@@ -64,7 +64,7 @@ fn numbers_grow_by_one_and_a_reader_goes_on_where_it_was() {
 }
 
 #[test]
-fn a_storm_is_cut_in_each_second_and_told_in_one_event() {
+fn a_storm_is_limited_each_second_and_summed_up_in_one_event() {
     let log = EventLog::new();
     let storm = u64::from(MOST) + 50;
     log.add(taken((0..storm).map(node).collect()), second(0));
@@ -135,7 +135,7 @@ fn a_storm_of_the_agent_is_cut_by_the_seconds_of_its_life() {
 }
 
 #[test]
-fn a_replay_at_full_speed_tells_what_one_at_the_capture_s_pace_tells() {
+fn a_replay_at_full_speed_prints_the_same_as_one_at_the_capture_s_pace() {
     let events: Vec<_> = (0..430).map(|number| node(number * SECOND / 100)).collect();
     let (at_once, paced) = (EventLog::new(), EventLog::new());
     at_once.add(taken(events.clone()), second(5));
@@ -157,7 +157,7 @@ fn a_replay_at_full_speed_tells_what_one_at_the_capture_s_pace_tells() {
 }
 
 #[test]
-fn what_was_overwritten_is_told_to_the_reader_that_missed_it() {
+fn an_overwritten_sample_is_reported_to_the_reader_that_missed_it() {
     let log = EventLog::new();
     for number in 0..25 {
         // Every other second, since a late event counts in the current second.

@@ -118,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pipe_that_nobody_reads_holds_nobody_up_and_what_it_missed_is_told() {
+    fn a_pipe_without_a_reader_delays_no_thread_and_its_lost_lines_are_reported() {
         let (mut reader, writer) = io::pipe().unwrap();
         let (mut lines, lost) = lines(writer);
         let line = [&[b'x'; 999][..], b"\n"].concat();

@@ -54,8 +54,9 @@ const RENAMEAT: c_long = 38;
 #[cfg(not(target_arch = "aarch64"))]
 const RENAMEAT: c_long = libc::SYS_renameat;
 
-/// Precedes the rest of a program, which has a single result for unknown calls. These calls have
-/// the same number on all architectures.
+/// Returns the first part of a filter's program, which refuses [`ABSENT`] calls with `ENOSYS`. The
+/// rest has a single result for refused calls. These calls have the same number on all
+/// architectures.
 fn absent() -> BpfProgram {
     let step = |code: u32, jt, jf, k| sock_filter {
         code: u16::try_from(code).unwrap_or_default(),

@@ -100,7 +100,7 @@ impl Sandbox {
         }
     }
 
-    /// Reason why system calls are not filtered.
+    /// Reason why system calls are not filtered. `None` if they are.
     #[must_use]
     pub const fn reason(&self) -> Option<&'static str> {
         match self {

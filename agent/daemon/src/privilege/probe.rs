@@ -8,8 +8,8 @@ use rustix::thread::CapabilitySet;
 
 use super::capabilities::keep;
 
-/// Looks up an element of a map that does not exist, in a thread without privileges. The kernel
-/// checks `EPERM` before `EBADF`.
+/// Returns whether updating a map needs `CAP_BPF`. A thread without privileges looks up an element
+/// of a map that does not exist: the kernel checks `EPERM` before `EBADF`.
 pub(super) fn map_updates_need_bpf() -> bool {
     let thread = std::thread::Builder::new().name("probe".to_owned());
     let probe = thread.spawn(|| {

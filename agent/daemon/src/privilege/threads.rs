@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn every_thread_of_this_process_is_told() {
+    fn every_thread_of_this_process_is_reported() {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         // A thread sets its own name once it runs.
         let (runs, running) = std::sync::mpsc::channel();

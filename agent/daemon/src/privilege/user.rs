@@ -50,7 +50,8 @@ pub fn become_own_user() -> Identity {
     }
 }
 
-/// Ids of the user and group of that name, or else of the user's primary group.
+/// Ids of the package's user and its group, or else of the user's primary group. `None` if the user
+/// does not exist, or is root.
 fn find(users: &str, groups: &str) -> Option<(Uid, Gid)> {
     let line = |text: &str| -> Option<Vec<String>> {
         let mut lines = text.lines().map(|line| line.split(':'));
@@ -97,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn who_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
+    fn an_agent_that_becomes_another_user_keeps_capabilities_and_nothing_of_root() {
         assert!(geteuid().is_root(), "this takes root: run `make test`");
         let thread = std::thread::spawn(|| {
             let before = capabilities(None).unwrap().effective;

@@ -365,7 +365,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_chosen_is_told() {
+    fn invalid_selections_are_refused_with_the_reason() {
         let error = |options| Filter::new(options).unwrap_err().to_string();
         assert!(error(FilterOptions::default()).starts_with("no topics selected"));
         let relative = FilterOptions {

@@ -100,7 +100,7 @@ fn is_ros_topic(kind: &str) -> bool {
     TopicKind::parse(kind).is_none_or(TopicKind::is_ros_topic)
 }
 
-/// Texts of the values.
+/// Returns each value as displayed text.
 fn printed<T: ToString>(texts: &[T]) -> Vec<String> {
     texts.iter().map(ToString::to_string).collect()
 }
@@ -246,7 +246,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_api_tells_what_a_bag_says_of_publishers() {
+    fn the_api_reports_what_a_bag_stores_about_publishers() {
         let json = r#"{"message_types": ["std_msgs/msg/String"], "type_hashes": [], "name": "/x",
             "subscriptions": [{"guid": "a"}],
             "publishers": [{"guid": "0110.1", "node": "/n", "qos": {"reliability": "BEST_EFFORT",

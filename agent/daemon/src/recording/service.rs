@@ -328,7 +328,7 @@ impl Recordings {
         }
     }
 
-    /// Directory of the bags.
+    /// Directory of the bags. `None` if recordings are refused.
     #[must_use]
     pub fn directory(&self) -> Option<&Path> {
         self.directory.as_deref()

@@ -80,8 +80,8 @@ struct Completion<'a, T> {
     hurry: bool,
 }
 
-/// Records until the end. The second value is the source's error, if it broke. `report_activity` is
-/// called regularly and after each command.
+/// Records until the end. The second value is the source's error, if it failed. `report_activity`
+/// is called regularly and after each command.
 pub fn record<E>(
     mut recorder: Recorder<'_>,
     mut next: impl FnMut(Duration) -> Result<NextItem, E>,

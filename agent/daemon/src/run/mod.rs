@@ -46,7 +46,7 @@ const SET_BACK: Duration = Duration::from_secs(1);
 /// The working thread ended with an error.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
-    /// The host's interfaces can no longer be captured.
+    /// Capturing on this host failed.
     #[error("the capture failed")]
     Capture(#[from] CaptureError),
     /// The rest of a capture cannot be read; packets before it are published.
@@ -208,7 +208,7 @@ impl Run {
     }
 
     /// Next time at which a replay has to return: for a clock item to subscriptions, or at the end
-    /// of a second.
+    /// of a second. `None` if neither is needed.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
         let published_until = subscribed.then(|| self.published_until + CLOCK_INTERVAL);
         let second = self.history.as_ref().map(History::due);

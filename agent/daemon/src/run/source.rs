@@ -115,7 +115,7 @@ impl Source {
         }
     }
 
-    /// Time at which a replay ended before its capture.
+    /// Time at which a replay ended before its capture. `None` if it did not.
     pub(super) fn cut(&self) -> Option<Timestamp> {
         match self {
             Self::Live(_) => None,

@@ -146,7 +146,7 @@ fn a_file_of_the_first_agent_is_read() {
 }
 
 #[test]
-fn who_was_there_before_the_host_was_started_is_not_there() {
+fn state_of_an_earlier_boot_is_not_used() {
     let (place, directory) = directory();
     let file = place.path().join(FILE);
     fs::write(&file, r#"{"version":1,"boot":"other","participants":[]}"#).unwrap();

@@ -68,19 +68,19 @@ impl Backlog {
         self.entries.insert(place, entry);
     }
 
-    /// The newest entry. Callers must not change its topic or size.
+    /// The newest entry, if any. Callers must not change its topic or size.
     pub(super) fn last_mut(&mut self) -> Option<&mut Item> {
         let last = self.entries.last_entry()?;
         Some(&mut last.into_mut().item)
     }
 
-    /// Removes the oldest entry.
+    /// Removes the oldest entry, if any.
     pub(super) fn pop(&mut self) -> Option<Item> {
         let place = *self.entries.first_key_value()?.0;
         self.remove(place)
     }
 
-    /// Evicts the least important entry.
+    /// Evicts the least important entry, if any.
     pub(super) fn sacrifice(&mut self) -> Option<Item> {
         let time = self.times.front().copied();
         let place = time.or_else(|| {

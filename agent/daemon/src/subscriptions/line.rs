@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn quality_of_service_survives_being_told() {
+    fn quality_of_service_survives_the_conversion() {
         let qos = Qos {
             reliability: Reliability::BEST_EFFORT,
             durability: Durability::TRANSIENT_LOCAL,

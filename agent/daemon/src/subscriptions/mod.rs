@@ -407,8 +407,8 @@ impl Subscription {
         self.channel.next_blocking(timeout)
     }
 
-    /// Waits for at most `timeout` until the request is in force. All messages sent after that are
-    /// delivered.
+    /// Waits for at most `timeout` until the request is in force, and returns whether it is. All
+    /// messages sent after that are delivered.
     pub async fn in_force(&self, timeout: Duration) -> bool {
         let known = self.channel.in_force();
         tokio::time::timeout(timeout, known).await.is_ok()

@@ -98,7 +98,7 @@ fn each_reader_gets_what_is_for_it_and_bytes_only_when_asked() {
 }
 
 #[test]
-fn a_slow_reader_loses_the_oldest_and_is_told_before_what_is_left() {
+fn a_slow_reader_loses_the_oldest_and_gets_their_number_before_the_rest() {
     let all = subscriptions(caps());
     let mut slow = all
         .open(request(Depth::Payloads, 4 * 1256, Overflow::DropOldest))

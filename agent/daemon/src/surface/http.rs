@@ -40,7 +40,7 @@ use crate::snapshot_cell::SnapshotCell;
 const INDEX: &str = "<!doctype html><title>ros2probe</title><h1>ros2probe</h1>
 <p>Watches the ROS 2 robot on this host from copies of its traffic.
 <ul><li><a href=\"/metrics\">/metrics</a> for Prometheus
-<li><a href=\"/readyz\">/readyz</a> whether it sees: 200, or 503 with the reason
+<li><a href=\"/readyz\">/readyz</a> whether the agent observes the robot: 200, or 503 with the reason
 <li><a href=\"/healthz\">/healthz</a> whether the process runs</ul>
 ";
 
@@ -194,7 +194,7 @@ fn router(sources: MetricSources) -> Router {
         .method_not_allowed_fallback(async |method: Method| {
             (
                 StatusCode::METHOD_NOT_ALLOWED,
-                format!("{method} is not possible here, GET is\n"),
+                format!("{method} is not allowed; use GET\n"),
             )
         })
         .with_state(Pages {
@@ -222,7 +222,7 @@ async fn metrics(Extract(pages): Extract<Pages>, headers: HeaderMap) -> Response
     pages.latest.refresh(REFRESH_TIMEOUT).await;
     let Some(turn) = PAGES.turn().await else {
         pages.limits.reached(Limit::MetricsClients, 1);
-        let reason = "other clients are having pages made
+        let reason = "too many pages are being rendered
 ";
         return (
             StatusCode::SERVICE_UNAVAILABLE,

@@ -66,7 +66,7 @@ impl<'a> Fields<'a> {
         })
     }
 
-    /// proc(5) counts fields from 1, and the state is the third.
+    /// Returns a field by its number: proc(5) counts from 1, and the state is the third.
     fn text(&self, number: usize) -> Option<&'a str> {
         Some(self.0.get(number.checked_sub(3)?)?.trim())
     }
@@ -103,6 +103,7 @@ impl Process {
 
 /// Returns the memory that the kernel cannot reclaim while the process runs: its own pages
 /// (anonymous, changed, swapped), and the rings shared with the kernel, which are mapped as files.
+/// `None` if the kernel hides it.
 fn unreclaimable_bytes() -> Option<f64> {
     let maps = fs::read_to_string("/proc/self/smaps").ok()?;
     let mut bytes = 0.0;

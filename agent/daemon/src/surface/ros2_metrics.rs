@@ -561,7 +561,7 @@ pub(super) fn watches(
 }
 
 /// Returns the configured entry of `watch` in the model: usually at the same index, unless the list
-/// has just changed.
+/// has just changed. `None` if it was removed.
 fn configured<'c>(
     place: usize,
     watch: &WatchFacts,

@@ -136,7 +136,7 @@ impl TlsShape {
                 return Err("tls_server_config: client_auth_type needs client_ca_file".to_owned());
             }
             (None | Some("NoClientCert" | ""), Some(_)) => {
-                return Err("tls_server_config: client_ca_file has no meaning without \
+                return Err("tls_server_config: client_ca_file has no effect without \
                             `client_auth_type: RequireAndVerifyClientCert`"
                     .to_owned());
             }

@@ -511,7 +511,7 @@ bool flag
     }
 
     #[test]
-    fn mistakes_are_told_with_their_line() {
+    fn mistakes_are_reported_with_their_line() {
         let problem = |text: &str| {
             let text = format!("module a {{ module msg {{\n{text}\n}}; }};");
             definition(name("a/msg/B"), &text).unwrap_err().to_string()

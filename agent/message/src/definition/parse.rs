@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn mistakes_are_told_with_their_line() {
+    fn mistakes_are_reported_with_their_line() {
         let problem = |text: &str| {
             let text = format!("int8 ok\n# comment\n{text}\nint8 after\n");
             let error = fields(&text).unwrap_err();

@@ -91,7 +91,7 @@ impl<'a> Object<'a> {
         }
     }
 
-    /// Returns the value as a number; booleans are numbers, too.
+    /// Returns the value as a number, which a boolean is, too; `None` for other values.
     fn number(&self) -> Option<Number> {
         match self {
             Self::Bool(value) => Some(Number::Int(i128::from(*value))),
@@ -230,7 +230,7 @@ fn evaluate<'a>(node: &Node, subject: &Object<'a>) -> Result<Object<'a>, FilterE
 }
 
 fn too_large() -> String {
-    "a number too large".to_owned()
+    "the number is too large".to_owned()
 }
 
 fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, String> {
@@ -239,7 +239,7 @@ fn element<'a>(object: &Object<'a>, index: &Object<'a>) -> Result<Object<'a>, St
         Object::Bool(index) => i128::from(*index),
         _ => {
             return Err(format!(
-                "an index has to be a number, not '{}'",
+                "an index must be a number, not '{}'",
                 index.type_name()
             ));
         }
@@ -466,7 +466,7 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
                 let number = text.trim().parse();
                 Object::Float(number.map_err(|_| format!("not a number: '{text}'"))?)
             }
-            _ => return Err(format!("'{kind}' cannot become a number")),
+            _ => return Err(format!("'{kind}' cannot be converted to a number")),
         },
         Function::Str => Object::Text(Cow::Owned(match argument {
             Object::None => "None".to_owned(),
@@ -476,7 +476,7 @@ fn call<'a>(function: Function, arguments: &[Object<'a>]) -> Result<Object<'a>, 
             Object::Text(text) => text.to_string(),
             Object::Bytes(bytes) => python::bytes(bytes),
             Object::List(_) | Object::Array(_) | Object::Message(_) => {
-                return Err(format!("'{kind}' cannot become a string"));
+                return Err(format!("'{kind}' cannot be converted to a string"));
             }
         })),
     })
@@ -497,7 +497,7 @@ fn integer<'a>(object: &Object<'a>) -> Result<Object<'a>, String> {
             .map_err(|_| format!("not a whole number: '{text}'"))?,
         _ => {
             return Err(format!(
-                "'{}' cannot become a whole number",
+                "'{}' cannot be converted to a whole number",
                 object.type_name()
             ));
         }
@@ -510,7 +510,7 @@ fn extreme<'a>(function: Function, objects: &[Object<'a>]) -> Result<Object<'a>,
     } else {
         Comparison::Greater
     };
-    let (mut best, rest) = objects.split_first().ok_or("nothing to choose from")?;
+    let (mut best, rest) = objects.split_first().ok_or("the argument is empty")?;
     for object in rest {
         if compare(comparison, object, best)? {
             best = object;

@@ -251,7 +251,7 @@ impl<'a> Parser<'a> {
             } else if self.sign("[") {
                 let index = self.deeper(Self::or)?;
                 if matches!(self.peek(), TokenKind::Sign(":")) {
-                    return Err(self.error("slices are not read"));
+                    return Err(self.error("slices are not supported"));
                 }
                 self.expect("]")?;
                 node = Node {
@@ -333,9 +333,8 @@ impl<'a> Parser<'a> {
             _ => {
                 let Some(function) = Function::named(name) else {
                     let known = Function::NAMES.map(|(name, _)| name).join(", ");
-                    let message = format!(
-                        "`{name}` is not known here: there are `m` (the message) and {known}"
-                    );
+                    let message =
+                        format!("`{name}` is unknown; known are `m` (the message) and {known}");
                     return Err(FilterError::new(column, message));
                 };
                 self.expect("(")?;

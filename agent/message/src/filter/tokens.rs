@@ -127,7 +127,7 @@ impl<'a> Reader<'a> {
         let mut text = String::new();
         loop {
             let Some(next) = self.rest.chars().next() else {
-                return Err(FilterError::new(column, "a string without its end"));
+                return Err(FilterError::new(column, "unterminated string"));
             };
             self.take(next.len_utf8());
             if next == quote {
@@ -138,7 +138,7 @@ impl<'a> Reader<'a> {
                 continue;
             }
             let Some(escaped) = self.rest.chars().next() else {
-                return Err(FilterError::new(column, "a string without its end"));
+                return Err(FilterError::new(column, "unterminated string"));
             };
             self.take(escaped.len_utf8());
             text.push(match escaped {
@@ -148,7 +148,7 @@ impl<'a> Reader<'a> {
                 '0' => '\0',
                 '\\' | '\'' | '"' => escaped,
                 _ => {
-                    let message = format!("`\\{escaped}` in a string is not read");
+                    let message = format!("the escape `\\{escaped}` is not supported");
                     return Err(FilterError::new(self.column - 2, message));
                 }
             });

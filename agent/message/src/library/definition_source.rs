@@ -30,7 +30,7 @@ impl DefinitionSource {
     pub(crate) fn describe(&self) -> String {
         match self {
             Self::Directory(path) | Self::Prefix(path) => format!("in {}", path.display()),
-            Self::Embedded(_) => "that comes with ros2probe".to_owned(),
+            Self::Embedded(_) => "built into ros2probe".to_owned(),
         }
     }
 

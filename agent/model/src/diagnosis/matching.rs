@@ -165,7 +165,7 @@ impl fmt::Debug for Policies {
     }
 }
 
-/// Returns whether this writer matches this reader of its topic and type.
+/// Decides whether this writer matches this reader of its topic and type.
 #[must_use]
 pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     let both = [offered.vendor, requested.vendor];
@@ -389,7 +389,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_values_are_nobodys_fault() {
+    fn unknown_values_are_no_incompatibility() {
         let (writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
         reader.durability = Durability(9);
         reader.ownership = Ownership(7);

@@ -109,7 +109,7 @@ impl HostedNode<'_> {
     }
 
     /// Returns the machine's addresses. Host names do not suffice, since robots of one series share
-    /// them.
+    /// them. `None` without an address.
     fn machine(&self) -> Option<BTreeSet<IpAddr>> {
         let addresses = &self.participant.addresses;
         let all = addresses.default.iter().chain(&addresses.metatraffic);

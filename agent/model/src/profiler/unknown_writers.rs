@@ -57,7 +57,8 @@ impl Profiler {
         self.record(guid, record, journal, graph)
     }
 
-    /// Drops the unknown writer with the longest silence, unless it is established.
+    /// Drops the unknown writer with the longest silence, unless it is established. Returns whether
+    /// one was dropped.
     fn evict_unknown_writer(&mut self, now: Timestamp, graph: GraphView<'_>) -> bool {
         if now < self.search_after {
             return false;

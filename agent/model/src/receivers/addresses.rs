@@ -96,7 +96,7 @@ impl AnnouncedAddresses {
             .retain(|_, destination| announcers.contains_key(destination));
     }
 
-    /// Returns the participant that alone announces this address.
+    /// Returns the participant that alone announces this address; `None` if none or several do.
     pub(super) fn owner(&self, destination: &Destination) -> Option<GuidPrefix> {
         let announcer = self.announcers.get(destination)?;
         (!announcer.contested).then_some(announcer.prefix)

@@ -126,7 +126,7 @@ fn an_interval_is_that_between_neighbours_that_both_were_seen() {
 }
 
 #[test]
-fn a_heartbeat_tells_of_the_last_ones_and_a_gap_of_those_that_never_were() {
+fn a_heartbeat_shows_lost_last_samples_and_a_gap_those_never_written() {
     let mut view = View::new();
     let now = Timestamp(view.now);
     assert_eq!(
@@ -181,7 +181,7 @@ fn a_writer_that_begins_anew_under_its_old_name_counts_from_there() {
 }
 
 #[test]
-fn a_sample_that_was_told_of_and_seen_late_is_no_new_beginning() {
+fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
     let mut view = View::new();
     view.see(1);
     let now = Timestamp(view.now);

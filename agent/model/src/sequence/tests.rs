@@ -181,7 +181,7 @@ fn what_readers_acknowledge_is_no_loss_unless_the_writer_had_withdrawn_it() {
 }
 
 #[test]
-fn what_a_heartbeat_tells_and_withdraws_at_once_is_lost() {
+fn samples_that_a_heartbeat_announces_and_withdraws_at_once_are_lost() {
     let mut bench = Bench::default();
     bench.receive([1, 2]).heartbeat(6, 6).wait(3);
     assert_eq!(bench.lost, [3, 4, 5, 6]);

@@ -215,13 +215,13 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
 }
 
 #[test]
-fn nobody_is_asked_about_a_writer_twice() {
+fn a_known_writer_is_looked_up_only_once() {
     let mut tracer = tracer();
     let mut asked = 0;
     for number in 1..=3 {
         tracer.record(&data(number, number, 0), || {
             asked += 1;
-            // Discovery does not know the writer at first.
+            // Discovery has not announced the writer at first.
             (asked > 1).then(|| (description(), 0.0))
         });
     }

@@ -151,7 +151,7 @@ fn an_incomplete_sample_is_lost_although_its_number_was_seen() {
 }
 
 #[test]
-fn a_sample_that_began_before_the_kernel_was_told_of_its_writer_is_no_loss_when_fragments_lack() {
+fn a_sample_begun_before_its_writer_was_in_the_kernels_map_is_no_loss_if_fragments_are_missing() {
     let mut bench = Bench::new(Traits::default());
     bench
         .writer
@@ -317,7 +317,7 @@ fn intervals_are_exact() {
 }
 
 #[test]
-fn what_went_elsewhere_while_nobody_listened_here_is_not_lost() {
+fn samples_sent_elsewhere_before_a_reader_existed_here_are_not_lost() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1).data(2).wait(60_000);
     bench.opened = Timestamp(bench.now);

@@ -1,4 +1,4 @@
-//! Participants that come and go for as long as a robot runs leave no growing state behind. A
+//! Participants that join and leave while a robot runs leave no growing state behind. A
 //! counting allocator measures the heap exactly.
 
 use crate::allocator;

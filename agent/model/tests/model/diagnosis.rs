@@ -275,7 +275,7 @@ fn two_types_and_two_definitions_of_one_are_found() {
 }
 
 #[test]
-fn who_is_alone_is_found_after_some_patience_and_not_where_that_is_normal() {
+fn an_unmatched_endpoint_is_found_after_a_while_and_not_where_that_is_normal() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[]);
     world.announce(reader(2, 1), "rt/cmd_vel", STRING, &[]);
@@ -314,7 +314,7 @@ fn who_is_alone_is_found_after_some_patience_and_not_where_that_is_normal() {
 }
 
 #[test]
-fn nobody_is_called_alone_while_a_participant_s_endpoints_are_unknown() {
+fn no_endpoint_is_unmatched_while_a_participants_endpoints_are_unknown() {
     let mut world = World::with(2);
     world.announce(writer(1, 1), "rt/points", STRING, &[]);
     // The participant announced itself before the agent started to capture its endpoints.

@@ -418,7 +418,7 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
             continue;
         }
         let at = line.t + SETTLED;
-        // A node knows itself before it announces itself.
+        // A node lists itself before it announces itself.
         let reported = facts
             .ros_discovery_info
             .iter()

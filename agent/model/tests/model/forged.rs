@@ -138,7 +138,7 @@ fn one_datagram_with_a_number_far_ahead_hides_no_message_and_loses_none() {
 }
 
 #[test]
-fn a_number_far_ahead_whose_heartbeat_comes_along_is_believed_no_more() {
+fn a_number_far_ahead_with_its_own_heartbeat_is_not_confirmed() {
     for run in streams() {
         for ahead in [100_u64, 100_000, 1 << 40] {
             run.stays_exact(1, &|host, bob| {
@@ -250,7 +250,7 @@ fn a_fragment_with_a_number_far_ahead_or_long_gone_changes_nothing() {
 }
 
 #[test]
-fn a_forgery_that_comes_before_the_stream_hides_none_of_it() {
+fn a_forgery_before_the_stream_hides_none_of_it() {
     for run in streams() {
         let first = |number: u64, first: u64| {
             let run = Run {

@@ -157,7 +157,7 @@ fn nothing_waits_of_a_best_effort_writer_or_for_best_effort_readers() {
 }
 
 #[test]
-fn a_reliable_reader_is_waited_for_before_its_first_acknack_and_not_for_ever() {
+fn a_reliable_reader_is_awaited_before_its_first_acknack_for_a_limited_time() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     request(&mut host, Depth::Arrivals);
@@ -342,7 +342,7 @@ impl Unannounced {
 }
 
 #[test]
-fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
+fn a_sample_before_the_announcement_is_delivered_once_when_repeated() {
     for depth in [Depth::Arrivals, Depth::Payloads] {
         let mut dora = Unannounced::new(depth);
         (1..=4).for_each(|number| dora.data(number));
@@ -366,7 +366,7 @@ fn what_came_before_the_announcement_is_given_once_when_it_comes_again() {
 }
 
 #[test]
-fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() {
+fn a_subscription_gets_what_preceded_the_announcement_since_it_began() {
     let mut dora = Unannounced::new(Depth::Arrivals);
     (1..=3).for_each(|number| dora.data(number));
     sample_requests(&mut dora.host, &[1, 2], Depth::Arrivals);
@@ -387,7 +387,7 @@ fn a_subscription_is_told_of_what_came_before_the_announcement_since_it_began() 
 }
 
 #[test]
-fn what_came_before_the_announcement_and_never_again_is_told_as_unannounced() {
+fn a_sample_before_the_announcement_never_repeated_is_unannounced() {
     for (reliable, acknowledged) in [(false, false), (true, false), (true, true)] {
         let mut dora = Unannounced::new(Depth::Payloads);
         for number in [1, 2, 4] {

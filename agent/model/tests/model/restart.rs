@@ -135,7 +135,7 @@ fn restarted(memory: &Memory, at: u64) -> Observer {
 }
 
 #[test]
-fn everything_that_was_shown_is_shown_again_and_the_filter_told() {
+fn everything_shown_is_restored_and_the_filter_updated() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let text = serde_json::to_string(&before.memory()).unwrap();
@@ -164,7 +164,7 @@ fn everything_that_was_shown_is_shown_again_and_the_filter_told() {
 }
 
 #[test]
-fn who_is_heard_within_a_lease_stays_and_who_is_not_goes() {
+fn a_restored_participant_heard_within_its_lease_stays_and_another_expires() {
     let mut before = agent(Settings::default());
     robot(&mut before);
     let at = START + 60 * SECOND;

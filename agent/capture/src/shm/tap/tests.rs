@@ -351,7 +351,7 @@ fn a_port_that_is_truncated_under_us_is_let_go_and_found_again_when_it_is_whole(
 }
 
 #[test]
-fn a_hundred_and_twenty_eight_idle_ports_are_looked_at_seldom_and_missed_by_nobody() {
+fn idle_ports_are_polled_rarely_and_none_is_missed() {
     let mut host = Host::new();
     let mut ports: Vec<_> = (0..128).map(|index| host.port(7411 + 2 * index)).collect();
     let mut segment = host.segment(1);

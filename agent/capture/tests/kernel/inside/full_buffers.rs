@@ -112,7 +112,7 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
 }
 
 #[test]
-fn without_the_kernels_types_full_sockets_are_told_as_long_as_every_socket_is_seen() {
+fn without_btf_full_sockets_are_reported_while_every_socket_is_seen() {
     let settings = FilterSettings {
         kernel_types: false,
         ..FilterSettings::default()
@@ -239,7 +239,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
 }
 
 #[test]
-fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
+fn a_captured_datagram_that_found_no_room_is_reported_by_its_token() {
     let (mut observed, link, mut talker, _) = observed_link(7, Verdict::Capture);
     let to = format!("{}:7411", link.monitor.address());
     let receiver = observed.socket(&link.monitor, &to);
@@ -274,7 +274,7 @@ fn a_captured_datagram_that_found_no_room_is_told_by_its_token() {
 /// Samples by writer.
 type Sent = BTreeSet<(Guid, u64)>;
 
-/// Sends this many samples of each talker from a thread of its own, with noise to port 7500 between
+/// Sends this many samples of each talker from a separate thread, with noise to port 7500 between
 /// them. Returns what was sent, and what the receiver read while it was sent.
 fn send_at_once(
     host: &Namespace,

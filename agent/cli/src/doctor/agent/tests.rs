@@ -19,7 +19,7 @@ const WELL: &str = r#"{"ready":true,"version":"1.0.0","source":"host","watches_k
 const WATCHED: &str = r#"{"watches":[{"topic":"/a","state":"measuring"}]}"#;
 
 #[test]
-fn an_agent_that_is_well_is_fine_in_everything() {
+fn a_healthy_agent_passes_every_check() {
     let findings = check(&answers(WELL, WATCHED), "/run/api.sock", "1.0.0");
     assert!(
         findings.iter().all(|each| each.severity == Severity::Ok),
@@ -33,7 +33,7 @@ fn an_agent_that_is_well_is_fine_in_everything() {
 }
 
 #[test]
-fn what_is_wrong_with_an_agent_is_said_one_by_one() {
+fn each_fault_of_an_agent_is_reported_separately() {
     let ill = r#"{"ready":false,"reason":"no packet for 30 s","version":"0.9.0",
             "source":"host","dropped_packets":5,"dropped_records":6,"topics_rejected":2,
             "tables":[{"table":"endpoints","limit":10,"evictions":3},{"table":"nodes"}]}"#;
@@ -189,6 +189,6 @@ fn a_wrong_configuration_is_a_problem_with_its_first_mistake() {
     assert_eq!(finding.severity, Severity::Problem);
     assert_eq!(
         finding.sentence,
-        "the configuration is wrong: x:1: bad (and 1 more)"
+        "the configuration is invalid: x:1: bad (and 1 more)"
     );
 }

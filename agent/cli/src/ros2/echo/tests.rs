@@ -150,7 +150,7 @@ fn a_writer_whose_messages_cannot_be_read_is_named_once() {
     assert!(
         first
             .err
-            .starts_with("rp: /a of writer 01.02: a message is no a/msg/B: "),
+            .starts_with("rp: /a of writer 01.02: a message cannot be decoded as a/msg/B: "),
         "{first:?}"
     );
     assert_eq!(tell(&[]), MessageText::default());
@@ -188,7 +188,7 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
 }
 
 #[test]
-fn publishers_that_differ_are_told() {
+fn publishers_that_differ_are_reported() {
     let publisher = |reliability: &'static str, durability: &'static str| Endpoint {
         qos: Qos {
             reliability: reliability.into(),

@@ -54,7 +54,7 @@ impl Intervals {
     }
 
     /// Report caused by a message (Humble, Jazzy): one that arrived at least a second after that of
-    /// the last report. The first interval only starts the count.
+    /// the last report. The first interval only starts the count. `None` if no report is due.
     pub fn report_at_message(&mut self) -> Option<Rate> {
         if self.between.is_empty() {
             return None;

@@ -68,7 +68,7 @@ fn messages(rates: &mut Rates, name: &str, times: impl IntoIterator<Item = i64>)
 }
 
 #[test]
-fn a_topic_that_is_not_there_is_told_once_and_waited_for() {
+fn a_missing_topic_is_reported_once_and_awaited() {
     let topics = vec![Named {
         typed: "x".to_owned(),
         name: "/x".to_owned(),

@@ -23,7 +23,7 @@ pub struct Statistics {
     pub max: i64,
     /// Standard deviation of the population: the sum of squares is divided by the number of values.
     pub standard_deviation: f64,
-    /// How many values there are.
+    /// Number of values.
     pub count: usize,
 }
 
@@ -54,7 +54,7 @@ impl Window {
         self.values.is_empty()
     }
 
-    /// The oldest value.
+    /// The oldest value. `None` if the window is empty.
     #[must_use]
     pub fn oldest(&self) -> Option<i64> {
         self.values.front().copied()

@@ -124,7 +124,7 @@ fn the_selection_follows_its_topic_and_asks_for_details_once() {
     assert_eq!(press(&mut app, KeyCode::End), [Command::Select(key("/d"))]);
     assert_eq!(press(&mut app, KeyCode::Down), []);
     assert_eq!(press(&mut app, KeyCode::Home), [Command::Select(key("/b"))]);
-    // After the topic has gone, the one in its place is selected.
+    // The topic is gone: the next one in its place is selected.
     let left = json!([{"name": "/c", "dds_name": "rt/c"}]);
     assert_eq!(
         app.take(topics(&left), Instant::now()),
@@ -205,7 +205,7 @@ fn arrows_scroll_the_pane_in_focus_and_escape_leads_back() {
 }
 
 #[test]
-fn who_reads_old_events_is_not_pushed_away_by_new_ones() {
+fn a_reader_of_old_events_is_not_evicted_by_new_ones() {
     let mut app = app();
     app.heights.events = 2;
     let event = || Fact::Event(Box::default());

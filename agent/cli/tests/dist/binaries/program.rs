@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// One that is, or stands for what is, shipped.
+/// A released binary, or a substitute for one.
 pub struct Binary {
     pub architecture: &'static str,
     pub path: PathBuf,

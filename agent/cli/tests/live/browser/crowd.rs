@@ -8,9 +8,9 @@ use ros2probe_testing::model::forge::{self, Message};
 
 /// When the capture begins: 2026-11-21, Unix seconds.
 const START: u64 = 1_795_219_200;
-/// Topics of one participant, each with a node of its own.
+/// Topics of one participant, each with its own node.
 const TOPICS: usize = 20;
-/// Longest name that DDS knows.
+/// Longest name in DDS.
 const LONGEST: usize = 255;
 
 /// Names that harm a page which takes text for markup, for code, or for a file's path, and that the

@@ -18,7 +18,7 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Streams of the page that an agent has room for.
 const STREAMS: usize = 16;
 
-/// A host of its own, on which nothing leads to any other.
+/// A host without a link to any other.
 pub(crate) struct Place {
     pub(crate) host: Namespace,
     pub(crate) directory: TempDir,
@@ -63,7 +63,7 @@ impl Place {
         self.host.outside().to_vec()
     }
 
-    /// A node that publishes a topic of its own until its value is dropped.
+    /// A node that publishes its own topic until its value is dropped.
     pub(crate) fn publisher(&self, topic: &str, node: &str) -> Result<Process> {
         let words = ["--role", "pub", "--topic", topic, "--node", node];
         let stream = [

@@ -18,7 +18,7 @@ use ros2probe_testing::harness::{run, wait_until};
 const CLIENTS: usize = 24;
 
 #[test]
-fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result<()> {
+fn without_descriptors_only_what_needs_one_fails_and_later_recovers() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let (state, bags) = (
@@ -80,7 +80,7 @@ fn no_descriptors_left_costs_what_needs_one_and_comes_back_with_them() -> Result
     counted.check(&scene.agent)?;
     let took = scene.end()?;
     outcome(
-        &format!("no descriptor left (RLIMIT_NOFILE), {CLIENTS} clients that want one"),
+        &format!("no descriptor left (RLIMIT_NOFILE), {CLIENTS} clients that need one"),
         &format!(
             "{cpu:?} of CPU in {span:?}, every message counted; a recording is refused ({detail}), state \
              writes fail and are counted; both work again with the limit; ended in {took:?}"

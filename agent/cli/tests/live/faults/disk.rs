@@ -1,4 +1,4 @@
-//! Disks that are full, read-only, or gone.
+//! Disks that are full, read-only, or removed.
 
 use std::fs;
 use std::io::Write as _;
@@ -170,7 +170,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     counted.check(&scene.agent)?;
     let written = disk.writes("written")?;
     disk.make_room()?;
-    // Although nothing changes any more.
+    // Although nothing changes.
     disk.wait_for_write("written", written)?;
     disk.state(&["/first", "/second"])?;
     disk.accepts(&mut counted, "roomy")?;
@@ -189,7 +189,7 @@ fn a_disk_that_is_full_read_only_or_gone_costs_what_should_lie_there_and_no_mess
     counted.check(&scene.agent)?;
     let took = scene.end()?;
     outcome(
-        "state and recordings that belong to somebody else",
+        "state and recordings that belong to another user",
         &format!("refused and counted until they belong to the agent; ended in {took:?}"),
     )
 }
@@ -230,8 +230,8 @@ fn directories_that_are_gone(
     disk.wait_for_write("written", written)?;
     disk.state(&["/fourth"])?;
     outcome(
-        "state and recordings removed while it runs",
-        "state writes fail and are counted until the directory is there again; the place for bags is made anew",
+        "state and recordings removed while the agent runs",
+        "state writes fail and are counted until the directory is there again; the directory for bags is created again",
     )
 }
 

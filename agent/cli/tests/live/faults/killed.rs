@@ -210,7 +210,7 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     ensure!(broken <= rounds / 8, "{broken} bags without metadata.yaml");
     outcome(
         &format!(
-            "kill -9, {rounds} times (seed {seed}), while starting, measuring, recording, keeping state, \
+            "kill -9, {rounds} times (seed {seed}), while starting, measuring, recording, saving state, \
                   reloading, ending, taking snapshots, adding watches"
         ),
         &format!(
@@ -220,7 +220,7 @@ fn killed_at_any_moment_it_leaves_nothing_and_starts_clean() -> Result<()> {
     )
 }
 
-/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all gone
+/// Starts an agent and kills it at this moment. Returns its number of objects in the kernel, all removed
 /// by then, and the time that its start took.
 fn until(
     link: &Link,

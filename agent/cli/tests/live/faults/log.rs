@@ -1,4 +1,4 @@
-//! A log that goes nowhere.
+//! A log without a reader.
 
 use std::fs::File;
 use std::io::{self, Read as _};
@@ -12,7 +12,7 @@ use ros2probe_testing::harness::network::Link;
 use ros2probe_testing::harness::soak::outcome;
 
 #[test]
-fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
+fn a_log_without_a_reader_delays_no_thread() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let right = format!("watch: [/**]\n{ON_THE_WIRE}");
@@ -53,9 +53,9 @@ fn a_log_that_nobody_reads_holds_nobody_up() -> Result<()> {
     }
     let took = scene.end()?;
     outcome(
-        "nobody reads the log (stderr is a full pipe), 20 reloads of 200 mistakes",
+        "log without a reader (stderr is a full pipe), 20 reloads of 200 mistakes",
         &format!(
-            "every message counted, {missed} lines lost and counted, reported in the log when it was read again; \
+            "every message counted, {missed} lines lost and counted, reported in the log once it was read again; \
              ended in {took:?}"
         ),
     )

@@ -106,8 +106,8 @@ fn every_cap_reached_at_once_stays_within_the_unit_s_memory() -> Result<()> {
     )
 }
 
-/// Everything at once, for so long and until so much of the tables is used: the datagrams sent, and
-/// the most memory needed.
+/// Sends everything at once, for at least this time and until this part of the tables is used.
+/// Returns the datagrams sent and the most memory needed.
 fn storm(
     scene: &Scene<'_>,
     group: &Confined,

@@ -36,7 +36,7 @@ struct Receiver {
 }
 
 impl Receiver {
-    /// Takes connections, and gives each `answer` again and again, or nothing at all.
+    /// Accepts connections and sends `answer` to each repeatedly, or nothing.
     fn start(host: &Namespace, answer: Option<Vec<u8>>) -> Result<Receiver> {
         let listener = netns::within(&host.network(), || TcpListener::bind("127.0.0.1:0"))??;
         listener.set_nonblocking(true)?;
@@ -53,7 +53,7 @@ impl Receiver {
                 counter.fetch_add(1, Ordering::Relaxed);
                 match &answer {
                     Some(answer) => {
-                        // It may have gone already.
+                        // The client may have disconnected.
                         let _ = stream.set_nonblocking(false);
                         let _ = stream.read(&mut [0; 64]);
                         let _ = stream.write_all(answer);
@@ -147,7 +147,7 @@ fn receivers_and_scrapers_that_misbehave_cost_counters_and_no_message() -> Resul
 }
 
 #[test]
-fn a_crowd_of_scrapers_and_clients_is_bounded_and_goes_again() -> Result<()> {
+fn a_crowd_of_scrapers_and_clients_is_bounded_and_leaves_nothing_behind() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
     let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
@@ -227,7 +227,7 @@ fn scrapers(scene: &Scene<'_>) -> Result<Vec<TcpStream>> {
             let request = match number % 4 {
                 // Half a request, as after a cable was pulled.
                 0 => "GET /metrics HTTP/1.1\r\nHo".to_owned(),
-                // Nothing at all.
+                // Sends nothing.
                 1 => String::new(),
                 // Many, and not one answer is read.
                 2 => "GET /metrics HTTP/1.1\r\nHost: localhost\r\n\r\n".repeat(100),

@@ -140,7 +140,7 @@ impl Repair {
     }
 }
 
-/// Starts a reliable stream, and waits until the agent knows which socket receives its samples.
+/// Starts a reliable stream, and waits until the agent has identified the socket that receives its samples.
 fn delivered_pair(link: &Link, stack: Stack, witness: &mut Witness) -> Result<(Peer, Peer)> {
     let stream = Stream {
         reliable: true,

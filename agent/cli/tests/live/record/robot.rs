@@ -1,4 +1,4 @@
-//! A robot that publishes, a program that records it, and what is in the bags.
+//! A robot that publishes, a program that records it, and the content of its bags.
 
 use super::*;
 

@@ -42,9 +42,9 @@ fn samples_above_64_kib_are_read_from_shared_memory_by_looking() -> Result<()> {
     observed.wait_for_view("sampled")
 }
 
-/// With `exact: auto` the breakpoint is there while samples are read, and no longer.
+/// With `exact: auto` the breakpoint exists only while samples are read.
 #[test]
-fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader() -> Result<()> {
+fn on_demand_every_sample_is_seen_and_the_last_reader_removes_the_breakpoint() -> Result<()> {
     let host = Host::with_its_own_fast_dds()?;
     let observed = host.observe("exact: auto")?;
     let stream = in_shared_memory(150_000, 40);
@@ -73,7 +73,7 @@ fn on_demand_every_sample_is_seen_and_the_breakpoint_goes_with_the_last_reader()
     observed.wait_for_view("sampled")
 }
 
-/// A host with a `/dev/shm` of its own.
+/// A host with its own `/dev/shm`.
 struct Host {
     network: Namespace,
     enter: Vec<String>,
@@ -115,7 +115,7 @@ impl Host {
         Observed::start(&self.network, &capture)
     }
 
-    /// As [`Self::pair`], until the agent knows their topic: it is announced once in shared memory,
+    /// As [`Self::pair`], until the agent has their topic: it is announced once in shared memory,
     /// and a busy machine may poll too late.
     fn known_pair(&self, observed: &Observed<'_>, stream: &Stream) -> Result<(Peer, Peer)> {
         for _ in 0..12 {
@@ -135,7 +135,7 @@ impl Host {
         bail!("{} never became known", stream.topic)
     }
 
-    /// A publisher and its subscriber that know each other.
+    /// A publisher and a matched subscriber.
     fn pair(&self, stream: &Stream) -> Result<(Peer, Peer)> {
         let launch =
             |role, node| Peer::launch_behind(&self.enter, Stack::Fast, role, stream, &[node]);

@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn files_that_are_idle_garbage_truncated_or_somebody_elses_hurt_nothing() -> Result<()> {
+fn files_that_are_idle_garbage_truncated_or_of_another_user_do_no_harm() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network)?;
     let directory = tempfile::tempdir()?;
@@ -290,7 +290,7 @@ fn nothing_below_dev_shm_is_opened_but_for_reading_and_nothing_is_mapped() -> Re
         };
         assert!(is_harmless, "{line}");
     }
-    // Futexes of its own threads apart, the agent waits on nothing and locks nothing.
+    // Except for futexes of its own threads, the agent waits on nothing and locks nothing.
     for call in ["flock(", "F_SETLK", "PROT_WRITE, MAP_SHARED, 3<"] {
         let wrong = trace
             .lines()

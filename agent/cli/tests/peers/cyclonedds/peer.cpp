@@ -185,7 +185,7 @@ void on_cloud(dds_entity_t reader, void* argument) {
   }
 }
 
-// Not supported by Cyclone DDS 0.8. The caller's configuration stays in force.
+// Not supported by Cyclone DDS 0.8. The caller's configuration stays active.
 void size_receive_buffer([[maybe_unused]] uint32_t bytes) {
 #if DDS_VERSION_MAJOR > 0 || DDS_VERSION_MINOR >= 10
   const std::string size = std::to_string(bytes) + "B";

@@ -268,7 +268,7 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
     }
 }
 
-/// The program of a Python package in a place of its own.
+/// The program of a Python package in a separate directory.
 fn schemathesis() -> Command {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
     let program = target.join("tools/schemathesis/bin/st");
@@ -281,7 +281,7 @@ fn schemathesis() -> Command {
 }
 
 #[test]
-fn no_request_that_can_be_thought_of_gets_an_answer_that_is_not_documented() {
+fn no_request_gets_an_undocumented_answer() {
     let directory = tempfile::tempdir().unwrap();
     let config = directory.path().join("config.yaml");
     std::fs::write(&config, "watch: [/chatter, /listed]\n").unwrap();

@@ -62,7 +62,7 @@ fn a_watch_is_added_shown_replaced_and_removed() {
     assert_eq!(problem(&gone), (404, "no-such-watch".to_owned()));
 }
 
-/// Topics and origins of what is watched.
+/// Topics and origins of the watches.
 fn listed(agent: &LocalAgent) -> Vec<(String, String)> {
     let list: Value = serde_json::from_str(&ask(agent, "GET", "/watch", "", "").body).unwrap();
     let watches = list["watches"].as_array().unwrap().iter();

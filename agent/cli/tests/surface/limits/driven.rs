@@ -186,13 +186,13 @@ pub const FIXED: &[[&str; 4]] = &[
         "KEPT",
         "agent/daemon/src/events.rs",
         "agent/daemon/src/events/tests.rs",
-        "what_was_overwritten_is_told_to_the_reader_that_missed_it",
+        "an_overwritten_sample_is_reported_to_the_reader_that_missed_it",
     ],
     [
         "MOST",
         "agent/daemon/src/events.rs",
         "agent/daemon/src/events/tests.rs",
-        "a_storm_is_cut_in_each_second_and_told_in_one_event",
+        "a_storm_is_limited_each_second_and_summed_up_in_one_event",
     ],
     [
         "MAX_STREAMS",
@@ -504,7 +504,7 @@ pub const FIXED: &[[&str; 4]] = &[
         "MAX_LIBRARIES",
         "agent/capture/src/uprobe/search.rs",
         "agent/capture/src/uprobe/search.rs",
-        "a_library_beyond_the_cap_is_said_to_be_uncovered_until_another_is_no_longer_used",
+        "a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used",
     ],
     [
         "MAX_LISTED",
@@ -546,11 +546,11 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "payload_bytes",
-        "messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_reads",
+        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read",
     ],
     [
         "subscriptions",
-        "messages_beyond_the_bytes_of_all_queues_crowd_out_the_oldest_until_somebody_reads",
+        "messages_beyond_the_bytes_of_all_queues_evict_the_oldest_until_one_is_read",
     ],
     [
         "recordings",
@@ -558,10 +558,10 @@ pub const KEYS: &[[&str; 2]] = &[
     ],
     [
         "api_clients",
-        "clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone",
+        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
     ],
     [
         "metrics_clients",
-        "clients_beyond_the_cap_are_told_so_at_once_and_served_when_one_has_gone",
+        "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
     ],
 ];

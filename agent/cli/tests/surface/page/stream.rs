@@ -3,7 +3,7 @@
 use super::*;
 
 #[test]
-fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
+fn a_stream_begins_with_the_whole_state_and_continues_with_changes() {
     let agent = ended("cyclonedds/points-besteffort-lossy-2ns", &[]);
     let mut live = Lines::open(agent.api, "/live", "").unwrap_or_else(|_| panic!());
     let first = live.batch();
@@ -42,7 +42,7 @@ fn a_stream_begins_with_everything_and_goes_on_with_what_changes() {
         "{loss}"
     );
 
-    // The capture has ended: nothing changes, and the stream goes on.
+    // The capture has ended: nothing changes, and the stream continues.
     let began = Instant::now();
     for _ in 0..2 {
         let batch = live.batch();
@@ -119,7 +119,7 @@ fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
 }
 
 #[test]
-fn a_replay_tells_figures_in_the_time_of_its_capture() {
+fn a_replay_sends_figures_in_the_time_of_its_capture() {
     let capture = data("cyclonedds/points-besteffort-lossy-2ns");
     let mut agent = LocalAgent::replay(&mut rp(), &capture, &["--watch", "/**", "--speed", "0.5"]);
     agent.wait_for_log("ready");

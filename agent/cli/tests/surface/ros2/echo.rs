@@ -21,7 +21,7 @@ fn own() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/echo")
 }
 
-/// Runs with the capture; what is between `from` and `until` is echoed.
+/// Runs with the capture; messages between `from` and `until` are echoed.
 fn echo(arguments: &[&str], from: &str, until: &str) -> std::process::Output {
     let capture = own().join("capture.pcap.gz");
     let capture = ["--replay", capture.to_str().unwrap()];
@@ -135,7 +135,7 @@ fn options_choose_what_is_echoed_and_when_it_ends() {
 }
 
 #[test]
-fn what_cannot_be_echoed_is_said_in_one_line() {
+fn what_cannot_be_echoed_is_reported_in_one_line() {
     let ask = |further: &[&str]| echo(&[&["topic", "echo", IMU], further].concat(), START, END);
     fails_with(
         &ask(&["--field", "orientation.v"]),
@@ -160,7 +160,7 @@ fn what_cannot_be_echoed_is_said_in_one_line() {
     );
     assert_eq!(ask(&["--timeout", "0"]).status.code(), Some(2));
     assert_eq!(ask(&["-l", "-1"]).status.code(), Some(2));
-    // Another type than the writer's: no message comes, and stderr names the reason.
+    // Another type than the writer's: no message is printed, and stderr names the reason.
     let other = ask(&["std_msgs/msg/String"]);
     assert_eq!(
         (stdout(&other).as_str(), other.status.code()),
@@ -192,7 +192,7 @@ fn only_messages_that_pass_the_filter_are_timed() {
 
 /// Goals of order 4 in three recordings; Jazzy announces type hashes.
 #[test]
-fn an_action_tells_feedback_and_states_with_every_middleware() {
+fn an_action_prints_feedback_and_states_with_every_middleware() {
     let directory = tempfile::tempdir().unwrap();
     let place = directory.path().join("example_interfaces/action");
     std::fs::create_dir_all(&place).unwrap();

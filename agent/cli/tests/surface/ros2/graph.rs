@@ -34,7 +34,7 @@ fn without_gids(text: &str) -> String {
 }
 
 #[test]
-fn what_the_original_says_of_a_graph_is_said() {
+fn what_the_original_prints_of_a_graph_is_printed() {
     let capture = own().join("graph.pcap.gz");
     let recorded = std::fs::read_to_string(own().join("recorded.jsonl")).unwrap();
     let differing = listed("Recorded commands");
@@ -67,7 +67,7 @@ fn what_the_original_says_of_a_graph_is_said() {
 
 /// Nodes of one name, and a topic and a service of two types (`fixtures/cli/mixed.py`).
 #[test]
-fn a_node_has_the_types_of_its_own_endpoints_where_a_topic_has_several() {
+fn a_node_has_its_endpoints_types_if_a_topic_has_several() {
     let capture = own().join("mixed.pcap.gz");
     let recorded = std::fs::read_to_string(own().join("mixed.jsonl")).unwrap();
     let mut count = 0;
@@ -92,7 +92,7 @@ fn a_node_has_the_types_of_its_own_endpoints_where_a_topic_has_several() {
     assert_eq!(count, 12);
 }
 
-/// As of a topic that is known at the start: a replay knows it when it has been read.
+/// As for a topic known at the start: a replay has it once it was read.
 #[test]
 fn a_topic_of_two_types_is_not_echoed_from_a_capture() {
     let capture = own().join("mixed.pcap.gz");
@@ -127,7 +127,7 @@ fn the_nodes_of_an_action_bear_their_names() {
 }
 
 #[test]
-fn what_humble_has_not_is_said_as_jazzy_says_it() {
+fn what_humble_lacks_is_printed_as_jazzy_prints_it() {
     let capture = own().join("graph.pcap.gz");
     let ask = |words: &str| {
         let mut words: Vec<&str> = words.split(' ').collect();

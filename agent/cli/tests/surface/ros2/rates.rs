@@ -41,7 +41,7 @@ fn corpus() -> PathBuf {
 }
 
 #[test]
-fn what_the_original_said_is_said() {
+fn what_the_original_printed_is_printed() {
     let list = tolerances();
     let mut compared = 0;
     for recorded in recorded(&own()) {
@@ -53,7 +53,7 @@ fn what_the_original_said_is_said() {
 
 #[test]
 #[ignore = "needs the corpus of captures: make test-corpus"]
-fn what_the_original_said_in_the_corpus_is_said() {
+fn what_the_original_printed_in_the_corpus_is_printed() {
     let (list, corpus) = (tolerances(), corpus());
     let mut compared = 0;
     for recorded in recorded(&corpus.join("cli")) {

@@ -50,7 +50,7 @@ fn samples_that_shared_memory_did_not_show_are_not_captured_and_the_time_waits_f
     let now = Timestamp(sent + SECOND / 20);
     robot.observer.input(Input::Time(now));
     assert!(robot.observer.dispatched_until(now).0 < sent);
-    // One of them comes late.
+    // One of them is late.
     look(&mut robot, 3);
     assert_eq!(robot.given(), [given(3)]);
     let now = Timestamp(sent + SECOND);

@@ -152,7 +152,7 @@ otlp:
 ";
     assert_eq!(
         report(source),
-        "f:2:13: otlp.endpoint: must be an URL of a gRPC receiver, as in \
+        "f:2:13: otlp.endpoint: must be the URL of a gRPC receiver, as in \
              `http://collector:4317`, or `off`\n\
              f:3:22: otlp.headers.c: is `3`, must be text\n\
              f:4:17: otlp.headers_file: must be an absolute path, as in \
@@ -204,17 +204,17 @@ fn of_a_newer_file_one_line_says_what_to_do() {
 fn a_key_that_is_called_otherwise_is_named() {
     assert_eq!(
         report("watchlist: []"),
-        "f:1:1: watchlist: unknown key; its name is `watch`"
+        "f:1:1: watchlist: unknown key; use `watch`"
     );
     let source = "watch: [{topic: /a, max_delay_ms: 3}]";
-    assert!(report(source).ends_with("unknown key; its name is `max_latency_ms`"));
+    assert!(report(source).ends_with("unknown key; use `max_latency_ms`"));
 }
 
 #[test]
 fn a_key_written_twice_is_reported() {
     assert_eq!(
         report("log: info\nlog: warn"),
-        "f:2:1: log: written twice, first at 1:6"
+        "f:2:1: log: duplicate key, first at 1:6"
     );
 }
 

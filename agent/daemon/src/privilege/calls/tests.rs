@@ -129,7 +129,7 @@ fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
 }
 
 #[test]
-fn sockets_are_made_by_who_speaks_and_of_no_other_kind() {
+fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
     let refused = Some(libc::EPERM);
     for role in ROLES {
         confined(role, move || {
@@ -233,7 +233,7 @@ fn kernel_maps_are_the_captures_and_probes_the_exact_thread_s() {
 }
 
 #[test]
-fn who_looks_at_others_opens_nothing_for_writing() {
+fn threads_of_the_capture_open_nothing_for_writing() {
     let directory = tempfile::tempdir().unwrap();
     for role in ROLES {
         let file = directory.path().join(format!("{role:?}"));
@@ -300,7 +300,7 @@ fn every_thread_can_pass_a_signal_on() {
 }
 
 #[test]
-fn who_is_confined_has_no_power_left_and_who_is_not_is_refused() {
+fn a_confined_thread_has_no_capability_and_an_unconfined_one_is_refused() {
     let has_none = rustix::thread::capabilities(None)
         .unwrap()
         .permitted

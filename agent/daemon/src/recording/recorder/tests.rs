@@ -191,7 +191,7 @@ fn samples_go_by_while_it_is_paused() {
 }
 
 #[test]
-fn a_topic_of_two_types_keeps_the_first_and_says_so() {
+fn a_topic_of_two_types_keeps_the_first_and_reports_it() {
     let directory = tempfile::tempdir().unwrap();
     let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
     recorder.take(&sample("/a", 1)).unwrap();

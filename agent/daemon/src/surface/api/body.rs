@@ -31,7 +31,7 @@ impl<S: Send + Sync, T: DeserializeOwned + Default> FromRequest<S> for Body<T> {
             return Ok(Self(T::default()));
         }
         if !is_json {
-            let detail = "send the body with `Content-Type: application/json`, or none";
+            let detail = "send the body with `Content-Type: application/json`, or send no body";
             return Err(Problem::new(Code::UnsupportedMediaType, detail));
         }
         let problem = |error: serde_json::Error| {

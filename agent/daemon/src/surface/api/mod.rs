@@ -193,7 +193,7 @@ fn router(context: &Context, door: Arc<Door>) -> Router {
         .method_not_allowed_fallback(async |method: Method| {
             Problem::new(
                 Code::MethodNotAllowed,
-                format!("{method} is not possible here"),
+                format!("{method} is not allowed on this path"),
             )
         })
         .layer(middleware::from_fn_with_state(door, security::guard));

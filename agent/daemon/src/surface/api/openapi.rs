@@ -23,7 +23,7 @@ use super::{Context, nouns};
 /// Answers that any request may receive.
 const COMMON: [(&str, &str); 6] = [
     ("400", "The request cannot be read."),
-    ("401", "The listener wants a bearer token."),
+    ("401", "The listener requires a bearer token."),
     (
         "403",
         "Sent to a foreign name, by a foreign web page, or to a listener that does not grant it.",

@@ -32,7 +32,7 @@ type Endpoints<'a> = BTreeMap<(Option<&'a str>, Guid), Vec<Guid>>;
 
 impl Side {
     /// Returns the side of a writer or reader of this topic: a server reads requests and writes all
-    /// other topics.
+    /// other topics. `None` if it cannot be determined.
     pub(super) fn of(topic: &TopicFacts, is_writer: bool) -> Option<Self> {
         match (topic.kind, is_writer) {
             (TopicKind::ServiceRequest, false) | (TopicKind::ServiceReply, true) => {
@@ -94,7 +94,7 @@ pub(super) fn service_type(message_type: &str) -> &str {
     stems.next().unwrap_or(message_type)
 }
 
-/// Returns the action that a topic or service belongs to.
+/// Returns the action that a topic or service belongs to, if any.
 pub(super) fn action(topic: &TopicFacts) -> Option<(RosName, ActionPart)> {
     match topic.kind {
         TopicKind::Topic | TopicKind::ServiceEvent | TopicKind::Discovery | TopicKind::Dds => None,

@@ -137,7 +137,7 @@ impl<'a> Circumstances<'a> {
         };
         let is_covered = !self.watchlist.matching(topic.domain_id, name).is_empty();
         if is_covered && !topic.hidden {
-            let detail = "limits.topics topics are measured already, or it was watched just now";
+            let detail = "limits.topics is reached, or the watch was added just now";
             return (ReasonCode::WatchRejected, detail.to_owned());
         }
         let detail = match name.strip_prefix('/') {

@@ -186,7 +186,8 @@ async fn samples(
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// Returns the next piece of the answer: some lines, or the payload of the last one.
+    /// Returns the next piece of the answer: some lines, or the payload of the last one. `None` at
+    /// its end.
     async fn next(&mut self) -> Option<Bytes> {
         if let Some(payload) = self.payload.take() {
             return Some(payload);
@@ -268,7 +269,7 @@ fn patterns(names: Option<&str>, regex: Option<&str>) -> Result<Vec<Choice>, Pro
     }
     let names: Vec<_> = names.into_iter().flat_map(|list| list.split(',')).collect();
     if names.len() > MAX_PATTERNS {
-        let detail = format!("at most {MAX_PATTERNS} topics can be named, use globs");
+        let detail = format!("at most {MAX_PATTERNS} topics can be named; use globs");
         return Err(Problem::new(Code::InvalidRequest, detail));
     }
     let names = names.into_iter().map(|name| Choice::parse(name.trim()));

@@ -3,7 +3,7 @@
 //! [`Access`].
 //!
 //! Host and Origin matter because a web page can make a browser on this host send requests to
-//! loopback (CSRF). It can do so under a name of its own, too (DNS rebinding).
+//! loopback (CSRF). It can also do so under its own host name (DNS rebinding).
 
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
@@ -122,7 +122,7 @@ impl Token {
         Ok(Self(token.into()))
     }
 
-    /// Compares in constant time for tokens of the right length.
+    /// Returns whether the token is the right one, in constant time for tokens of the right length.
     fn is(&self, offered: &[u8]) -> bool {
         self.0.ct_eq(offered).into()
     }
@@ -267,7 +267,7 @@ impl Granted {
             None => "configure `api.socket` or `api.token_file`".to_owned(),
         };
         let detail = format!(
-            "loopback gives no {what} without a token: {way}, or set `api.loopback: {needed}`"
+            "loopback grants no {what} without a token: {way}, or set `api.loopback: {needed}`"
         );
         Err(Problem::new(Code::NeedsSocket, detail))
     }
@@ -360,7 +360,7 @@ fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
     let foreign = origins.find(|origin| Some(origin) != own.as_ref());
     if cross || foreign.is_some() {
         let detail = format!(
-            "requests of web pages from elsewhere ({}) are not answered",
+            "requests from web pages of other origins ({}) are refused",
             foreign.unwrap_or_else(|| "another site".to_owned())
         );
         return Err(Problem::new(Code::ForeignOrigin, detail));
@@ -379,7 +379,7 @@ fn authorized(headers: &HeaderMap, token: &Token) -> Result<(), Problem> {
     Err(Problem::new(Code::Unauthorized, "the token is wrong"))
 }
 
-/// Returns the token of a request.
+/// Returns the bearer token of a request, if it has one.
 fn bearer(headers: &HeaderMap) -> Option<&[u8]> {
     let credentials = headers.get(AUTHORIZATION)?.as_bytes();
     let (scheme, offered) = credentials.split_at_checked(7)?;

@@ -35,7 +35,7 @@ pub enum OpenError {
     Token(#[from] TokenError),
     /// Without a token, any host could change the watches.
     #[error(
-        "{address} can be reached from elsewhere: serving the control API there needs \
+        "{address} is reachable from other hosts: serving the control API there needs \
          `api.token_file`"
     )]
     Unprotected {
@@ -308,7 +308,7 @@ mod tests {
     }
 
     #[test]
-    fn a_busy_port_is_said_in_one_line() {
+    fn a_busy_port_is_reported_in_one_line() {
         let other = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = other.local_addr().unwrap();
         let error = Server::new(None, Access::Watch)

@@ -57,7 +57,7 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
 
 /// Write a snapshot to a bag
 ///
-/// The answer follows once the messages in memory are in a bag. The snapshot then begins anew.
+/// The answer follows once the messages in memory are in a bag. The snapshot then restarts, empty.
 #[utoipa::path(
     post,
     path = "/snapshots/{name}",

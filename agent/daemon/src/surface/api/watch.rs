@@ -297,7 +297,7 @@ fn problem(refused: &Refused, topic: &str, domain_id: Option<u32>) -> Problem {
         } => {
             format!("{topic} is listed in the configuration file: change it there and reload")
         }
-        Refused::Given { by } => format!("{topic} is given by {}", by.phrase()),
+        Refused::Given { by } => format!("{topic} is defined by {}", by.phrase()),
         Refused::Different => {
             format!("{topic} is watched with other settings: PUT replaces them")
         }

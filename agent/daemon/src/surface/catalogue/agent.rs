@@ -16,13 +16,13 @@ pub(in crate::surface) const SOURCE_INFO: Metric = Metric::info(
 pub(in crate::surface) const SANDBOX_INFO: Metric = Metric::info(
     "ros2probe_sandbox_info",
     &["system_calls", "reason"],
-    "System calls that the kernel permits to the agent: `filtered` (only those that it makes), \
+    "System calls that the kernel permits the agent: `filtered` (only those that it makes), \
      or `all` with the reason.",
 );
 pub(in crate::surface) const ABILITY: Metric = Metric::gauge(
     "ros2probe_capture_ability",
     &["ability"],
-    "1 if the source can see it: each subscriber, messages sent, losses in socket buffers and in \
+    "1 if the source provides the ability: each subscriber, messages sent, losses in socket buffers and in \
      reassembly, socket owners, containers, forwarded traffic, shared memory, every message in \
      it.",
 );

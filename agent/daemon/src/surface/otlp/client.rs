@@ -131,7 +131,7 @@ impl Client {
     /// not waited for.
     pub(super) fn overtaken(&mut self) {
         self.failed(&Status::deadline_exceeded(
-            "no answer before there was more",
+            "no answer before the next export",
         ));
         self.count(Outcome::Failed);
     }
@@ -159,7 +159,7 @@ impl Client {
                 tracing::debug!(
                     signal = self.signal.label(),
                     message = partial.error_message,
-                    "the OTLP receiver sent a message"
+                    "the OTLP receiver accepted an export in part"
                 );
             }
             u64::try_from(partial.rejected_data_points).unwrap_or(0)
@@ -218,7 +218,8 @@ const fn path(signal: Signal) -> &'static str {
     }
 }
 
-/// Returns whether to retry (OTLP 1.x, "Failures"), and the delay that the receiver requests.
+/// Returns `None` if the request must not be retried (OTLP 1.x, "Failures"), otherwise the delay
+/// that the receiver requests, if any.
 fn retry_delay(status: &Status) -> Option<Option<Duration>> {
     let asked = retry_info(status.details());
     let again = match status.code() {

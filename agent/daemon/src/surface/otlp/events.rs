@@ -71,7 +71,7 @@ impl Reporter {
         }
     }
 
-    /// Returns the next events as a request.
+    /// Returns the next events as a request; `None` if there are no new ones.
     fn take(&mut self, sender: &SignalSender, most: usize) -> Option<Request> {
         let Batch {
             lagged,

@@ -95,7 +95,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_instance_is_told_by_its_host_and_stays_the_same() {
+    fn an_instance_is_identified_by_its_host_and_stays_the_same() {
         let host = |id: &str| Host {
             name: Some("robot-7".to_owned()),
             id: Some(id.to_owned()),

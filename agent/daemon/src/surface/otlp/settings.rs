@@ -122,13 +122,14 @@ impl Settings {
 struct Variables<'e>(&'e dyn Fn(&str) -> Option<String>);
 
 impl Variables<'_> {
-    /// Returns a variable's value; an empty one counts as unset.
+    /// Returns a variable's value; `None` if it is unset or empty.
     fn find(&self, name: &str) -> Option<String> {
         let value = (self.0)(name)?.trim().to_owned();
         (!value.is_empty()).then_some(value)
     }
 
-    /// Returns the signal's own variable, or the one for all signals, with its name.
+    /// Returns the signal's own variable, or the one for all signals, with its name. `None` if both
+    /// are unset.
     fn of(&self, signal: Signal, name: &str) -> Option<(String, String)> {
         let own = match signal {
             Signal::Metrics => "METRICS",
@@ -155,7 +156,7 @@ impl Variables<'_> {
 fn number(name: &str, value: &str) -> Option<Duration> {
     let milliseconds = value.parse().ok().filter(|value| *value > 0);
     if milliseconds.is_none() {
-        tracing::warn!(name, value, "not a number of milliseconds, not used");
+        tracing::warn!(name, value, "not a number of milliseconds; ignored");
     }
     milliseconds.map(Duration::from_millis)
 }
@@ -427,7 +428,7 @@ otlp:
     }
 
     #[test]
-    fn what_cannot_work_is_said_at_the_start() {
+    fn invalid_settings_are_reported_at_the_start() {
         let failed = |yaml: &str, environment: &[(&str, &str)]| {
             resolve(yaml, environment).unwrap_err().to_string()
         };

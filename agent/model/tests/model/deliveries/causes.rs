@@ -114,7 +114,7 @@ fn a_retransmission_without_room_is_lost_like_the_original() {
 }
 
 #[test]
-fn a_loss_whose_fragments_the_kernel_gives_up_later_is_told_with_its_final_cause() {
+fn a_loss_whose_fragments_expire_later_has_its_final_cause() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=20 {

@@ -25,7 +25,7 @@ fn a_heartbeat_tells_the_tail_to_the_reader_it_is_for_and_to_no_other() {
 }
 
 #[test]
-fn an_acknowledgement_tells_what_a_reader_waits_for() {
+fn an_acknowledgement_shows_what_a_reader_waits_for() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     host.acknack(bob, 1);

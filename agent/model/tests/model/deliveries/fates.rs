@@ -63,7 +63,7 @@ proptest! {
         let bob = host.reader(BOB, 7411);
         let socket_full = |record: Record| Record { flags: record.flags | flag::SOCKET_FULL, ..record };
         host.put(arrival(&host, bob, 1, false, false));
-        // The kernel knows the writer by then, so it captures every fragment from here on.
+        // The kernel has the writer by then, so it captures every fragment from here on.
         host.wait(300);
         let mut given_up = Vec::new();
         let mut repairs = Vec::new();

@@ -9,7 +9,7 @@ use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 #[test]
-fn two_subscribers_of_one_multicast_with_different_losses_are_told_apart() {
+fn two_subscribers_of_one_multicast_have_separate_losses() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     let (bob, carol) = (bob.multicast(101), carol.multicast(102));
@@ -60,7 +60,7 @@ fn a_late_joiner_and_its_history_lose_nothing() {
 }
 
 #[test]
-fn a_reader_that_leaves_loses_nothing_and_comes_back_without_a_gap() {
+fn a_reader_that_leaves_loses_nothing_and_returns_without_a_gap() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.reader(CAROL, 7413));
     for number in 1..=100 {
@@ -99,7 +99,7 @@ fn a_reader_that_leaves_loses_nothing_and_comes_back_without_a_gap() {
 }
 
 #[test]
-fn what_arrives_where_nobody_reads_is_unmatched_and_takes_no_room() {
+fn what_arrives_without_a_reader_is_unmatched_and_takes_no_room() {
     let mut host = Host::new();
     let (bob, carol) = (host.reader(BOB, 7411), host.bystander(CAROL, 7413));
     let (bob, carol) = (bob.multicast(101), carol.multicast(102));
@@ -125,7 +125,7 @@ fn what_arrives_where_nobody_reads_is_unmatched_and_takes_no_room() {
 }
 
 #[test]
-fn a_killed_subscriber_does_not_lose_for_ever() {
+fn the_losses_of_a_killed_subscriber_end() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     for number in 1..=1000 {
@@ -141,7 +141,7 @@ fn a_killed_subscriber_does_not_lose_for_ever() {
 }
 
 #[test]
-fn an_address_that_two_announce_in_turn_is_nobodys() {
+fn an_address_that_two_announce_in_turn_identifies_neither() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).wire();
     host.reader(CAROL, 7411);
@@ -162,7 +162,7 @@ fn an_address_that_two_announce_in_turn_is_nobodys() {
 }
 
 #[test]
-fn who_is_silent_and_unknown_is_forgotten() {
+fn a_silent_unknown_receiver_is_removed() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let nobody = CapturePoint {
@@ -180,7 +180,7 @@ fn who_is_silent_and_unknown_is_forgotten() {
 }
 
 #[test]
-fn what_a_participant_sends_to_an_address_of_its_own_by_mistake_tells_nothing_of_its_socket() {
+fn a_packet_to_the_senders_own_address_does_not_identify_its_socket() {
     // RustDDS announces 127.0.0.1 to other hosts too, so an ACKNACK for Alice returns to Bob.
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);

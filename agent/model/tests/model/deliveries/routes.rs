@@ -109,7 +109,7 @@ fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
 }
 
 #[test]
-fn a_wire_tells_receivers_apart_by_destination_and_invents_no_losses_for_repairs() {
+fn a_wire_distinguishes_receivers_by_destination_and_invents_no_losses_for_repairs() {
     let mut host = Host::new();
     let (bob, carol) = (
         host.reader(BOB, 7411).wire(),
@@ -166,7 +166,7 @@ fn a_mirrored_wire_adds_what_sockets_do_not_see_and_nothing_else() {
     let elsewhere = host.reader(CAROL, 7413).wire();
     host.owner(group, BOB);
     for number in 1..=100 {
-        // The mirror comes first and shows the samples of Bob and Carol.
+        // The mirror is first and shows the samples of Bob and Carol.
         host.data(group.wire(), number);
         host.data(group, number);
         if number % 10 == 0 {
@@ -217,7 +217,7 @@ fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
 }
 
 #[test]
-fn a_full_table_refuses_counts_and_makes_room_when_somebody_is_silent() {
+fn a_full_table_refuses_counts_and_evicts_the_silent() {
     let mut host = Host::with(Settings {
         deliveries: 3,
         ..Settings::default()

@@ -30,7 +30,7 @@ fn repeated_announcements_are_no_events_and_changed_ones_are() {
 }
 
 #[test]
-fn the_only_sample_of_ros_discovery_info_is_kept_although_it_comes_first() {
+fn the_only_sample_of_ros_discovery_info_is_kept_if_it_is_first() {
     for gid_len in [16, 24] {
         let mut world = World::new(&[]);
         let nodes = [

@@ -14,7 +14,7 @@ use ros2probe_wire::DomainId;
 use super::{ALICE, BOB, READER, WRITER, World, alice, bob};
 
 #[test]
-fn who_comes_and_goes_is_told_with_what_was_known_of_it() {
+fn joining_and_leaving_are_events_with_the_known_attributes() {
     let mut world = World::new(&[]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -62,7 +62,7 @@ fn who_comes_and_goes_is_told_with_what_was_known_of_it() {
 }
 
 #[test]
-fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_gone() {
+fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 100);
     world.sedp(alice(WRITER), "rt/chatter");
@@ -113,7 +113,7 @@ fn losses_are_told_once_a_second_with_topic_and_node_also_of_a_writer_that_has_g
 }
 
 #[test]
-fn a_changed_expectation_is_told_once_and_another_watch_changes_nothing() {
+fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
     let expects = |pattern: &str, max_silence| Watch {
         expectations: Expectations {
             max_silence,

@@ -32,7 +32,7 @@ fn domains_are_not_mixed() {
 }
 
 #[test]
-fn a_domain_told_by_a_better_port_moves_everything_along() {
+fn a_domain_from_a_better_port_moves_everything_along() {
     let mut world = World::new(&["/**"]);
     let payload = forge::participant(ALICE, 10, None);
     let unicast = Envelope {
@@ -112,7 +112,7 @@ fn a_deleted_writer_does_not_stay_because_its_participant_is_announced_again() {
 }
 
 #[test]
-fn a_killed_participant_goes_with_all_it_had_when_its_lease_ends() {
+fn a_killed_participant_is_removed_with_its_endpoints_when_its_lease_ends() {
     for lease in [10, 20] {
         let mut world = World::new(&["/**"]);
         world.spdp(ALICE, lease);
@@ -182,7 +182,7 @@ fn a_participant_comes_back_under_the_same_guid() {
 }
 
 #[test]
-fn a_copy_that_a_disposal_overtook_raises_nobody_from_the_dead() {
+fn a_copy_overtaken_by_a_disposal_restores_nothing() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");

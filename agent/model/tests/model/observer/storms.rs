@@ -62,7 +62,7 @@ fn a_storm_of_forgeries_leaves_memory_bounded_and_real_topics_counted() {
 }
 
 #[test]
-fn forgeries_with_endless_leases_that_repeated_themselves_do_not_fill_the_table_for_ever() {
+fn repeated_forgeries_with_endless_leases_do_not_fill_the_table_permanently() {
     let settings = Settings {
         participants: 64,
         ..Settings::default()

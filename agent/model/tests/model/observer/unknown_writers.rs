@@ -33,7 +33,7 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
 }
 
 #[test]
-fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_participant() {
+fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
     const FAST: GuidPrefix = GuidPrefix(*b"\x01\x0fsome-robot");
     let mut world = World::new(&[]);
     let holder = SocketFacts {
@@ -94,7 +94,7 @@ fn an_unknown_writer_is_told_by_the_holder_of_its_socket_by_its_guid_and_by_its_
 }
 
 #[test]
-fn what_the_kernels_budget_for_strangers_leaves_out_is_not_lost() {
+fn what_the_kernels_budget_for_unknown_writers_omits_is_not_lost() {
     let mut world = World::new(&["/chatter"]);
     for number in [1, 2, 3, 40, 90, 91, 200] {
         world.sample(alice(WRITER), number);
@@ -108,7 +108,7 @@ fn what_the_kernels_budget_for_strangers_leaves_out_is_not_lost() {
 }
 
 #[test]
-fn a_sample_on_its_way_while_its_writer_says_goodbye_makes_no_stranger() {
+fn a_sample_in_transit_while_its_writer_leaves_makes_no_unknown_writer() {
     let mut world = World::new(&["/**"]);
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");

@@ -1,4 +1,4 @@
-//! A Debian host of its own: a container over a fresh system, whose writes go to memory.
+//! A Debian host: a container over a fresh system, whose writes go to memory.
 
 use std::fs::File;
 use std::io;

@@ -174,7 +174,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         Diagnosis::TypeConflict { topic, types } => {
             let types: Vec<&str> = types.iter().map(AsRef::as_ref).collect();
             let text = format!(
-                "{} has several types, whose endpoints do not talk to each other: {}",
+                "{} has several types, whose endpoints cannot communicate: {}",
                 topic.name,
                 types.join(", ")
             );
@@ -397,7 +397,8 @@ fn died(topic: &TopicFacts) -> (&'static str, &'static str) {
     }
 }
 
-/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`].
+/// Returns when a loss began that has continued, with pauses shorter than [`LOSS`]; `None` without
+/// a recent loss.
 fn began(past: &Past, topic: u32) -> Option<f64> {
     let mut began = None;
     let mut pause = 0;

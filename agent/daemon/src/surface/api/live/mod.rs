@@ -131,7 +131,7 @@ async fn live(
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// Returns the next batch.
+    /// Returns the next batch; `None` at the end of the stream.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
             return None;

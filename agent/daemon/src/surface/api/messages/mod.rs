@@ -220,7 +220,7 @@ fn request(topic: Choice, domain_id: u32) -> Request {
 impl Pieces for Stream {
     type Piece = Bytes;
 
-    /// Returns the next lines.
+    /// Returns the next lines; `None` at the end of the stream.
     async fn next(&mut self) -> Option<Bytes> {
         if self.ended {
             return None;

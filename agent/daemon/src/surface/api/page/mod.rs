@@ -99,7 +99,7 @@ impl Page {
         !self.addresses.is_empty()
     }
 
-    /// Returns the address of the page on the agent's host.
+    /// Returns the address of the page on the agent's host; `None` if the page is not served.
     fn address(&self) -> Option<String> {
         let is_near = |address: &&SocketAddr| address.ip().is_loopback();
         let near = self.addresses.iter().find(is_near);
@@ -342,7 +342,7 @@ mod tests {
     }
 
     #[test]
-    fn gzip_is_sent_to_who_takes_it() {
+    fn gzip_is_sent_to_clients_that_accept_it() {
         for (given, expected) in [
             ("gzip", true),
             ("deflate, GZIP;q=1", true),
