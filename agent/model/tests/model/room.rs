@@ -12,7 +12,6 @@ use ros2probe_model::snapshot::{SocketFacts, TopicFacts};
 use ros2probe_testing::model::domain::{VirtualDomain, watchlist};
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record};
 
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
