@@ -137,7 +137,7 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
         let met = Socket {
             // SAFETY: `skb` is the program's context.
             cgroup: unsafe { bpf_skb_cgroup_id(skb) },
-            no_room: 0,
+            rcvbuf_errors: 0,
         };
         let _ = SOCKETS.insert(socket, met, 0);
     }

@@ -18,7 +18,7 @@ mod handed;
 mod host;
 mod inside;
 mod maps;
-mod no_room;
+mod socket_full;
 mod owners;
 mod packet;
 mod pieces;
@@ -79,23 +79,23 @@ pub fn host_egress(context: SkBuffContext) -> i32 {
 
 /// Runs for every datagram that does not fit a socket's buffer, directly after [`host_ingress`].
 #[raw_tracepoint]
-pub fn no_room(context: RawTracePointContext) -> u32 {
-    no_room::refused(&context);
+pub fn socket_full(context: RawTracePointContext) -> u32 {
+    socket_full::refused(&context);
     0
 }
 
-/// Runs for every packet that the kernel drops, with the reason; attached where [`no_room`] does
+/// Runs for every packet that the kernel drops, with the reason; attached where [`socket_full`] does
 /// not cover IPv6.
 #[raw_tracepoint]
 pub fn no_room_freed(context: RawTracePointContext) -> u32 {
-    no_room::freed(&context);
+    socket_full::freed(&context);
     0
 }
 
 /// Runs as [`no_room_freed`] does, on kernels that give no reason.
 #[raw_tracepoint]
 pub fn no_room_unexplained(context: RawTracePointContext) -> u32 {
-    no_room::unexplained(&context);
+    socket_full::unexplained(&context);
     0
 }
 

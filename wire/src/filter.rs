@@ -54,9 +54,9 @@ pub enum Counter {
     /// Host hook: copies of a datagram that was captured just before, not captured again.
     CopiesNotCaptured,
     /// RTPS datagrams dropped at a full socket buffer.
-    NoRoom,
+    SocketFull,
     /// Datagrams dropped at a full socket buffer that the host hook had not just seen there.
-    NoRoomUnseen,
+    SocketFullUnseen,
     /// RTPS datagrams with missing IP fragments that the kernel gave up, or refused for lack of
     /// memory for fragments, whose first fragment is known.
     NotReassembled,
@@ -93,8 +93,8 @@ impl Counter {
         Self::Contended,
         Self::PiecesLost,
         Self::CopiesNotCaptured,
-        Self::NoRoom,
-        Self::NoRoomUnseen,
+        Self::SocketFull,
+        Self::SocketFullUnseen,
         Self::NotReassembled,
         Self::NotReassembledUnnamed,
         Self::Unreadable,
@@ -128,8 +128,8 @@ impl Counter {
             Self::Contended => "contended",
             Self::PiecesLost => "pieces_lost",
             Self::CopiesNotCaptured => "copies_not_captured",
-            Self::NoRoom => "no_room",
-            Self::NoRoomUnseen => "no_room_unseen",
+            Self::SocketFull => "no_room",
+            Self::SocketFullUnseen => "no_room_unseen",
             Self::NotReassembled => "not_reassembled",
             Self::NotReassembledUnnamed => "not_reassembled_unnamed",
             Self::Unreadable => "unreadable",

@@ -58,7 +58,7 @@ pub struct Socket {
     /// Id of the cgroup it was created in: the inode of that cgroup's directory.
     pub cgroup: u64,
     /// Datagrams dropped at its full buffer, RTPS or not.
-    pub no_room: u64,
+    pub rcvbuf_errors: u64,
 }
 
 /// A process that holds a socket, as the iterator over open files writes it.

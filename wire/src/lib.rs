@@ -44,4 +44,4 @@ pub use domain::DomainId;
 pub use guid::{EntityId, Guid, GuidPrefix};
 pub use record::Record;
 pub use rtps::SequenceNumber;
-pub use time::{Duration, RtpsTime, Timestamp};
+pub use time::{RtpsDuration, RtpsTime, Timestamp};

@@ -6,12 +6,13 @@
 use alloc::boxed::Box;
 use alloc::vec::Vec;
 use core::fmt;
+use core::time::Duration;
 
 use crate::cursor::{Cursor, Reason, WireError};
 use crate::parameters::ParameterId;
 use crate::rtps::VendorId;
 use crate::text;
-use crate::time::Duration;
+use crate::time::RtpsDuration;
 
 /// The side of an endpoint.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
@@ -149,19 +150,19 @@ pub struct Qos {
     /// History; `None` if the implementation does not announce it (Fast DDS before 3.2).
     pub history: Option<History>,
     /// Longest time between two samples.
-    pub deadline: Duration,
+    pub deadline: RtpsDuration,
     /// Age at which samples expire; writers only.
-    pub lifespan: Duration,
+    pub lifespan: RtpsDuration,
     /// Liveliness.
     pub liveliness: Liveliness,
     /// Time within which liveliness is asserted.
-    pub liveliness_lease: Duration,
+    pub liveliness_lease: RtpsDuration,
     /// Ownership.
     pub ownership: Ownership,
     /// Least time between two samples that a reader accepts.
-    pub minimum_separation: Duration,
+    pub minimum_separation: RtpsDuration,
     /// Delay that the implementation may add to save work.
-    pub latency_budget: Duration,
+    pub latency_budget: RtpsDuration,
     /// Order of samples of several writers.
     pub destination_order: DestinationOrder,
     /// Presentation of coherent sets.
@@ -191,13 +192,13 @@ impl Qos {
                 }),
                 _ => None,
             },
-            deadline: Duration::Infinite,
-            lifespan: Duration::Infinite,
+            deadline: RtpsDuration::Infinite,
+            lifespan: RtpsDuration::Infinite,
             liveliness: Liveliness::AUTOMATIC,
-            liveliness_lease: Duration::Infinite,
+            liveliness_lease: RtpsDuration::Infinite,
             ownership: Ownership::SHARED,
-            minimum_separation: Duration::Finite(0),
-            latency_budget: Duration::Finite(0),
+            minimum_separation: RtpsDuration::Finite(Duration::ZERO),
+            latency_budget: RtpsDuration::Finite(Duration::ZERO),
             destination_order: DestinationOrder::BY_RECEPTION_TIMESTAMP,
             presentation: Presentation {
                 access_scope: AccessScope::INSTANCE,
@@ -264,9 +265,12 @@ impl Qos {
 }
 
 /// Reads seconds and 2^-32 fractions.
-pub(crate) fn duration(value: &mut Cursor<'_>, what: &'static str) -> Result<Duration, WireError> {
+pub(crate) fn duration(
+    value: &mut Cursor<'_>,
+    what: &'static str,
+) -> Result<RtpsDuration, WireError> {
     let seconds = value.i32(what)?;
-    Ok(Duration::from_wire(seconds, value.u32(what)?))
+    Ok(RtpsDuration::from_wire(seconds, value.u32(what)?))
 }
 
 fn partitions(value: &mut Cursor<'_>) -> Result<Vec<Box<str>>, WireError> {
@@ -337,7 +341,10 @@ mod tests {
         let value = [2, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0x80];
         apply(&mut qos, ParameterId::LIVELINESS, &value).unwrap();
         assert_eq!(qos.liveliness, Liveliness::MANUAL_BY_TOPIC);
-        assert_eq!(qos.liveliness_lease, Duration::Finite(1_500_000_000));
+        assert_eq!(
+            qos.liveliness_lease,
+            RtpsDuration::Finite(Duration::from_millis(1500))
+        );
     }
 
     #[test]
@@ -364,7 +371,10 @@ mod tests {
             &[1, 0, 0, 0, 0, 0, 0, 0],
         )
         .unwrap();
-        assert_eq!(qos.latency_budget, Duration::Finite(1_000_000_000));
+        assert_eq!(
+            qos.latency_budget,
+            RtpsDuration::Finite(Duration::from_secs(1))
+        );
     }
 
     #[test]

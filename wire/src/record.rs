@@ -61,7 +61,7 @@ pub mod flag {
     pub const HOST: u16 = 1 << 6;
     /// A copy of a record with the same time: the datagram was dropped at the socket's full buffer.
     /// DATA and DATA_FRAG only.
-    pub const NO_ROOM: u16 = 1 << 7;
+    pub const SOCKET_FULL: u16 = 1 << 7;
     /// The datagram never became complete: the kernel gave up waiting for IP fragments. Written at
     /// that time (after `net.ipv4.ipfrag_time`, 30 s) for the submessages in its first fragment.
     /// DATA and DATA_FRAG only; `socket` is 0.

@@ -1,11 +1,16 @@
 //! Points in time and durations, as RTPS encodes them and as the agent keeps them.
 
+use core::ops::{Add, Sub};
+use core::time::Duration;
+
 /// One second in nanoseconds, the unit of [`Timestamp`].
 pub const SECOND: u64 = 1_000_000_000;
 /// One millisecond in nanoseconds.
 pub const MILLISECOND: u64 = 1_000_000;
 
 /// Nanoseconds since the Unix epoch. The only clock reading of the agent, always passed in.
+///
+/// Sums and differences with a [`Duration`] saturate at both ends of the 64 bits.
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
 pub struct Timestamp(pub u64);
 
@@ -25,6 +30,56 @@ impl Timestamp {
     pub fn seconds(self) -> f64 {
         self.0 as f64 / 1e9
     }
+
+    /// Returns the whole seconds since the Unix epoch.
+    #[inline]
+    #[must_use]
+    pub const fn whole_seconds(self) -> u64 {
+        self.0 / SECOND
+    }
+
+    /// Returns the distance to `other`, whichever is later.
+    #[inline]
+    #[must_use]
+    pub const fn distance(self, other: Self) -> Duration {
+        Duration::from_nanos(self.0.abs_diff(other.0))
+    }
+}
+
+impl Add<Duration> for Timestamp {
+    type Output = Self;
+
+    #[inline]
+    fn add(self, duration: Duration) -> Self {
+        Self(self.0.saturating_add(nanoseconds(duration)))
+    }
+}
+
+impl Sub<Duration> for Timestamp {
+    type Output = Self;
+
+    #[inline]
+    fn sub(self, duration: Duration) -> Self {
+        Self(self.0.saturating_sub(nanoseconds(duration)))
+    }
+}
+
+/// The time since an earlier timestamp; zero if it is later.
+impl Sub for Timestamp {
+    type Output = Duration;
+
+    #[inline]
+    fn sub(self, earlier: Self) -> Duration {
+        Duration::from_nanos(self.0.saturating_sub(earlier.0))
+    }
+}
+
+/// Returns the nanoseconds of a duration, at most [`u64::MAX`] (584 years).
+#[inline]
+#[must_use]
+pub const fn nanoseconds(duration: Duration) -> u64 {
+    let seconds = duration.as_secs().saturating_mul(SECOND);
+    seconds.saturating_add(duration.subsec_nanos() as u64)
 }
 
 /// RTPS `Time_t` and `Duration_t` (RTPS 2.5, 9.3.2): seconds and a fraction of 2^-32 seconds, kept
@@ -42,21 +97,21 @@ impl RtpsTime {
         let seconds = self.0 >> 32;
         let fraction = self.0 & 0xffff_ffff;
         // Rounds to nearest: 2^-32 s is finer than a nanosecond, so writers' values survive.
-        let nanoseconds = (fraction * 1_000_000_000 + (1 << 31)) >> 32;
-        Some(Timestamp(seconds * 1_000_000_000 + nanoseconds))
+        let nanoseconds = (fraction * SECOND + (1 << 31)) >> 32;
+        Some(Timestamp(seconds * SECOND + nanoseconds))
     }
 }
 
-/// A QoS or lease duration.
+/// A QoS or lease duration (RTPS 2.5, 9.3.2.3).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Debug)]
-pub enum Duration {
-    /// Nanoseconds.
-    Finite(u64),
+pub enum RtpsDuration {
+    /// Ends after this time.
+    Finite(Duration),
     /// Never ends.
     Infinite,
 }
 
-impl Duration {
+impl RtpsDuration {
     /// Converts the wire's `i32` seconds and `u32` fraction. 7fffffff seconds with any fraction of
     /// at least 7fffffff is infinite (Fast DDS and Cyclone DDS both send ffffffff). Negative
     /// durations read as zero.
@@ -66,19 +121,31 @@ impl Duration {
             return Self::Infinite;
         }
         if seconds < 0 {
-            return Self::Finite(0);
+            return Self::Finite(Duration::ZERO);
         }
-        let fraction_nanoseconds = (fraction as u64 * 1_000_000_000 + (1 << 31)) >> 32;
-        Self::Finite(seconds.cast_unsigned() as u64 * 1_000_000_000 + fraction_nanoseconds)
+        let fraction_nanoseconds = (fraction as u64 * SECOND + (1 << 31)) >> 32;
+        let nanoseconds = seconds.cast_unsigned() as u64 * SECOND + fraction_nanoseconds;
+        Self::Finite(Duration::from_nanos(nanoseconds))
     }
 
-    /// Returns the nanoseconds; `None` if the duration is infinite.
+    /// Returns the duration; `None` if it is infinite.
     #[must_use]
-    pub const fn nanoseconds(self) -> Option<u64> {
+    pub const fn finite(self) -> Option<Duration> {
         match self {
-            Self::Finite(nanoseconds) => Some(nanoseconds),
+            Self::Finite(duration) => Some(duration),
             Self::Infinite => None,
         }
+    }
+
+    /// Returns seconds with a fraction; `None` if it never ends.
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "microseconds survive up to 285 years"
+    )]
+    pub fn seconds(self) -> Option<f64> {
+        self.finite()
+            .map(|duration| nanoseconds(duration) as f64 / 1e9)
     }
 }
 
@@ -89,17 +156,20 @@ mod tests {
     #[test]
     fn a_tenth_of_a_second_is_not_429_milliseconds() {
         assert_eq!(
-            Duration::from_wire(0, 0x1999_999a),
-            Duration::Finite(100_000_000)
+            RtpsDuration::from_wire(0, 0x1999_999a),
+            RtpsDuration::Finite(Duration::from_millis(100))
         );
     }
 
     #[test]
     fn infinite_in_both_spellings() {
-        assert_eq!(Duration::from_wire(i32::MAX, u32::MAX), Duration::Infinite);
         assert_eq!(
-            Duration::from_wire(i32::MAX, 0x7fff_ffff),
-            Duration::Infinite
+            RtpsDuration::from_wire(i32::MAX, u32::MAX),
+            RtpsDuration::Infinite
+        );
+        assert_eq!(
+            RtpsDuration::from_wire(i32::MAX, 0x7fff_ffff),
+            RtpsDuration::Infinite
         );
     }
 
@@ -110,5 +180,19 @@ mod tests {
             RtpsTime(1 << 32 | 1 << 31).timestamp(),
             Some(Timestamp(1_500_000_000))
         );
+    }
+
+    #[test]
+    fn times_saturate_instead_of_wrapping() {
+        let (second, end) = (Duration::from_secs(1), Timestamp(u64::MAX));
+        assert_eq!(Timestamp(1) + second, Timestamp(SECOND + 1));
+        assert_eq!(Timestamp(SECOND + 1) - second, Timestamp(1));
+        assert_eq!((end + second, end + Duration::MAX), (end, end));
+        assert_eq!(Timestamp(1) - second, Timestamp(0));
+        assert_eq!(Timestamp(SECOND) - Timestamp(0), second);
+        assert_eq!(Timestamp(0) - Timestamp(SECOND), Duration::ZERO);
+        assert_eq!(Timestamp(0).distance(Timestamp(SECOND)), second);
+        assert_eq!(nanoseconds(Duration::from_nanos(u64::MAX)), u64::MAX);
+        assert_eq!(nanoseconds(Duration::MAX), u64::MAX);
     }
 }

@@ -25,7 +25,7 @@ use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::frame::{self, Link};
 use ros2probe_wire::names::Demangled;
 use ros2probe_wire::rtps::{InlineQos, Locator, LocatorKind, Payload};
-use ros2probe_wire::{Duration, EntityId, Guid};
+use ros2probe_wire::{EntityId, Guid, RtpsDuration};
 use serde_json::{Value, json};
 
 use entry::oracle::{Body, Message};
@@ -226,12 +226,10 @@ fn captures(directory: &Path, found: &mut Vec<(PathBuf, PathBuf)>) {
     }
 }
 
-fn seconds(duration: Duration) -> Value {
-    match duration {
-        Duration::Infinite => json!("inf"),
-        #[expect(clippy::cast_precision_loss, reason = "seconds of a lease")]
-        Duration::Finite(nanoseconds) => json!(nanoseconds as f64 / 1e9),
-    }
+fn seconds(duration: RtpsDuration) -> Value {
+    duration
+        .seconds()
+        .map_or_else(|| json!("inf"), |seconds| json!(seconds))
 }
 
 fn locators(locators: &[Locator]) -> Value {

@@ -7,7 +7,7 @@
 
 use std::fmt::Write as _;
 
-use ros2probe_wire::Duration;
+use ros2probe_wire::RtpsDuration;
 use ros2probe_wire::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};
 
 /// Spelling of policies.
@@ -47,11 +47,11 @@ fn profile(text: &mut String, qos: &Qos, spelling: Spelling) {
         Spelling::Numbers => number.to_string(),
         Spelling::Names => name.to_owned(),
     };
-    let duration = |text: &mut String, name: &str, duration: Duration| {
+    let duration = |text: &mut String, name: &str, duration: RtpsDuration| {
         let (seconds, nanoseconds) = match duration {
             // 2^63 - 1 ns, which is RMW_DURATION_INFINITE.
-            Duration::Infinite => (9_223_372_036, 854_775_807),
-            Duration::Finite(total) => (total / 1_000_000_000, total % 1_000_000_000),
+            RtpsDuration::Infinite => (9_223_372_036, 854_775_807),
+            RtpsDuration::Finite(duration) => (duration.as_secs(), duration.subsec_nanos()),
         };
         let _ = write!(
             text,
@@ -106,6 +106,8 @@ fn liveliness(kind: Liveliness) -> (u8, &'static str) {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use ros2probe_wire::qos::{History, Role};
     use ros2probe_wire::rtps::VendorId;
 
@@ -118,7 +120,7 @@ mod tests {
                 depth: 5,
             }),
             reliability: Reliability::BEST_EFFORT,
-            lifespan: Duration::Finite(10_000_000_001),
+            lifespan: RtpsDuration::Finite(Duration::from_nanos(10_000_000_001)),
             ..Qos::defaults(Role::Writer, VendorId::CYCLONE)
         }
     }

@@ -142,11 +142,11 @@ mod tests {
     fn only_wanted_sockets_are_kept_and_the_first_holder_of_a_shared_one() {
         let found = [socket(1, 10), socket(2, 20), socket(2, 21), socket(3, 30)];
         let owners = read(found.as_bytes(), &BTreeSet::from([2, 3, 4]));
-        let told: Vec<_> = owners
+        let listed: Vec<_> = owners
             .iter()
             .map(|(cookie, owner)| (*cookie, owner.process_id))
             .collect();
-        assert_eq!(told, [(2, 20), (3, 30)]);
+        assert_eq!(listed, [(2, 20), (3, 30)]);
         let expected = Owner {
             inode: 102,
             process_id: 20,

@@ -32,8 +32,8 @@ const LATE_NANOSECONDS: u64 = 1_000_000_000;
 pub struct ReorderBuffer {
     /// Records of the kernel, in the kernel's clock.
     kernel: VecDeque<Record>,
-    /// Records with [`flag::NO_ROOM`], sorted by time in the kernel's clock.
-    no_room: VecDeque<Record>,
+    /// Records with [`flag::SOCKET_FULL`], sorted by time in the kernel's clock.
+    socket_full: VecDeque<Record>,
     walked: VecDeque<Walked>,
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: VecDeque<(u64, u32)>,
@@ -68,12 +68,12 @@ impl ReorderBuffer {
         if matches!(record.body(), Body::Undelivered) {
             self.undelivered.push_back((record.time, record.datagram));
             self.undelivered_tokens.insert(record.datagram);
-        } else if record.flags & flag::NO_ROOM != 0 {
+        } else if record.flags & flag::SOCKET_FULL != 0 {
             // Records of several CPUs may be out of order by microseconds.
             let place = self
-                .no_room
+                .socket_full
                 .partition_point(|other| other.time <= record.time);
-            self.no_room.insert(place, record);
+            self.socket_full.insert(place, record);
         } else {
             self.kernel.push_back(record);
         }
@@ -123,7 +123,7 @@ impl ReorderBuffer {
     /// Returns the number of waiting records of the kernel's ring.
     #[must_use]
     pub fn waiting(&self) -> usize {
-        self.kernel.len() + self.no_room.len()
+        self.kernel.len() + self.socket_full.len()
     }
 
     /// Removes and returns the oldest record, if it is not younger than `until` in the kernel's
@@ -131,8 +131,8 @@ impl ReorderBuffer {
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|walked| walked.at);
-        let no_room = self.no_room.front().map(|record| record.time);
-        let oldest = kernel.into_iter().chain(walked).chain(no_room).min();
+        let socket_full = self.socket_full.front().map(|record| record.time);
+        let oldest = kernel.into_iter().chain(walked).chain(socket_full).min();
         if oldest.is_none_or(|oldest| oldest > until) {
             self.forget_undelivered(until);
             self.give_back();
@@ -142,8 +142,8 @@ impl ReorderBuffer {
             record.time = clocks.calendar(record.time).0;
             Next::Kernel(record)
         };
-        if no_room == oldest {
-            return self.no_room.pop_front().map(of_kernel);
+        if socket_full == oldest {
+            return self.socket_full.pop_front().map(of_kernel);
         }
         if kernel == oldest {
             return self.kernel.pop_front().map(of_kernel);
@@ -153,7 +153,7 @@ impl ReorderBuffer {
         if !walked.no_room_said && self.undelivered_tokens.contains(&record.datagram) {
             walked.no_room_said = true;
             if record.is_sample() {
-                let flags = record.flags | flag::NO_ROOM;
+                let flags = record.flags | flag::SOCKET_FULL;
                 return Some(Next::Walked(Record { flags, ..record }));
             }
         }
@@ -169,7 +169,7 @@ impl ReorderBuffer {
         if self.found.capacity() > KEPT {
             self.found = Vec::new();
         }
-        for records in [&mut self.kernel, &mut self.no_room] {
+        for records in [&mut self.kernel, &mut self.socket_full] {
             if records.is_empty() && records.capacity() > KEPT {
                 *records = VecDeque::new();
             }
@@ -215,9 +215,9 @@ mod tests {
         }
     }
 
-    fn no_room(number: u64, milliseconds: u64) -> Record {
+    fn socket_full(number: u64, milliseconds: u64) -> Record {
         Record {
-            flags: flag::NO_ROOM,
+            flags: flag::SOCKET_FULL,
             ..of_the_kernel(number, milliseconds)
         }
     }
@@ -252,7 +252,7 @@ mod tests {
                 let age = clocks.now.nanoseconds_since(Timestamp(record.time));
                 assert!(age >= SETTLE.cast_signed(), "{age}");
                 let number = record.sequence_number.cast_signed();
-                let delivered = record.flags & flag::NO_ROOM == 0;
+                let delivered = record.flags & flag::SOCKET_FULL == 0;
                 if delivered { number } else { -number }
             })
             .collect()
@@ -279,12 +279,12 @@ mod tests {
         order.kernel(of_the_kernel(2, 10));
         // A record of another CPU, and two that are out of order.
         order.kernel(of_the_kernel(3, 12));
-        order.kernel(no_room(3, 12));
-        order.kernel(no_room(2, 10));
+        order.kernel(socket_full(3, 12));
+        order.kernel(socket_full(2, 10));
         walked(&mut order, captured(4, 12));
         assert_eq!(numbers(&mut order, &clocks(200)), [1, -2, 2, -3, 3, 4]);
         // The arrival waits in a run and has the time of the last fragment.
-        order.kernel(no_room(7, 300));
+        order.kernel(socket_full(7, 300));
         order.kernel(of_the_kernel(6, 299));
         order.kernel(of_the_kernel(7, 320));
         assert_eq!(numbers(&mut order, &clocks(390)), [6, -7]);

@@ -42,8 +42,8 @@ struct Known {
     dropped_before: Option<u64>,
     questions: u8,
     /// Value at the last report to the model.
-    no_room: u64,
-    told: Option<SocketFacts>,
+    rcvbuf_errors: u64,
+    reported: Option<SocketFacts>,
 }
 
 impl Sockets {
@@ -76,13 +76,13 @@ impl Sockets {
         self.groups.refresh(&groups);
         for (cookie, socket) in &met {
             let known = self.known.entry(*cookie).or_default();
-            if !asked && known.told.is_some() && known.no_room == socket.no_room {
+            if !asked && known.reported.is_some() && known.rcvbuf_errors == socket.rcvbuf_errors {
                 continue;
             }
-            known.no_room = socket.no_room;
+            known.rcvbuf_errors = socket.rcvbuf_errors;
             let facts = known.facts(*cookie, socket, &self.groups);
-            if known.told.as_ref() != Some(&facts) {
-                known.told = Some(facts.clone());
+            if known.reported.as_ref() != Some(&facts) {
+                known.reported = Some(facts.clone());
                 observer.input(Input::Socket(facts));
             }
         }
@@ -92,7 +92,7 @@ impl Sockets {
     fn forget(&mut self, met: &BTreeMap<u64, Socket>, observer: &mut Observer) {
         self.known.retain(|cookie, known| {
             let stays = met.contains_key(cookie);
-            if !stays && known.told.is_some() {
+            if !stays && known.reported.is_some() {
                 if known.may_be_open() {
                     observer.input(Input::SocketForgotten(*cookie));
                 } else {
@@ -167,7 +167,7 @@ impl Known {
     /// count them.
     fn unnamed(&self, socket: &Socket) -> Option<u64> {
         let dropped = u64::from(self.owner.as_ref()?.drops?);
-        Some(dropped.saturating_sub(socket.no_room))
+        Some(dropped.saturating_sub(socket.rcvbuf_errors))
     }
 
     fn facts(&self, cookie: u64, socket: &Socket, groups: &CgroupPaths) -> SocketFacts {
@@ -199,8 +199,11 @@ mod tests {
         }
     }
 
-    fn sockets(cookies: &[u64], no_room: u64) -> BTreeMap<u64, Socket> {
-        let socket = Socket { cgroup: 1, no_room };
+    fn sockets(cookies: &[u64], rcvbuf_errors: u64) -> BTreeMap<u64, Socket> {
+        let socket = Socket {
+            cgroup: 1,
+            rcvbuf_errors,
+        };
         cookies.iter().map(|cookie| (*cookie, socket)).collect()
     }
 
@@ -208,15 +211,15 @@ mod tests {
     fn what_was_dropped_before_or_is_named_is_not_unidentified() {
         let mut observer = Observer::new(Settings::default());
         let mut all = Sockets::new(PathBuf::from("/sys/fs/cgroup"));
-        let drops = |all: &Sockets, no_room| {
-            let met = sockets(&[1], no_room);
+        let drops = |all: &Sockets, rcvbuf_errors| {
+            let met = sockets(&[1], rcvbuf_errors);
             let known = all.known.get(&1).unwrap();
             known.facts(1, &met[&1], &all.groups).unidentified_drops
         };
-        let mut look = |all: &mut Sockets, dropped, no_room| {
+        let mut look = |all: &mut Sockets, dropped, rcvbuf_errors| {
             let owners = BTreeMap::from([(1, owner(dropped))]);
-            all.poll(owners, &sockets(&[1], no_room), &mut observer);
-            drops(all, no_room)
+            all.poll(owners, &sockets(&[1], rcvbuf_errors), &mut observer);
+            drops(all, rcvbuf_errors)
         };
         assert_eq!(look(&mut all, 100, 0), 0);
         assert_eq!(look(&mut all, 110, 10), 0);

@@ -136,8 +136,8 @@ pub fn allow_running_first() -> bool {
         return true;
     }
     // SAFETY: `limit` is a live local and outlives the call.
-    let told = unsafe { libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) };
-    told == 0 && limit.rlim_cur > 0
+    let result = unsafe { libc::getrlimit(libc::RLIMIT_RTPRIO, &raw mut limit) };
+    result == 0 && limit.rlim_cur > 0
 }
 
 /// Sets or clears the lowest real-time priority of this thread, which lets it run before ordinary

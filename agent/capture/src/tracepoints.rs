@@ -196,7 +196,7 @@ fn socket_losses(
         // A socket outside of the hook's cgroup could be mistaken for one inside.
         return Err(format!("limited to one cgroup, and {reason}"));
     }
-    let mut links = vec![tracepoint(ebpf, "no_room", "udp_fail_queue_rcv_skb")?];
+    let mut links = vec![tracepoint(ebpf, "socket_full", "udp_fail_queue_rcv_skb")?];
     if release().is_none_or(|release| release < REPORTS_IPV6) {
         let reasons = [Layout::ReasonBufferFull, Layout::ReasonMemory];
         let program = if layout.need(&reasons).is_ok() {

@@ -280,7 +280,7 @@ impl WireTap {
             self.included.update(&self.selection, &self.interfaces);
         }
         for change in changes {
-            let told = match change {
+            let result = match change {
                 Change::Present(Interface { index, name, .. }) => {
                     let accept = self.selection.accepts(&name);
                     self.filter.accept_interface(index, accept)
@@ -292,7 +292,7 @@ impl WireTap {
                     self.filter.forget_interface(index)
                 }
             };
-            self.refused_interfaces += u64::from(told.is_err());
+            self.refused_interfaces += u64::from(result.is_err());
         }
     }
 

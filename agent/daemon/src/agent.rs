@@ -158,8 +158,8 @@ impl Components<'_> {
             Arc::clone(&subscriptions),
             self.stop.clone(),
         );
-        let seconds = usize::try_from(self.history.as_secs()).unwrap_or(usize::MAX);
-        let history = (seconds > 0).then(|| History::new(seconds, config.limits.topics));
+        let topics = config.limits.topics;
+        let history = (!self.history.is_zero()).then(|| History::new(self.history, topics));
         let (reloader, reloads) = reload::channel();
         let context = api::Context {
             latest: sources.latest,
@@ -466,7 +466,7 @@ fn report_listeners(server: Option<&Server>, control: &api::Server, watches: &Wa
 
 fn settings(config: &Config, is_live: bool) -> observer::Settings {
     observer::Settings {
-        topic_grace: u64::try_from(config.topic_grace.as_nanos()).unwrap_or(u64::MAX),
+        topic_grace: config.topic_grace,
         directed: is_live,
         ..observer::Settings::default().with_limits(&config.limits)
     }

@@ -133,14 +133,14 @@ impl EventLog {
         let mut log = self.log();
         let before = log.last;
         for event in taken.events {
-            log.turn_robot(event.at.0 / SECOND);
+            log.turn_robot(event.at.whole_seconds());
             log.record(event.at, Occurrence::Robot(event.kind));
         }
         for (class, count) in taken.overflow {
             log.hold_back(group(class), count);
         }
         // Events are settled up to a second after they happen.
-        log.turn_robot((clock.0 / SECOND).saturating_sub(1));
+        log.turn_robot(clock.whole_seconds().saturating_sub(1));
         let is_news = log.last > before;
         drop(log);
         if is_news {

@@ -12,7 +12,7 @@ use crate::config::{Limit, Limits};
 
 const LIMITS: usize = Limit::ALL.len();
 /// Time for which a limit counts as reached after a refusal or eviction.
-const LATELY: Duration = Duration::from_secs(60);
+const REACHED_FOR: Duration = Duration::from_secs(60);
 
 /// State of one cap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -121,7 +121,7 @@ impl LimitFigures {
     #[must_use]
     pub fn facts(&self, state: &State) -> [LimitFacts; LIMITS] {
         let rises = *self.rises.lock().unwrap_or_else(PoisonError::into_inner);
-        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < LATELY;
+        let is_recent = |at: Instant| state.agent.at.saturating_duration_since(at) < REACHED_FOR;
         Limit::ALL.map(|limit| {
             let (used, reached) = self.usage(limit, state);
             let cap = self.caps.get(limit) as u64;

@@ -220,7 +220,7 @@ fn assemble(
     );
     let settings = observer::Settings {
         // No kernel filter has to be updated first.
-        payload_delay: 0,
+        payload_delay: Duration::ZERO,
         ..observer::Settings::default().with_limits(&config.limits)
     };
     let components = Components {

@@ -38,7 +38,7 @@ const MAX_BYTES: u64 = 64 << 20;
 /// Least time between two writes.
 const PERIOD: Duration = Duration::from_secs(3);
 /// Time after a failure until the next attempt, if nothing has changed.
-const AGAIN: Duration = Duration::from_secs(10);
+const RETRY_INTERVAL: Duration = Duration::from_secs(10);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
 /// State directory, locked by this process.
@@ -361,7 +361,7 @@ impl StateWriter {
         let is_failing = self.done.is_failing.load(Ordering::Relaxed);
         self.handed.is_none_or(|(handed, at)| {
             let age = now.saturating_duration_since(at);
-            age >= PERIOD && (handed != revision || is_failing && age >= AGAIN)
+            age >= PERIOD && (handed != revision || is_failing && age >= RETRY_INTERVAL)
         })
     }
 

@@ -8,6 +8,7 @@ use std::fs;
 use std::io::{Cursor, Write as _};
 use std::path::Path;
 use std::sync::{Arc, LazyLock};
+use std::time::Duration;
 
 use ros2probe::ros2::Dialect;
 use ros2probe::ros2::bag::{self, Sort};
@@ -297,10 +298,10 @@ pub fn bag_file(bytes: &[u8]) {
     let name = ["a_0.mcap", "a_0.mcap.zstd", "a_0.mcap.lz4"][usize::from(choice % 3)];
     let path = directory.join(name);
     fs::write(&path, file).expect("a file");
-    told(&path);
+    reported(&path);
     if !metadata.is_empty() {
         fs::write(directory.join("metadata.yaml"), metadata).expect("a file");
-        told(directory);
+        reported(directory);
     }
     let Ok(report) = reindex(directory) else {
         return;
@@ -309,7 +310,7 @@ pub fn bag_file(bytes: &[u8]) {
     let of_file = &report.files[0];
     assert!(!path.with_extension("mcap.part").exists());
     // A completed bag is complete: a second run reports the same.
-    told(directory);
+    reported(directory);
     let again = reindex(directory).expect("what was written");
     assert_eq!(again.metadata.message_count, report.metadata.message_count);
     assert_eq!(again.metadata.topics, report.metadata.topics);
@@ -323,7 +324,7 @@ pub fn bag_file(bytes: &[u8]) {
 }
 
 /// Reads everything that can be reported of a bag or a file.
-fn told(path: &Path) {
+fn reported(path: &Path) {
     let Ok(opened) = Bag::open(path) else {
         return;
     };
@@ -408,8 +409,8 @@ const SMALL: Settings = Settings {
     interest: 12,
     sample_bytes: 1 << 12,
     payload_bytes: 1 << 14,
-    topic_grace: 1_000_000_000,
-    payload_delay: 400_000_000,
+    topic_grace: Duration::from_secs(1),
+    payload_delay: Duration::from_millis(400),
     directed: true,
 };
 

@@ -133,8 +133,8 @@ impl Acknowledgements {
             missing: reader.missing,
             requested: reader.requested,
             acknacks: reader.acknacks,
-            lag_samples: next.steps_since(reader.base.max(SequenceNumber(1))),
-            lag_seconds: self.lag(reader.base.max(SequenceNumber(1)), next, now),
+            lag_samples: next.steps_since(reader.base.max(SequenceNumber::FIRST)),
+            lag_seconds: self.lag(reader.base.max(SequenceNumber::FIRST), next, now),
             last_seen: reader.last_seen,
         })
     }

@@ -6,10 +6,10 @@
 //! dropped. Counting of samples happens elsewhere.
 
 use std::collections::{BTreeMap, HashMap};
+use std::time::Duration;
 
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::size::Size;
@@ -19,7 +19,7 @@ const OVERHEAD: usize = 128;
 /// Largest number of unfinished samples.
 const SAMPLES: usize = 16_384;
 /// An unfinished sample is dropped after this long without a fragment.
-const FORGET: u64 = 30 * SECOND;
+const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Smallest allocation for a sample.
 const LEAST: usize = 4096;
 
@@ -168,7 +168,7 @@ impl Assembly {
 
     /// Drops samples that have received no fragment for a long time.
     pub fn expire(&mut self, now: Timestamp) {
-        self.retain(|_, part| part.touched.0.saturating_add(FORGET) > now.0);
+        self.retain(|_, part| part.touched + FRAGMENT_TIMEOUT > now);
     }
 
     fn retain(&mut self, mut keep: impl FnMut(&(Guid, SequenceNumber), &Part) -> bool) {
@@ -389,7 +389,7 @@ mod tests {
             &[0; 1000],
             0,
         );
-        assembly.expire(Timestamp(FORGET + 2));
+        assembly.expire(Timestamp(2) + FRAGMENT_TIMEOUT);
         assert_eq!((assembly.bytes, assembly.parts.len()), (0, 0));
     }
 

@@ -10,16 +10,16 @@ mod accounting;
 mod departed;
 
 use std::collections::BTreeSet;
+use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::journal::Journal;
 use super::loss::LossCause;
 use super::loss_causes::{LossCauses, REASSEMBLY};
 use super::measurement::Delivered;
-use super::reception::{Outcome, Reception, Whole};
+use super::reception::{CompleteSample, Outcome, Reception};
 use super::route::Direction;
 use super::route::Route;
 use super::samples::Budget;
@@ -34,11 +34,11 @@ pub use accounting::Totals;
 /// delivery restarts.
 const EXCUSED: u64 = 512;
 /// Samples that left this host less than this ago may still arrive.
-const UNDER_WAY: u64 = SECOND;
+const UNDER_WAY: Duration = Duration::from_secs(1);
 /// A receiver without any sign of life counts samples that left for it as lost after this silence.
 /// Socket diagnostics of the kernel report a closed socket earlier.
-const SILENCE: u64 = 18 * SECOND;
-const FIRST_MOMENTS: u64 = 5 * SECOND;
+const SILENCE: Duration = Duration::from_secs(18);
+const FIRST_MOMENTS: Duration = Duration::from_secs(5);
 /// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
@@ -240,7 +240,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         self.touch(sample.record());
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.is_empty() {
@@ -259,7 +259,7 @@ impl Delivery {
     }
 
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
-    pub fn no_room(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
+    pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(sample.record());
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.note(sample) {
@@ -348,7 +348,7 @@ impl Delivery {
         self.conclude(now, context);
         self.loss_causes
             .settled(self.reception.sequence().settled());
-        self.undelivered.expire(now.0);
+        self.undelivered.expire(now);
     }
 
     /// Settles all samples, including pending ones: the input has ended.
@@ -412,7 +412,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         let (number, reliable) = (sample.sequence_number(), self.is_reliable(context));
         self.begin_anew(number, context);
         let sequence = self.reception.sequence();
@@ -437,14 +437,14 @@ impl Delivery {
                 }
                 (true, None)
             }
-            Outcome::Whole(whole) => {
+            Outcome::Complete(whole) => {
                 self.whole(&whole, context);
                 (false, Some(whole))
             }
         }
     }
 
-    fn whole(&mut self, whole: &Whole, context: &mut DeliveryContext<'_>) {
+    fn whole(&mut self, whole: &CompleteSample, context: &mut DeliveryContext<'_>) {
         let sequence = self.reception.sequence();
         let is_history = whole.number < sequence.first() && !whole.unconfirmed;
         let missed = sequence.missed_since(whole.number);
@@ -478,7 +478,7 @@ impl Delivery {
         &mut self,
         sample: Sample<'_>,
         context: &mut DeliveryContext<'_>,
-    ) -> (bool, Option<Whole>) {
+    ) -> (bool, Option<CompleteSample>) {
         let number = sample.sequence_number();
         let is_whole = matches!(sample, Sample::Data(_));
         if is_whole && self.loss_causes.resolve(number) {
@@ -548,16 +548,14 @@ impl Delivery {
     }
 
     /// Splits the borrow into the reception, its memory budget, and the accounting of decisions.
-    const fn split<'a>(
+    fn split<'a>(
         &'a mut self,
         context: &'a mut DeliveryContext<'_>,
     ) -> (&'a mut Reception, &'a mut Budget, Accounting<'a>) {
-        let wait = REASSEMBLY - settle_window(self.is_reliable(context));
-        let until = if context.reassembled {
-            Some(Timestamp(context.now.0.saturating_add(wait)))
-        } else {
-            None
-        };
+        let window = settle_window(self.is_reliable(context));
+        let until = context
+            .reassembled
+            .then(|| context.now + REASSEMBLY.saturating_sub(window));
         let accounting = Accounting {
             tally: &mut self.tally,
             loss_causes: &mut self.loss_causes,

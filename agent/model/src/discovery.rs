@@ -18,11 +18,13 @@ mod priority;
 use std::collections::{BTreeSet, HashMap};
 use std::ops::RangeInclusive;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{
+    DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp,
+};
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -31,7 +33,7 @@ use super::size::Size;
 use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;
-use eviction::{FORSAKEN, Newcomer, Table, Victims};
+use eviction::{MAX_SILENCE, Newcomer, Table, Victims};
 use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
 pub use memory::{Memory, hexadecimal};
@@ -45,7 +47,7 @@ const APPLICANTS: usize = 128;
 const PENDING_NODES: usize = PENDING / 8;
 /// Most bytes of waiting node lists.
 const PENDING_NODE_BYTES: usize = 1 << 20;
-const PENDING_FOR: u64 = 60 * SECOND;
+const PENDING_FOR: Duration = Duration::from_secs(60);
 /// Longest topic or type name: `string<256>` in the builtin topics of DDS. Longer names are
 /// rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
@@ -426,21 +428,21 @@ impl Discovery {
             .iter()
             .filter_map(|(prefix, participant)| {
                 let lease = match participant.proxy.lease {
-                    Duration::Finite(lease) => lease,
+                    RtpsDuration::Finite(lease) => lease,
                     // The restored participant may have stopped while no agent ran, so its infinite
                     // lease is limited.
-                    Duration::Infinite if participant.restored.is_some() => FORSAKEN,
-                    Duration::Infinite => return None,
+                    RtpsDuration::Infinite if participant.restored.is_some() => MAX_SILENCE,
+                    RtpsDuration::Infinite => return None,
                 };
-                let end = participant.last_seen.0.saturating_add(lease);
-                (end <= now.0).then_some((end, *prefix))
+                let end = participant.last_seen + lease;
+                (end <= now).then_some((end, *prefix))
             })
             .collect();
         expired.sort_unstable();
         for (end, prefix) in expired {
-            self.remove(prefix, Timestamp(end), Some(Event::Expired), journal);
+            self.remove(prefix, end, Some(Event::Expired), journal);
         }
-        let fresh = |at: Timestamp| at.0.saturating_add(PENDING_FOR) > now.0;
+        let fresh = |at: Timestamp| at + PENDING_FOR > now;
         let participants = &self.participants;
         self.pending_endpoints
             .retain(|guid, pending| fresh(pending.at) || participants.contains_key(&guid.prefix));

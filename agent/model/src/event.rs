@@ -10,7 +10,6 @@ use std::collections::BTreeMap;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::churn;
@@ -218,7 +217,7 @@ impl Events {
     /// Adds an event if its class has quota left.
     pub fn push(&mut self, at: Timestamp, kind: EventKind) {
         let quota = self.classes.entry(kind.class()).or_default();
-        let second = at.0 / SECOND;
+        let second = at.whole_seconds();
         // A late decision may belong to the second before. An earlier second means that the clock
         // was set.
         if second != quota.second && second.checked_add(1) != Some(quota.second) {
@@ -338,6 +337,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::time::SECOND;
     use ros2probe_wire::{EntityId, GuidPrefix};
 
     use super::*;

@@ -7,8 +7,8 @@ mod nodes;
 use std::cmp::Ordering;
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use crate::diagnosis::{Diagnoses, Diagnosis, QosPairs};
@@ -18,7 +18,7 @@ use crate::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
 /// Time that an endpoint may be without a counterpart, since nodes start one after another.
-const PATIENCE: u64 = 5 * SECOND;
+const MATCH_TIMEOUT: Duration = Duration::from_secs(5);
 /// Largest number of findings kept of each kind.
 const PER_KIND: usize = 256;
 /// Largest number of series for incompatible pairs.
@@ -115,7 +115,7 @@ impl Examiner {
                 let UnmatchedEndpoint { guid, diagnosis } = unmatched;
                 let since = self.alone.get(&guid).copied().unwrap_or(now);
                 alone.insert(guid, since);
-                let end = Timestamp(since.0.saturating_add(PATIENCE));
+                let end = since + MATCH_TIMEOUT;
                 if end <= now {
                     findings.add(diagnosis);
                 } else {

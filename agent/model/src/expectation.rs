@@ -193,17 +193,17 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
             broken |= MAX_LOSS;
         }
     }
-    if let Some(maximum) = expectations.max_latency_ms {
+    if let Some(maximum) = expectations.max_latency {
         let (slot, _) = (evidence.recent)(1);
-        if slot.delayed > 0 && slot.delay * 1000.0 > maximum * slot.delayed as f64 {
+        if slot.delayed > 0 && slot.delay > maximum.as_secs_f64() * slot.delayed as f64 {
             broken |= MAX_LATENCY;
         }
     }
-    if let Some(maximum) = expectations.max_silence_s {
+    if let Some(maximum) = expectations.max_silence {
         let last = evidence
             .last_message
             .map_or(evidence.since, |last| last.max(evidence.since));
-        if evidence.now.nanoseconds_since(last) as f64 / 1e9 > maximum {
+        if evidence.now - last > maximum {
             broken |= MAX_SILENCE;
         }
     }
@@ -220,6 +220,8 @@ fn window(rate: f64) -> u64 {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
     use ros2probe_wire::time::SECOND;
 
@@ -311,7 +313,7 @@ mod tests {
         let mut bench = Bench::new(Expectations {
             max_rate_hz: Some(5.0),
             max_loss_ratio: Some(0.01),
-            max_latency_ms: Some(50.0),
+            max_latency: Some(Duration::from_millis(50)),
             ..Expectations::default()
         });
         let slot = Slot {
@@ -333,7 +335,7 @@ mod tests {
     #[test]
     fn silence_counts_from_the_first_publisher() {
         let mut bench = Bench::new(Expectations {
-            max_silence_s: Some(2.0),
+            max_silence: Some(Duration::from_secs(2)),
             ..Expectations::default()
         });
         let states: Vec<_> = [0, 0, 0, 5]
@@ -346,7 +348,7 @@ mod tests {
     #[test]
     fn without_subscriber_or_publisher_nothing_is_expected() {
         let mut bench = Bench::new(Expectations {
-            max_silence_s: Some(1.0),
+            max_silence: Some(Duration::from_secs(1)),
             ..Expectations::default()
         });
         bench.subscriptions = 0;

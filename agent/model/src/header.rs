@@ -4,11 +4,13 @@
 //! types of the common interface packages that begin with a header. Other types have no header
 //! latency. Implausible stamps, such as simulated time or an unset header, are ignored.
 
+use std::time::Duration;
+
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 /// A stamp that differs more than this from the capture time comes from another clock.
-pub const PLAUSIBLE: u64 = 3600 * SECOND;
+pub const PLAUSIBLE: Duration = Duration::from_secs(3600);
 
 /// Types from packages other than `sensor_msgs` and `geometry_msgs`.
 const OTHERS: [&str; 37] = [
@@ -78,8 +80,8 @@ pub fn begins_with_header(message_type: &str) -> bool {
 #[must_use]
 pub fn stamp_time((seconds, nanoseconds): (i32, u32), now: Timestamp) -> Option<Timestamp> {
     let seconds = u64::try_from(seconds).ok()?;
-    let stamp = seconds * 1_000_000_000 + u64::from(nanoseconds);
-    (stamp.abs_diff(now.0) <= PLAUSIBLE).then_some(Timestamp(stamp))
+    let stamp = Timestamp(seconds * SECOND + u64::from(nanoseconds));
+    (stamp.distance(now) <= PLAUSIBLE).then_some(stamp)
 }
 
 #[cfg(test)]

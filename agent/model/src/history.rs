@@ -5,6 +5,7 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
@@ -101,11 +102,12 @@ struct PreviousTotals {
 }
 
 impl History {
-    /// Creates a ring of `span` seconds, for at most `topics` measured topics at once.
+    /// Creates a ring of the last whole seconds of `span`, for at most `topics` measured topics at
+    /// once.
     #[must_use]
-    pub fn new(span: usize, topics: usize) -> Self {
+    pub fn new(span: Duration, topics: usize) -> Self {
         Self {
-            span,
+            span: usize::try_from(span.as_secs()).unwrap_or(usize::MAX),
             most: topics.saturating_mul(NAMES),
             seconds: VecDeque::new(),
             rows: 0,
@@ -121,7 +123,7 @@ impl History {
     pub fn due(&self) -> Timestamp {
         let last = self.seconds.back();
         last.map_or(Timestamp(0), |last| {
-            Timestamp((last.at.0 / SECOND + 1).saturating_mul(SECOND))
+            Timestamp((last.at.whole_seconds() + 1).saturating_mul(SECOND))
         })
     }
 
@@ -454,7 +456,10 @@ mod tests {
 
     #[test]
     fn a_second_has_what_was_counted_in_it() {
-        let (mut history, points) = (History::new(600, 10), name("rt/points"));
+        let (mut history, points) = (
+            History::new(Duration::from_secs(600), 10),
+            name("rt/points"),
+        );
         take(&mut history, 100, &[(&points, counted(10, 0, &[0.001]))]);
         take(
             &mut history,
@@ -486,7 +491,7 @@ mod tests {
 
     #[test]
     fn a_topic_that_was_not_measured_for_a_while_has_a_gap() {
-        let mut history = History::new(600, 10);
+        let mut history = History::new(Duration::from_secs(600), 10);
         let (one, other) = (name("rt/a"), name("rt/b"));
         take(
             &mut history,
@@ -511,7 +516,7 @@ mod tests {
 
     #[test]
     fn old_seconds_go_and_many_rows_reach_back_less_far() {
-        let (mut history, points) = (History::new(3, 10), name("rt/points"));
+        let (mut history, points) = (History::new(Duration::from_secs(3), 10), name("rt/points"));
         for second in 1..=5 {
             take(&mut history, second, &[(&points, counted(second, 0, &[]))]);
         }
@@ -519,11 +524,11 @@ mod tests {
         let times: Vec<_> = past
             .seconds()
             .iter()
-            .map(|second| second.at.0 / SECOND)
+            .map(|second| second.at.whole_seconds())
             .collect();
         assert_eq!(times, [3, 4, 5]);
 
-        let mut history = History::new(600, 20_000);
+        let mut history = History::new(Duration::from_secs(600), 20_000);
         let names: Vec<_> = (0..20_000)
             .map(|number| name(&number.to_string()))
             .collect();
@@ -542,7 +547,7 @@ mod tests {
 
     #[test]
     fn names_of_topics_that_went_make_room_for_those_that_come() {
-        let mut history = History::new(600, 2);
+        let mut history = History::new(Duration::from_secs(600), 2);
         let names: Vec<_> = (0..9).map(|number| name(&number.to_string())).collect();
         for (second, name) in (1..).zip(&names) {
             take(&mut history, second, &[(name, counted(1, 0, &[]))]);
@@ -564,7 +569,7 @@ mod tests {
 
     #[test]
     fn a_clock_that_is_set_back_begins_anew() {
-        let (mut history, points) = (History::new(600, 2), name("rt/points"));
+        let (mut history, points) = (History::new(Duration::from_secs(600), 2), name("rt/points"));
         take(&mut history, 100, &[(&points, counted(1, 0, &[]))]);
         assert!(!history.is_due(Timestamp(100 * SECOND + 5)));
         assert!(history.is_due(Timestamp(101 * SECOND)));
@@ -572,7 +577,7 @@ mod tests {
         take(&mut history, 50, &[(&points, counted(2, 0, &[]))]);
         assert_eq!(history.past().seconds().len(), 1);
         assert_eq!(history.due(), Timestamp(51 * SECOND));
-        assert!(!History::new(1, 1).is_due(Timestamp(0)));
+        assert!(!History::new(Duration::from_secs(1), 1).is_due(Timestamp(0)));
     }
 
     #[test]

@@ -10,8 +10,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::dispatch::{Dispatch, Sample};
@@ -19,17 +19,17 @@ use super::size::Size;
 
 /// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
 /// which follows within three seconds.
-const PATIENCE: u64 = 4 * SECOND;
+const GAP_TIMEOUT: Duration = Duration::from_secs(4);
 /// Largest number of waiting samples.
 const WAITING: usize = 4096;
 /// Largest number of samples remembered of a writer without an announcement.
 pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// Samples from before the announcement are retransmitted within this time, or not at all.
-const AGAIN: u64 = 10 * SECOND;
+const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Memory per sample in addition to its payload.
-const OVERHEAD: usize = size_of::<Due>() + 64;
+const OVERHEAD: usize = size_of::<QueuedSample>() + 64;
 /// Longest time from the announcement to the first ACKNACK.
-const MATCHING: u64 = SECOND;
+const FIRST_ACKNACK_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// How far the samples of a writer are decided.
 #[derive(Clone, Copy, PartialEq, Eq, Debug, Default)]
@@ -48,7 +48,7 @@ pub struct Progress {
 
 /// A sample and the subscriptions that receive it.
 #[derive(Debug)]
-pub struct Due {
+pub struct QueuedSample {
     /// Ids of the requests.
     pub to: Arc<[u64]>,
     /// The sample.
@@ -60,7 +60,7 @@ pub struct Due {
 /// Samples that wait for lower numbers.
 #[derive(Debug, Default)]
 pub struct InOrder {
-    waiting: BTreeMap<SequenceNumber, Due>,
+    waiting: BTreeMap<SequenceNumber, QueuedSample>,
     bytes: usize,
     incarnation: Option<u32>,
     /// The missing number, and since when it is waited for.
@@ -72,7 +72,7 @@ pub struct InOrder {
     announced: Timestamp,
 }
 
-impl Due {
+impl QueuedSample {
     /// Returns the size of its payload in bytes.
     pub fn bytes(&self) -> usize {
         self.sample.payload.as_ref().map_or(0, bytes::Bytes::len)
@@ -128,25 +128,25 @@ impl InOrder {
     }
 
     /// Begins a new incarnation after all samples of the previous one are dispatched.
-    pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(Due)) {
+    pub fn begin(&mut self, incarnation: u32, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
         if self.incarnation.replace(incarnation) != Some(incarnation) {
             self.give_all(now, give);
         }
     }
 
     /// Returns the sample for immediate dispatch; no other sample waits.
-    pub fn pass(&mut self, mut due: Due, now: Timestamp) -> Due {
-        due.sample.time = now.max(self.last);
-        self.last = due.sample.time;
-        due
+    pub fn pass(&mut self, mut queued: QueuedSample, now: Timestamp) -> QueuedSample {
+        queued.sample.time = now.max(self.last);
+        self.last = queued.sample.time;
+        queued
     }
 
     /// Adds a sample that is dispatched in its turn.
-    pub fn put(&mut self, due: Due) {
-        let number = due.sample.sequence_number;
+    pub fn put(&mut self, queued: QueuedSample) {
+        let number = queued.sample.sequence_number;
         self.earlier.remove(&number);
-        self.bytes += due.cost();
-        if let Some(before) = self.waiting.insert(number, due) {
+        self.bytes += queued.cost();
+        if let Some(before) = self.waiting.insert(number, queued) {
             self.bytes -= before.cost();
         }
     }
@@ -156,7 +156,7 @@ impl InOrder {
         if self.earlier.is_empty() {
             return Vec::new();
         }
-        let is_late = self.announced.0.saturating_add(AGAIN) <= now.0;
+        let is_late = self.announced + RETRANSMISSION_TIMEOUT <= now;
         if is_late || !progress.reliable {
             return std::mem::take(&mut self.earlier).into_iter().collect();
         }
@@ -172,19 +172,19 @@ impl InOrder {
         progress: &Progress,
         now: Timestamp,
         room: usize,
-        give: &mut impl FnMut(Due),
+        give: &mut impl FnMut(QueuedSample),
     ) -> Option<SequenceNumber> {
         self.begin(progress.incarnation, now, give);
         let first = self
             .earlier
             .first()
-            .filter(|_| progress.acknowledged || self.announced.0.saturating_add(MATCHING) > now.0);
+            .filter(|_| progress.acknowledged || self.announced + FIRST_ACKNACK_TIMEOUT > now);
         let complete = first.map_or(progress.complete, |first| progress.complete.min(*first));
         while let Some(entry) = self.waiting.first_entry()
             && *entry.key() < complete
         {
-            let due = entry.remove();
-            self.give(due, now, give);
+            let queued = entry.remove();
+            self.give(queued, now, give);
         }
         if self.waiting.is_empty() {
             return None;
@@ -192,7 +192,7 @@ impl InOrder {
         if self.hole.0 != complete {
             self.hole = (complete, now);
         }
-        let is_late = self.hole.1.0.saturating_add(PATIENCE) <= now.0;
+        let is_late = self.hole.1 + GAP_TIMEOUT <= now;
         if is_late || self.waiting.len() > WAITING || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
             self.give_all(now, give);
@@ -202,24 +202,24 @@ impl InOrder {
     }
 
     /// Dispatches all waiting samples at the end of the input.
-    pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(Due)) {
-        while let Some((_, due)) = self.waiting.pop_first() {
-            self.give(due, now, give);
+    pub fn give_all(&mut self, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+        while let Some((_, queued)) = self.waiting.pop_first() {
+            self.give(queued, now, give);
         }
     }
 
-    fn give(&mut self, due: Due, now: Timestamp, give: &mut impl FnMut(Due)) {
-        self.bytes -= due.cost();
-        let came = due.sample.time;
+    fn give(&mut self, queued: QueuedSample, now: Timestamp, give: &mut impl FnMut(QueuedSample)) {
+        self.bytes -= queued.cost();
+        let came = queued.sample.time;
         // Its reader may have received the lower number through unobserved shared memory, and then
         // it did not wait.
-        let now = if due.sample.sampled { came } else { now };
+        let now = if queued.sample.sampled { came } else { now };
         // Players sort by time, so samples that waited for the same retransmission are one
         // nanosecond apart.
         let after = match came < now.max(self.last) {
             true => Timestamp(self.last.0.saturating_add(1)),
             false => came,
         };
-        give(self.pass(due, now.max(after)));
+        give(self.pass(queued, now.max(after)));
     }
 }

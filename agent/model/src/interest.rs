@@ -23,7 +23,7 @@ pub struct Interest {
 #[derive(Clone, Copy, Debug, Default)]
 struct Entry {
     wanted: Option<Verdict>,
-    told: Option<Verdict>,
+    reported: Option<Verdict>,
 }
 
 impl Interest {
@@ -65,7 +65,7 @@ impl Interest {
         }
         let entry = self.entries.entry(guid).or_default();
         entry.wanted = Some(verdict);
-        if entry.wanted == entry.told {
+        if entry.wanted == entry.reported {
             self.changed.remove(&guid);
         } else {
             self.changed.insert(guid);
@@ -78,7 +78,7 @@ impl Interest {
             return;
         };
         entry.wanted = None;
-        if entry.told.is_none() {
+        if entry.reported.is_none() {
             self.entries.remove(&guid);
             self.changed.remove(&guid);
         } else {
@@ -100,7 +100,7 @@ impl Interest {
             let Some(entry) = self.entries.get_mut(&guid) else {
                 continue;
             };
-            entry.told = entry.wanted;
+            entry.reported = entry.wanted;
             changes.push((guid, entry.wanted));
             if entry.wanted.is_none() {
                 self.entries.remove(&guid);
@@ -122,16 +122,16 @@ impl Interest {
         let mut ignored = self
             .entries
             .iter()
-            .filter(|(_, entry)| entry.wanted == Some(Verdict::Ignore) && entry.told.is_none());
+            .filter(|(_, entry)| entry.wanted == Some(Verdict::Ignore) && entry.reported.is_none());
         let found = ignored.next().map(|(guid, _)| *guid);
-        let told = || {
+        let reported = || {
             let ignored = |entry: &Entry| entry.wanted == Some(Verdict::Ignore);
             self.entries
                 .iter()
                 .find(|(_, entry)| ignored(entry))
                 .map(|(guid, _)| *guid)
         };
-        let Some(guid) = found.or_else(told) else {
+        let Some(guid) = found.or_else(reported) else {
             return false;
         };
         self.remove(guid);

@@ -5,8 +5,8 @@
 //! A loss that may be of the second kind stays pending until then.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::loss::LossCause;
@@ -17,7 +17,7 @@ const SAMPLES: usize = 8192;
 /// Largest number of runs of pending samples per receiver.
 const RUNS: usize = 1024;
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
-pub const REASSEMBLY: u64 = 35 * SECOND;
+pub const REASSEMBLY: Duration = Duration::from_secs(35);
 
 /// Known causes and pending losses.
 #[derive(Debug, Default)]
@@ -242,11 +242,11 @@ mod tests {
             loss_causes.note(SequenceNumber(2 * number), LossCause::SocketBuffer, at(1))
         });
         assert_eq!(forgotten.count(), 10_000 - SAMPLES);
-        let told = (0..2000).filter_map(|number| {
+        let losses = (0..2000).filter_map(|number| {
             let number = SequenceNumber(2 * number);
             loss_causes.wait(number, number, at(1))
         });
-        assert_eq!(told.count(), 2000 - RUNS);
+        assert_eq!(losses.count(), 2000 - RUNS);
     }
 
     #[test]

@@ -14,12 +14,12 @@ mod settings;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::record::{Body, Handover, flag};
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Envelope, Outcome};
 use ros2probe_wire::{DomainId, Guid, Reason, Record, Timestamp};
 
@@ -48,11 +48,11 @@ use lists::traits;
 pub use settings::Settings;
 
 /// Interval at which leases, windows and gaps are checked.
-const TICK: u64 = SECOND / 10;
+const TICK: Duration = Duration::from_millis(100);
 /// A larger step of the clock means that the clock was set; it is not processed tick by tick.
-const JUMP: u64 = 3600 * SECOND;
+const JUMP: Duration = Duration::from_secs(3600);
 /// Largest number of names matched against globs at once, which takes a few milliseconds.
-const MATCHES_AT_ONCE: usize = 20_000;
+const MAX_MATCHES_PER_ROUND: usize = 20_000;
 
 /// What the model needs from shared memory.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,13 +6,13 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
-use super::in_order::{Due, InOrder, MAX_UNANNOUNCED, Progress};
+use super::in_order::{InOrder, MAX_UNANNOUNCED, Progress, QueuedSample};
 use super::journal::Missing;
 use super::selection::RequestIds;
 use super::size::{Size, largest};
@@ -22,7 +22,7 @@ use super::writer::Counted;
 const WAITING: usize = 65_536;
 /// Longest time until the kernel captures payloads after a request, and the model has processed
 /// what was captured before.
-pub const PAYLOAD_DELAY: u64 = 400 * MILLISECOND;
+pub const PAYLOAD_DELAY: Duration = Duration::from_millis(400);
 
 /// Requests for the samples of one writer.
 #[derive(Debug)]
@@ -55,7 +55,7 @@ struct UnannouncedSamples {
 #[derive(Debug)]
 pub struct Payloads {
     writers: HashMap<Guid, WantedWriter>,
-    payload_delay: u64,
+    payload_delay: Duration,
     /// Number of writers whose payloads are requested.
     deep: usize,
     assembly: Assembly,
@@ -70,9 +70,9 @@ pub struct Payloads {
 
 impl Payloads {
     /// Creates the state without requests. At most `limit` bytes are held; payloads arrive at most
-    /// `payload_delay` nanoseconds after they are requested.
+    /// `payload_delay` after they are requested.
     #[must_use]
-    pub fn new(limit: usize, payload_delay: u64) -> Self {
+    pub fn new(limit: usize, payload_delay: Duration) -> Self {
         Self {
             writers: HashMap::new(),
             payload_delay,
@@ -265,7 +265,7 @@ impl Payloads {
             false => self.assembly.take(writer, counted.number),
         };
         // A sample that began before the request is incomplete.
-        let is_expected = counted.began.0 >= interested.since.0.saturating_add(self.payload_delay)
+        let is_expected = counted.began >= interested.since + self.payload_delay
             || interested
                 .first_whole
                 .is_some_and(|first| first < counted.number);
@@ -279,7 +279,7 @@ impl Payloads {
             Some(_) => &interested.to,
             None => &interested.arrivals,
         };
-        let due = Due {
+        let queued = QueuedSample {
             to: Arc::clone(to),
             sample: Sample {
                 topic: Arc::clone(&interested.topic),
@@ -296,18 +296,22 @@ impl Payloads {
         };
         let mut before = Vec::new();
         let order = &mut interested.order;
-        order.begin(progress.incarnation, counted.at, &mut |due| {
-            before.push(due);
+        order.begin(progress.incarnation, counted.at, &mut |queued| {
+            before.push(queued);
         });
-        self.waiting_bytes += due.cost();
+        self.waiting_bytes += queued.cost();
         if counted.unconfirmed || order.is_idle() && counted.number < progress.complete {
-            let due = order.pass(due, counted.at);
-            before.push(due);
-            before.into_iter().for_each(|due| self.give_due(due));
+            let queued = order.pass(queued, counted.at);
+            before.push(queued);
+            before
+                .into_iter()
+                .for_each(|queued| self.give_queued(queued));
             return None;
         }
-        order.put(due);
-        before.into_iter().for_each(|due| self.give_due(due));
+        order.put(queued);
+        before
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
         self.turn(writer, progress, counted.at)
     }
 
@@ -403,10 +407,12 @@ impl Payloads {
         let order = &mut interested.order;
         let room = room + order.bytes();
         let forgone = order.forgone(progress, now);
-        let mut due = Vec::new();
-        let skip = order.turn(progress, now, room, &mut |each| due.push(each));
+        let mut queued = Vec::new();
+        let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone);
-        due.into_iter().for_each(|due| self.give_due(due));
+        queued
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
         skip
     }
 
@@ -418,10 +424,14 @@ impl Payloads {
             return;
         };
         let forgone = interested.order.forgone(&nothing_awaited, now);
-        let mut due = Vec::new();
-        interested.order.give_all(now, &mut |each| due.push(each));
+        let mut queued = Vec::new();
+        interested
+            .order
+            .give_all(now, &mut |each| queued.push(each));
         self.unannounced(writer, &forgone);
-        due.into_iter().for_each(|due| self.give_due(due));
+        queued
+            .into_iter()
+            .for_each(|queued| self.give_queued(queued));
     }
 
     /// Reports samples that will not arrive.
@@ -495,17 +505,17 @@ impl Payloads {
         missed.into_iter().for_each(|missed| self.give(missed, 0));
     }
 
-    fn give_due(&mut self, due: Due) {
-        let bytes = due.bytes();
-        self.waiting_bytes -= due.cost();
-        if !due.to.is_empty() {
+    fn give_queued(&mut self, queued: QueuedSample) {
+        let bytes = queued.bytes();
+        self.waiting_bytes -= queued.cost();
+        if !queued.to.is_empty() {
             let sample = Dispatch {
-                to: due.to,
-                outcome: SampleOutcome::Sample(Arc::new(due.sample)),
+                to: queued.to,
+                outcome: SampleOutcome::Sample(Arc::new(queued.sample)),
             };
             self.give(sample, bytes);
         }
-        if let Some(missed) = due.missed {
+        if let Some(missed) = queued.missed {
             self.give(missed, 0);
         }
     }

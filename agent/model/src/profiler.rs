@@ -6,10 +6,10 @@
 mod unknown_writers;
 
 use std::collections::{BTreeSet, HashMap};
+use std::time::Duration;
 
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::record::{Body, flag};
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
 
 use super::delivery::Totals;
@@ -27,23 +27,23 @@ pub use unknown_writers::UnknownWriters;
 
 /// An unknown writer is shown and metered after this time; announcements usually arrive within a
 /// second.
-const UNKNOWN_AFTER: u64 = 3 * SECOND;
+const UNKNOWN_AFTER: Duration = Duration::from_secs(3);
 /// An unknown writer is dropped after this silence, or earlier if it sent little.
-const FORGET: u64 = 30 * SECOND;
-const EVICTABLE_AFTER: u64 = 3 * SECOND;
+const UNKNOWN_WRITER_TIMEOUT: Duration = Duration::from_secs(30);
+const EVICTABLE_AFTER: Duration = Duration::from_secs(3);
 /// Number of messages from which on an unknown writer is not evicted.
 const ESTABLISHED_MESSAGES: u64 = 10;
 /// Longest time until the kernel knows a writer: a round of the capture thread on a busy machine.
 /// Until then the kernel limits captures as for an unknown writer, and a point cloud exceeds that
 /// limit.
-const KERNEL_UPDATE_TIME: u64 = SECOND / 5;
+const KERNEL_UPDATE_TIME: Duration = Duration::from_millis(200);
 /// Unknown writers may use one part in this many of the memory for fragmented samples.
 const UNKNOWN_WRITERS_SHARE: usize = 4;
 /// Deliveries that may be dropped for new ones: minimum silence, and largest number at once.
-const SILENT: u64 = 10 * SECOND;
+const DELIVERY_TIMEOUT: Duration = Duration::from_secs(10);
 const GIVEN_UP: usize = 64;
 /// Flags of records that report undelivered datagrams; they are no transmissions.
-pub(super) const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+pub(super) const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
 
 /// A measured writer.
 #[derive(Debug)]
@@ -444,11 +444,9 @@ impl Profiler {
                 }
                 continue;
             }
-            if measured.last_seen.0.saturating_add(FORGET) <= now.0 {
+            if measured.last_seen + UNKNOWN_WRITER_TIMEOUT <= now {
                 unknown_writers.forgotten.push(*guid);
-            } else if !measured.metered
-                && measured.first_seen.0.saturating_add(UNKNOWN_AFTER) <= now.0
-            {
+            } else if !measured.metered && measured.first_seen + UNKNOWN_AFTER <= now {
                 (measured.metered, measured.opened) = (true, now);
                 unknown_writers.metered.push(*guid);
             }
@@ -495,7 +493,7 @@ impl Profiler {
             .iter()
             .filter_map(|(guid, measured)| Some((guid, measured.subscribers.as_ref()?)))
             .flat_map(|(guid, subscribers)| subscribers.silent_since().map(|at| (at, *guid)))
-            .filter(|(at, _)| at.0.saturating_add(SILENT) <= now.0)
+            .filter(|(at, _)| *at + DELIVERY_TIMEOUT <= now)
             .collect();
         silent.sort_unstable();
         for (at, guid) in silent.into_iter().take(GIVEN_UP) {
@@ -589,8 +587,8 @@ impl Measured {
     }
 
     /// Marks the writer as metered once the kernel knows it.
-    const fn allow_incomplete(&mut self, now: Timestamp) {
-        self.sure_from = Timestamp(now.0.saturating_add(KERNEL_UPDATE_TIME));
+    fn allow_incomplete(&mut self, now: Timestamp) {
+        self.sure_from = now + KERNEL_UPDATE_TIME;
         self.writer.allow_incomplete(self.sure_from);
     }
 }

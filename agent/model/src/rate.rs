@@ -4,9 +4,8 @@
 //! its start. Exact counters are elsewhere; this module forgets after [`SECONDS`].
 
 use ros2probe_wire::Timestamp;
-use ros2probe_wire::time::SECOND;
 
-/// Length of the window.
+/// Length of the window in seconds, one slot each.
 pub const SECONDS: u64 = 10;
 const SLOTS: usize = SECONDS as usize + 1;
 
@@ -61,7 +60,7 @@ impl Window {
     /// counting began later.
     #[must_use]
     pub fn sum(&self, now: Timestamp, seconds: u64) -> (Slot, u64) {
-        let current = now.0 / SECOND;
+        let current = now.whole_seconds();
         let end = current.max(self.second);
         let start = end.saturating_sub(seconds.min(SECONDS));
         // The second in which counting began is incomplete.
@@ -85,7 +84,7 @@ impl Window {
 
     /// Clears the slots of seconds without counts.
     fn turn(&mut self, now: Timestamp) {
-        let second = now.0 / SECOND;
+        let second = now.whole_seconds();
         if self.began == 0 {
             (self.began, self.second) = (second, second);
         }
@@ -105,6 +104,8 @@ impl Window {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::time::SECOND;
+
     use super::*;
 
     fn fill(window: &mut Window, start_ms: u64, step_ms: u64, count: u64) -> Timestamp {

@@ -4,6 +4,8 @@
 //! a late fragment does not reopen it, and each missing sample is decided once. The caller counts
 //! the results.
 
+use std::time::Duration;
+
 use ros2probe_wire::record::{self, DataFrag, Gap, Heartbeat};
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
@@ -26,7 +28,7 @@ pub struct Reception {
 
 /// A complete sample.
 #[derive(Clone, Copy, Debug)]
-pub struct Whole {
+pub struct CompleteSample {
     /// Its sequence number.
     pub number: SequenceNumber,
     /// Payload bytes, including encapsulation.
@@ -53,7 +55,7 @@ pub struct Whole {
 #[derive(Clone, Copy, Debug)]
 pub enum Outcome {
     /// The record completed a sample.
-    Whole(Whole),
+    Complete(CompleteSample),
     /// The record is a duplicate.
     Duplicate,
     /// The sample is still incomplete, or the record was not usable.
@@ -250,12 +252,11 @@ impl Reception {
         }
     }
 
-    /// Decides samples that have been open for `window` nanoseconds, and those that the writer
-    /// withdrew `grace` nanoseconds ago.
+    /// Decides samples that have been open for `window`, and those that the writer withdrew `grace` ago.
     pub fn advance(
         &mut self,
         now: Timestamp,
-        (window, grace): (u64, u64),
+        (window, grace): (Duration, Duration),
         budget: &mut Budget,
         decide: &mut impl FnMut(Decision),
     ) {
@@ -296,7 +297,7 @@ impl Reception {
         let Arrival::New { recovered, newest } = arrival else {
             return Outcome::Duplicate;
         };
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             recovered,
             newest,
             ..whole_data(sample)
@@ -321,7 +322,7 @@ impl Reception {
             record::Sample::Data(_) => whole_data(sample),
         };
         self.sequence.complete_unconfirmed(number);
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             newest: false,
             unconfirmed: true,
             ..whole
@@ -374,15 +375,15 @@ impl Reception {
             return Outcome::Open;
         };
         let repaired = reliable && facts.repaired_after >= REPAIR;
-        Outcome::Whole(Whole {
+        Outcome::Complete(CompleteSample {
             recovered: recovered || repaired,
             ..whole_fragments(record::Sample::DataFrag(fragments), &facts)
         })
     }
 }
 
-const fn whole_data(sample: record::Sample<'_>) -> Whole {
-    Whole {
+const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
+    CompleteSample {
         number: sample.sequence_number(),
         bytes: sample.size() as u64,
         is_message: sample.is_message(),
@@ -396,8 +397,8 @@ const fn whole_data(sample: record::Sample<'_>) -> Whole {
     }
 }
 
-const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> Whole {
-    Whole {
+const fn whole_fragments(sample: record::Sample<'_>, facts: &Facts) -> CompleteSample {
+    CompleteSample {
         bytes: facts.size as u64,
         source: facts.source,
         stamp: facts.stamp,

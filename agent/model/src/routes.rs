@@ -4,8 +4,8 @@
 //! bounded: the one with the longest silence is dropped for a new one.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
 
 use super::receivers::{GraphView, Matched};
@@ -16,8 +16,10 @@ use super::topic::Topic;
 
 /// Largest number of routes per writer.
 const LIMIT: usize = 512;
-/// Number of times, one per second, at which the last departed number is remembered.
-const MOMENTS: usize = 24;
+/// Number of times at which the last departed number is remembered.
+const DEPARTURE_TIMES: usize = 24;
+/// Interval of these times.
+const DEPARTURE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// All routes of one writer, sorted.
 #[derive(Debug, Default)]
@@ -83,7 +85,7 @@ impl Routes {
         let left = routes.iter().map(left).max().unwrap_or(0);
         [
             Size::new("routes.routes", routes.len(), LIMIT),
-            Size::new("routes.left", left, MOMENTS),
+            Size::new("routes.left", left, DEPARTURE_TIMES),
         ]
     }
 
@@ -232,9 +234,9 @@ impl KnownRoute {
         let is_due = self
             .left
             .back()
-            .is_none_or(|(at, last)| *last != number && at.0.saturating_add(SECOND) <= now.0);
+            .is_none_or(|(at, last)| *last != number && *at + DEPARTURE_INTERVAL <= now);
         if is_due {
-            if self.left.len() >= MOMENTS {
+            if self.left.len() >= DEPARTURE_TIMES {
                 self.left.pop_front();
             }
             self.left.push_back((now, number));
@@ -252,6 +254,8 @@ impl KnownRoute {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_wire::time::SECOND;
+
     use super::*;
 
     #[test]
@@ -277,6 +281,6 @@ mod tests {
         assert_eq!(known.left_by(at(500)), None);
         assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));
         assert_eq!(known.left_by(at(2000)), Some(SequenceNumber(2970)));
-        assert!(known.left.len() <= MOMENTS);
+        assert!(known.left.len() <= DEPARTURE_TIMES);
     }
 }

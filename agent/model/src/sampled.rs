@@ -6,7 +6,8 @@
 //! numbers, and unseen numbers are no losses. While a writer is sampled, its samples on the network
 //! are counted here, too.
 
-use ros2probe_wire::time::{MILLISECOND, SECOND};
+use std::time::Duration;
+
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::measurement::SampledFacts;
@@ -14,9 +15,9 @@ use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
 use super::size::Size;
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
-const HOLD: u64 = 10 * SECOND;
+const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
-const PATIENCE: u64 = 200 * MILLISECOND;
+const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
 /// Numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -70,13 +71,13 @@ pub struct SampledUpdate {
 
 /// How much of a sample was seen, including its latest record.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Seen {
+pub enum Completeness {
     /// Some fragments, with more to follow.
-    Part,
+    Partial,
     /// The last fragment, while others are missing.
-    Tail,
+    LastFragment,
     /// The whole sample.
-    Whole,
+    Complete,
 }
 
 impl Sampled {
@@ -132,13 +133,13 @@ impl Sampled {
 
     /// Returns whether the writer is still sampled.
     #[must_use]
-    pub const fn is_current(&self, now: Timestamp) -> bool {
-        self.last.0.saturating_add(HOLD) > now.0
+    pub fn is_current(&self, now: Timestamp) -> bool {
+        self.last + SAMPLED_TIMEOUT > now
     }
 
     /// Returns whether a record at `now` belongs to this view: while the writer is sampled, and for
     /// the first record after that, since samples missing before it may have used shared memory.
-    pub const fn takes(&mut self, now: Timestamp) -> bool {
+    pub fn takes(&mut self, now: Timestamp) -> bool {
         let takes = self.is_current(now) || !self.left;
         self.left |= !self.is_current(now);
         takes
@@ -157,7 +158,7 @@ impl Sampled {
     }
 
     /// Processes a sample that [`Self::awaits`] accepts, or a fragment of one, after [`Self::end`].
-    pub fn catch_up(&mut self, number: SequenceNumber, seen: Seen) -> SampledUpdate {
+    pub fn catch_up(&mut self, number: SequenceNumber, seen: Completeness) -> SampledUpdate {
         SampledUpdate {
             finished: self.sight(number, seen),
             ..SampledUpdate::default()
@@ -182,7 +183,7 @@ impl Sampled {
     /// Stops waiting for samples that were already missing at the previous tick.
     pub fn tick(&mut self, now: Timestamp) {
         let (then, next) = self.last_settled;
-        if now.0.saturating_sub(then.0) >= PATIENCE {
+        if now - then >= ARRIVAL_TIMEOUT {
             self.settle(next.min(self.next));
             self.last_settled = (now, self.next);
         }
@@ -244,7 +245,7 @@ impl Sampled {
     /// numbers before it may have been missed.
     pub fn sample(
         &mut self,
-        (number, seen, source): (SequenceNumber, Seen, Option<Timestamp>),
+        (number, seen, source): (SequenceNumber, Completeness, Option<Timestamp>),
         reach: u64,
         now: Timestamp,
         sequence: &mut Sequence,
@@ -293,7 +294,7 @@ impl Sampled {
             ..SampledUpdate::default()
         };
         let is_later = self.arrived.is_none_or(|(arrived, _)| arrived < number);
-        if seen != Seen::Part && below == 0 && is_later {
+        if seen != Completeness::Partial && below == 0 && is_later {
             update.arrived = true;
             update.interval = self
                 .arrived
@@ -377,7 +378,7 @@ impl Sampled {
     /// Processes a sample whose number is not confirmed.
     fn unconfirmed(
         &mut self,
-        (number, seen): (SequenceNumber, Seen),
+        (number, seen): (SequenceNumber, Completeness),
         new: bool,
         sequence: &mut Sequence,
     ) -> SampledUpdate {
@@ -387,7 +388,7 @@ impl Sampled {
         SampledUpdate {
             samples,
             alike: samples,
-            finished: seen != Seen::Part && sequence.complete_unconfirmed(number),
+            finished: seen != Completeness::Partial && sequence.complete_unconfirmed(number),
             unconfirmed: true,
             ..SampledUpdate::default()
         }
@@ -408,13 +409,13 @@ impl Sampled {
 
     /// Marks a sample as seen. Returns whether nothing more of it is waited for, for the first
     /// time.
-    fn sight(&mut self, number: SequenceNumber, seen: Seen) -> bool {
+    fn sight(&mut self, number: SequenceNumber, seen: Completeness) -> bool {
         let bit = self.bit(number, self.next).unwrap_or(0);
         if self.sighted & bit != bit {
             self.sighted |= bit;
             self.seen += 1;
         }
-        let finished = seen != Seen::Part && self.awaits(number);
+        let finished = seen != Completeness::Partial && self.awaits(number);
         if finished {
             self.finished |= bit;
         }
@@ -423,7 +424,7 @@ impl Sampled {
 
     /// Returns the bit of a number relative to `next`.
     fn bit(&self, number: SequenceNumber, next: SequenceNumber) -> Option<u128> {
-        let below = next.0.checked_sub(number.0)?.checked_sub(1)?;
+        let below = (number < next).then(|| next - number.next())?;
         1_u128.checked_shl(u32::try_from(below).ok()?)
     }
 

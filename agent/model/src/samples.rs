@@ -5,6 +5,8 @@
 //! arrived, within a budget shared by all writers. [`super::sequence`] knows whether a finished
 //! sample was seen before; the caller checks there first.
 
+use std::time::Duration;
+
 use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
@@ -215,13 +217,13 @@ impl Samples {
     pub fn growing(
         &self,
         now: Timestamp,
-        window: u64,
+        window: Duration,
         first: SequenceNumber,
     ) -> Option<SequenceNumber> {
         let growing = self
             .partial
             .iter()
-            .filter(|each| each.number >= first && each.latest.0.saturating_add(window) > now.0);
+            .filter(|each| each.number >= first && each.latest + window > now);
         growing.map(|each| each.number).min()
     }
 
@@ -241,13 +243,13 @@ impl Samples {
         }
     }
 
-    /// Drops samples without a fragment for `window` nanoseconds; returns their number.
-    pub fn expire(&mut self, now: Timestamp, window: u64, budget: &mut Budget) -> u64 {
+    /// Drops samples without a fragment for `window`; returns their number.
+    pub fn expire(&mut self, now: Timestamp, window: Duration, budget: &mut Budget) -> u64 {
         let mut expired = 0;
         while let Some(index) = self
             .partial
             .iter()
-            .position(|each| each.latest.0.saturating_add(window) <= now.0)
+            .position(|each| each.latest + window <= now)
         {
             self.close(index, budget);
             expired += 1;
@@ -497,14 +499,17 @@ mod tests {
         let (mut samples, mut budget) = (Samples::default(), budget());
         put(&mut samples, &fragment(4, 1, 1, 9000), 100, &mut budget);
         assert_eq!(
-            samples.growing(Timestamp(150), 100, SequenceNumber(0)),
+            samples.growing(Timestamp(150), Duration::from_nanos(100), SequenceNumber(0)),
             Some(SequenceNumber(4))
         );
         assert_eq!(
-            samples.growing(Timestamp(250), 100, SequenceNumber(0)),
+            samples.growing(Timestamp(250), Duration::from_nanos(100), SequenceNumber(0)),
             None
         );
-        assert_eq!(samples.expire(Timestamp(250), 100, &mut budget), 1);
+        assert_eq!(
+            samples.expire(Timestamp(250), Duration::from_nanos(100), &mut budget),
+            1
+        );
         assert_eq!(budget.bytes, 0);
     }
 }

@@ -13,8 +13,8 @@ mod submessages;
 mod unconfirmed;
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::size::Size;
@@ -36,16 +36,16 @@ pub const REACH: u64 = 64;
 /// A gap that fills within this time without a request was reordering. Retransmissions take longer
 /// even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before
 /// they answer a HEARTBEAT.
-const REORDERING: i64 = 5_000_000;
+const REORDERING: Duration = Duration::from_millis(5);
 /// Number of gaps remembered, to distinguish reordering from retransmission.
 const GAPS: usize = 32;
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
-const INCARNATION: u64 = 100 * MILLISECOND;
+const INCARNATION: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
 /// source times.
 const STALE: u32 = 1024;
 /// Number of steps per window in which settling advances.
-const STEPS: u64 = 16;
+const STEPS: u32 = 16;
 /// Largest number of checkpoints: two windows of different lengths, and one that is held.
 const CHECKPOINTS: usize = 3 * STEPS as usize;
 /// Words of a bitmap.
@@ -373,7 +373,7 @@ impl Sequence {
     pub fn advance(
         &mut self,
         now: Timestamp,
-        (window, grace): (u64, u64),
+        (window, grace): (Duration, Duration),
         hold: Option<SequenceNumber>,
         settled: &mut impl FnMut(Settled),
     ) {
@@ -382,18 +382,18 @@ impl Sequence {
         }
         let mut limit = None;
         if let Some((at, available)) = self.withdrawn
-            && at.0.saturating_add(grace) <= now.0
+            && at + grace <= now
         {
             limit = Some(available);
             let later = self.available > available;
             self.withdrawn = later.then_some((now, self.available));
         }
         while let Some((at, next)) = self.checkpoints.front().copied()
-            && at.0.saturating_add(window) <= now.0
+            && at + window <= now
         {
             limit = limit.max(Some(next));
             let later = self.checkpoints.get(1);
-            let is_last = later.is_none_or(|(at, _)| at.0.saturating_add(window) > now.0);
+            let is_last = later.is_none_or(|(at, _)| *at + window > now);
             if is_last && hold.is_some_and(|hold| hold < next) {
                 break;
             }
@@ -402,9 +402,10 @@ impl Sequence {
         if let Some(limit) = limit {
             self.settle(hold.map_or(limit, |hold| hold.min(limit)), settled);
         }
-        let due = self.checkpoints.back().is_none_or(|(at, next)| {
-            *next < self.next && at.0.saturating_add(window / STEPS) <= now.0
-        });
+        let due = self
+            .checkpoints
+            .back()
+            .is_none_or(|(at, next)| *next < self.next && *at + window / STEPS <= now);
         if due && self.settled < self.next {
             self.checkpoints.push_back((now, self.next));
         }
@@ -492,7 +493,7 @@ impl Sequence {
             .iter()
             .rev()
             .find(|gap| gap.start <= number && number < gap.end);
-        let late = |gap: &Gap| gap.requested || now.nanoseconds_since(gap.noticed) >= REORDERING;
+        let late = |gap: &Gap| gap.requested || now - gap.noticed >= REORDERING;
         match repair_mode {
             RepairMode::BestEffort => false,
             // A gap that is no longer remembered is an old one.

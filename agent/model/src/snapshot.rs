@@ -10,7 +10,7 @@ use std::sync::Arc;
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, Duration, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
 pub use super::churn::ChurnCount;
 use super::diagnosis::Diagnoses;
@@ -79,7 +79,7 @@ pub struct ParticipantFacts {
     /// Time of its last packet.
     pub last_seen: Timestamp,
     /// Time after which a silent participant is removed.
-    pub lease: Duration,
+    pub lease: RtpsDuration,
     /// Whether it announces security: its user data may be encrypted.
     pub secured: bool,
     /// Whether it is restored from saved state without a packet so far.

@@ -26,7 +26,7 @@ use super::header::PLAUSIBLE;
 use super::journal::Journal;
 use super::measurement::Breakdown;
 use super::receivers::{GraphView, Matched};
-use super::reception::Whole;
+use super::reception::CompleteSample;
 use super::route::Direction;
 use super::route::Route;
 use super::routes::{KnownRoute, Routes};
@@ -249,8 +249,7 @@ impl Subscribers {
         // Both times are from one clock. A sample that leaves before its timestamp, or hours after
         // it, is no measure of the send delay.
         if let Some(source) = source.filter(|_| sample.is_start())
-            && let Ok(delay) = u64::try_from(began.nanoseconds_since(source))
-            && delay <= PLAUSIBLE
+            && (source..=source + PLAUSIBLE).contains(&began)
             && self.departures.is_first(source)
         {
             let delay = began.nanoseconds_since(source);
@@ -291,7 +290,7 @@ impl Subscribers {
             if let Body::Sample(sample) = body
                 && sample.is_message()
                 && sample.is_end()
-                && record.flags & flag::NO_ROOM == 0
+                && record.flags & flag::SOCKET_FULL == 0
             {
                 let place = self.find(receiver);
                 match place.and_then(|place| self.deliveries.get_mut(place)) {
@@ -358,15 +357,15 @@ impl Subscribers {
         sample: Sample<'_>,
         context: &mut WriterContext<'_>,
     ) -> bool {
-        let no_room = sample.record().flags & flag::NO_ROOM != 0;
+        let socket_full = sample.record().flags & flag::SOCKET_FULL != 0;
         let route = self.routes.get(index).map(|known| known.route);
         if route.is_some_and(|route| self.is_repair_elsewhere(route, receiver, sample)) {
             return false;
         }
         let is_open = |receiver| matches!(receiver, Receiver::Route(route) if route.is_open());
         if self.open > 0 && !is_open(receiver) {
-            let is_known = !no_room && self.repair(sample, context);
-            if (is_known || no_room) && self.find(receiver).is_none() {
+            let is_known = !socket_full && self.repair(sample, context);
+            if (is_known || socket_full) && self.find(receiver).is_none() {
                 return false;
             }
         }
@@ -377,8 +376,8 @@ impl Subscribers {
             return false;
         };
         let next = delivery.next();
-        if no_room {
-            delivery.no_room(
+        if socket_full {
+            delivery.socket_full(
                 sample,
                 &mut delivery_context(&mut self.totals, self.reassembled, context),
             );
@@ -401,7 +400,7 @@ impl Subscribers {
     }
 
     /// Processes a sample that arrived whole on this route.
-    fn came(&mut self, index: usize, place: usize, whole: &Whole, now: Timestamp) {
+    fn came(&mut self, index: usize, place: usize, whole: &CompleteSample, now: Timestamp) {
         self.transfer(whole, now);
         let Some(known) = self.routes.get_mut(index).filter(|_| !whole.recovered) else {
             return;
@@ -544,7 +543,7 @@ impl Subscribers {
         self.totals.breakdown.get_or_insert_default()
     }
 
-    fn transfer(&mut self, whole: &Whole, now: Timestamp) {
+    fn transfer(&mut self, whole: &CompleteSample, now: Timestamp) {
         if now > whole.began {
             let transfer = now.nanoseconds_since(whole.began);
             self.breakdown().transfer.observe(seconds(transfer));

@@ -5,6 +5,7 @@
 //! series show silence instead of disappearing.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::{DomainId, Guid, Timestamp};
@@ -355,9 +356,9 @@ impl Topics {
     }
 
     /// Removes topics that vanished more than `grace` ago.
-    pub fn expire(&mut self, now: Timestamp, grace: u64) {
+    pub fn expire(&mut self, now: Timestamp, grace: Duration) {
         while let Some((at, id)) = self.vanished.first().copied()
-            && at.0.saturating_add(grace) <= now.0
+            && at + grace <= now
         {
             self.forget(id);
         }

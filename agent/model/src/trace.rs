@@ -7,10 +7,10 @@
 
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
 use ros2probe_wire::rtps::StatusInfo;
-use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{DomainId, Guid, Record, RtpsTime, SequenceNumber, Timestamp};
 
 use super::identity::Identity;
@@ -35,10 +35,10 @@ const MAX_FINISHED: usize = 2048;
 /// Memory for bitmaps of fragments in bytes.
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements after this time have no span.
-const PATIENCE: u64 = 10 * SECOND;
+const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
 /// An arriving message is not a copy of one sent from here if no record shows that within this
 /// time.
-const LOCAL_COPY_DELAY: u64 = 500 * MILLISECOND;
+const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
 /// Index of the loopback interface in every network namespace.
 const LOOPBACK: u32 = 1;
 /// The bits of a trace id that decide about sampling, as in OpenTelemetry's samplers.
@@ -203,7 +203,7 @@ impl Tracer {
         record: &Record,
         about: impl FnOnce() -> Option<(WriterDescription, f64)>,
     ) {
-        const UNDELIVERED: u16 = flag::NO_ROOM | flag::NOT_REASSEMBLED;
+        const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
         let writer = record.writer();
         if !self.writers.contains_key(&writer) {
             let Some((description, ratio)) = about() else {
@@ -235,7 +235,7 @@ impl Tracer {
         for traced in self.writers.values_mut().flatten() {
             traced.release(now, &mut self.shared);
             while let Some(first) = traced.waiting.front()
-                && now.0.saturating_sub(first.at.0) > PATIENCE
+                && now - first.at > ACKNACK_TIMEOUT
             {
                 traced.waiting.pop_front();
                 self.shared.open = self.shared.open.saturating_sub(1);
@@ -448,7 +448,7 @@ impl WriterTrace {
     /// Completes the spans of arrivals that are old enough to be from another host.
     fn release(&mut self, now: Timestamp, shared: &mut Shared) {
         while let Some(first) = self.arrived.front()
-            && now.0.saturating_sub(first.end.0) > LOCAL_COPY_DELAY
+            && now - first.end > LOCAL_COPY_DELAY
             && let Some(span) = self.arrived.pop_front()
         {
             shared.open = shared.open.saturating_sub(1);

@@ -3,8 +3,9 @@
 //!
 //! The result is the transport that they would use; whether they match is decided elsewhere.
 
+use std::time::Duration;
+
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::discovery::{Discovery, Endpoint};
@@ -14,8 +15,8 @@ use super::snapshot::{EndpointFacts, Transport, TransportCount};
 const MAX_PAIRS: usize = 1024;
 /// A participant without announced nodes for this long does not use ROS, and its endpoints have no
 /// node.
-const NODES_WITHIN: u64 = 30 * SECOND;
-const NODE_WITHIN: u64 = 10 * SECOND;
+const NODES_WITHIN: Duration = Duration::from_secs(30);
+const NODE_WITHIN: Duration = Duration::from_secs(10);
 
 /// Counts the pairs of these writers and readers by transport, and passes each endpoint its
 /// transports.
@@ -74,8 +75,7 @@ pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
 /// Returns whether names are missing that shared memory may contain at present: nodes of a
 /// participant, or the node of an endpoint.
 pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
-    let is_new =
-        |first_seen: Timestamp, patience: u64| first_seen.0.saturating_add(patience) > now.0;
+    let is_new = |first_seen: Timestamp, within: Duration| first_seen + within > now;
     let participants = discovery.participants();
     participants.values().any(|participant| {
         participant.proxy.shared_memory

@@ -7,19 +7,19 @@
 //! are subtracted.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use ros2probe_wire::record::Sample;
-use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{Record, SequenceNumber};
+use ros2probe_wire::{Record, SequenceNumber, Timestamp};
 
 use super::size::Size;
 
 /// Largest number of drops that wait for their arrival, more than the datagrams of a large sample.
 const LIMIT: usize = 4096;
-/// Largest difference in nanoseconds between the clock conversions of the two reports.
-const SLACK: u64 = 100_000;
+/// Largest difference between the clock conversions of the two reports.
+const SLACK: Duration = Duration::from_micros(100);
 /// Arrivals follow within this time, or their record was lost.
-const LIFETIME: u64 = 60 * SECOND;
+const LIFETIME: Duration = Duration::from_secs(60);
 
 /// Drops that wait for their arrival at one receiver.
 #[derive(Debug, Default)]
@@ -34,8 +34,8 @@ struct UndeliveredPart {
     /// Fragments from `start` to before `end`; 0 and 1 for an unfragmented sample.
     start: u32,
     end: u32,
-    first: u64,
-    last: u64,
+    first: Timestamp,
+    last: Timestamp,
 }
 
 impl Undelivered {
@@ -91,8 +91,8 @@ impl Undelivered {
         self.waiting.retain_mut(|each| {
             let is_meant = each.socket == record.socket
                 && each.number == sample.sequence_number()
-                && each.last.saturating_add(SLACK) >= begin
-                && each.first <= end.saturating_add(SLACK);
+                && each.last + SLACK >= begin
+                && each.first <= end + SLACK;
             if !is_meant {
                 return true;
             }
@@ -131,9 +131,9 @@ impl Undelivered {
     }
 
     /// Removes entries whose arrival did not follow.
-    pub fn expire(&mut self, now: u64) {
+    pub fn expire(&mut self, now: Timestamp) {
         while let Some(oldest) = self.waiting.front()
-            && oldest.last.saturating_add(LIFETIME) <= now
+            && oldest.last + LIFETIME <= now
         {
             self.waiting.pop_front();
         }
@@ -155,12 +155,13 @@ const fn range(sample: Sample<'_>) -> (u32, u32) {
 }
 
 /// Returns the times of its first and last datagram.
-fn span(record: &Record) -> (u64, u64) {
+fn span(record: &Record) -> (Timestamp, Timestamp) {
+    let end = Timestamp(record.time);
     let begin = match record.elapsed {
-        u32::MAX => 0,
-        elapsed => record.time.saturating_sub(elapsed.into()),
+        u32::MAX => Timestamp(0),
+        elapsed => end - Duration::from_nanos(elapsed.into()),
     };
-    (begin, record.time)
+    (begin, end)
 }
 
 fn take_out(parts: &[(u32, u32)], from: u32, to: u32) -> Vec<(u32, u32)> {
@@ -237,7 +238,7 @@ mod tests {
             ranges(&delivered(&mut undelivered, &later, &mut 0)),
             [(3, 4)]
         );
-        undelivered.expire(13 * MILLISECOND + LIFETIME);
+        undelivered.expire(Timestamp(13 * MILLISECOND) + LIFETIME);
         assert!(undelivered.is_empty());
     }
 

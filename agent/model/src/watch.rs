@@ -3,8 +3,10 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::DomainId;
+use ros2probe_wire::time::nanoseconds;
 use serde::{Deserialize, Serialize};
 
 use crate::glob;
@@ -40,6 +42,21 @@ pub enum Retain {
 /// Expectations of a topic; `None` expects nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Expectations {
+    /// Smallest rate, in messages per second.
+    pub min_rate_hz: Option<f64>,
+    /// Largest rate, in messages per second.
+    pub max_rate_hz: Option<f64>,
+    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
+    pub max_loss_ratio: Option<f64>,
+    /// Longest time from INFO_TS to the capture.
+    pub max_latency: Option<Duration>,
+    /// Longest time without a message.
+    pub max_silence: Option<Duration>,
+}
+
+/// Expectations in the units of the configuration and of the API.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ExpectationValues {
     /// Smallest rate, in messages per second.
     pub min_rate_hz: Option<f64>,
     /// Largest rate, in messages per second.
@@ -127,22 +144,47 @@ impl Expectations {
             ("min_rate_hz", self.min_rate_hz.is_some()),
             ("max_rate_hz", self.max_rate_hz.is_some()),
             ("max_loss_ratio", self.max_loss_ratio.is_some()),
-            ("max_latency_ms", self.max_latency_ms.is_some()),
-            ("max_silence_s", self.max_silence_s.is_some()),
+            ("max_latency_ms", self.max_latency.is_some()),
+            ("max_silence_s", self.max_silence.is_some()),
         ]
     }
 
-    /// Validates expectations that no schema has checked.
-    ///
-    /// # Errors
-    /// Returns a description of the first error.
-    pub fn check(&self) -> Result<(), String> {
+    /// Returns the values in the units of the configuration, exact to a nanosecond.
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "nanoseconds of a threshold stay exact to 104 days"
+    )]
+    pub fn values(&self) -> ExpectationValues {
+        let nanoseconds = |duration| nanoseconds(duration) as f64;
+        ExpectationValues {
+            min_rate_hz: self.min_rate_hz,
+            max_rate_hz: self.max_rate_hz,
+            max_loss_ratio: self.max_loss_ratio,
+            max_latency_ms: self.max_latency.map(|latency| nanoseconds(latency) / 1e6),
+            max_silence_s: self.max_silence.map(|silence| nanoseconds(silence) / 1e9),
+        }
+    }
+}
+
+impl TryFrom<ExpectationValues> for Expectations {
+    type Error = String;
+
+    /// Validates the values. Fails with a description of the first value out of its range.
+    fn try_from(values: ExpectationValues) -> Result<Self, String> {
+        let ExpectationValues {
+            min_rate_hz,
+            max_rate_hz,
+            max_loss_ratio,
+            max_latency_ms,
+            max_silence_s,
+        } = values;
         let values = [
-            self.min_rate_hz,
-            self.max_rate_hz,
-            self.max_loss_ratio,
-            self.max_latency_ms,
-            self.max_silence_s,
+            min_rate_hz,
+            max_rate_hz,
+            max_loss_ratio,
+            max_latency_ms,
+            max_silence_s,
         ];
         for ((key, low, high), value) in RANGES.into_iter().zip(values) {
             if let Some(value) = value.filter(|value| !(low..=high).contains(value)) {
@@ -151,12 +193,20 @@ impl Expectations {
                 ));
             }
         }
-        match (self.min_rate_hz, self.max_rate_hz) {
-            (Some(low), Some(high)) if low > high => Err(format!(
+        if let (Some(low), Some(high)) = (min_rate_hz, max_rate_hz)
+            && low > high
+        {
+            return Err(format!(
                 "max_rate_hz is {high}, below min_rate_hz, which is {low}"
-            )),
-            _ => Ok(()),
+            ));
         }
+        Ok(Self {
+            min_rate_hz,
+            max_rate_hz,
+            max_loss_ratio,
+            max_latency: max_latency_ms.map(|value| Duration::from_secs_f64(value / 1e3)),
+            max_silence: max_silence_s.map(Duration::from_secs_f64),
+        })
     }
 }
 
@@ -450,6 +500,27 @@ mod tests {
         }
         for pattern in ["/points", "/**", "/*", "/_hidden", "/a/**/b", "/cam*/raw"] {
             assert_eq!(check_pattern(pattern), Ok(()), "{pattern}");
+        }
+    }
+
+    #[test]
+    fn thresholds_keep_their_values_in_every_unit() {
+        for (max_latency_ms, max_silence_s) in
+            [(50.0, 1.0), (0.1, 2.3), (7.7, 604_800.0), (0.0, 0.001)]
+        {
+            let values = ExpectationValues {
+                max_latency_ms: Some(max_latency_ms),
+                max_silence_s: Some(max_silence_s),
+                ..ExpectationValues::default()
+            };
+            assert_eq!(Expectations::try_from(values).unwrap().values(), values);
+        }
+        for wrong in [-0.1, f64::NAN, f64::INFINITY, 3_600_000.1] {
+            let values = ExpectationValues {
+                max_latency_ms: Some(wrong),
+                ..ExpectationValues::default()
+            };
+            assert!(Expectations::try_from(values).is_err(), "{wrong}");
         }
     }
 }

@@ -7,8 +7,9 @@
 mod latency;
 mod sampled_view;
 
+use std::time::Duration;
+
 use ros2probe_wire::record::{AckNack, Body, Sample, flag};
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, RtpsTime, SequenceNumber, Timestamp};
 
 use super::dispatch::MissedReason;
@@ -26,15 +27,15 @@ use super::size::Size;
 use super::wall_clock::WallClock;
 
 /// Time in which reordering may fill a gap of a best-effort writer.
-pub const BEST_EFFORT_WINDOW: u64 = SECOND;
+pub const BEST_EFFORT_WINDOW: Duration = Duration::from_secs(1);
 /// Time in which a reliable writer may retransmit: three HEARTBEAT periods of Fast DDS.
-pub const RELIABLE_WINDOW: u64 = 10 * SECOND;
+pub const RELIABLE_WINDOW: Duration = Duration::from_secs(10);
 /// A first sample older than this is history that a late joiner requested.
-const HISTORY: u64 = 10 * SECOND;
+const HISTORY: Duration = Duration::from_secs(10);
 
 /// A uprobe's view of a writer stays exact for this long after its last record: samples read from
 /// shared memory in that time were seen already.
-const EXACT_FOR: u64 = 10 * SECOND;
+const EXACT_FOR: Duration = Duration::from_secs(10);
 
 /// Properties of the writer from discovery; all false if it is unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -443,7 +444,7 @@ impl Writer {
             Outcome::Duplicate => {
                 self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
             }
-            Outcome::Whole(whole) if whole.is_message => {
+            Outcome::Complete(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);
                 let wall_clock = context.wall_clock.wall_time(now);
                 let (source, stamp) = (whole.source, whole.stamp);
@@ -466,7 +467,7 @@ impl Writer {
                     unconfirmed: whole.unconfirmed,
                 });
             }
-            Outcome::Whole(_) => {}
+            Outcome::Complete(_) => {}
         }
         None
     }
@@ -480,7 +481,7 @@ impl Writer {
 
     fn is_exact(&self, now: Timestamp) -> bool {
         let last = self.exact;
-        last.is_some_and(|last| last.0.saturating_add(EXACT_FOR) > now.0)
+        last.is_some_and(|last| last + EXACT_FOR > now)
     }
 
     fn count(&mut self, now: Timestamp, bytes: u64, recovered: bool) {
@@ -500,7 +501,7 @@ impl Writer {
 
 /// Returns the time in which a gap may fill, for a writer that is `reliable` or not.
 #[must_use]
-pub const fn settle_window(reliable: bool) -> u64 {
+pub const fn settle_window(reliable: bool) -> Duration {
     if reliable {
         RELIABLE_WINDOW
     } else {

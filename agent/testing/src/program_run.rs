@@ -20,7 +20,7 @@ use ros2probe_wire::{Guid, Timestamp};
 pub const INTERFACE: u32 = 1;
 
 /// Result for one frame.
-pub struct Seen {
+pub struct FrameResult {
     /// Whether user space receives it.
     pub kept: bool,
     /// Valid records.
@@ -28,7 +28,7 @@ pub struct Seen {
 }
 
 /// Result for one datagram at a socket.
-pub struct SeenAtSocket {
+pub struct SocketResult {
     /// Its first piece and all its bytes, if it is captured.
     pub captured: Option<(Piece, Vec<u8>)>,
     /// Its records, including those held back for more fragments.
@@ -115,7 +115,7 @@ impl Kernel {
     }
 
     /// Runs the program on one IP packet.
-    pub fn frame(&mut self, packet: &[u8]) -> Seen {
+    pub fn frame(&mut self, packet: &[u8]) -> FrameResult {
         let (kept, _) = self.run(packet, 1);
         let kept = kept != 0;
         self.now += 1;
@@ -147,11 +147,11 @@ impl Kernel {
                 }
             }
         }
-        Seen { kept, records }
+        FrameResult { kept, records }
     }
 
     /// Runs a program of the host hook on one datagram in one IP packet.
-    pub fn datagram(&mut self, packet: &[u8]) -> SeenAtSocket {
+    pub fn datagram(&mut self, packet: &[u8]) -> SocketResult {
         let (verdict, _) = self.run(packet, 1);
         assert_eq!(verdict, 1, "a datagram was dropped: {packet:02x?}");
         let mut captured: Option<(Piece, Vec<u8>)> = None;
@@ -164,7 +164,7 @@ impl Kernel {
         }
         let mut records: Vec<_> = std::iter::from_fn(|| self.filter.next_record()).collect();
         records.extend(self.take_stalled());
-        SeenAtSocket { captured, records }
+        SocketResult { captured, records }
     }
 
     pub fn counter(&self, which: Counter) -> u64 {

@@ -46,7 +46,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             process: process(),
             first_seen: Timestamp(1),
             last_seen: Timestamp(2),
-            lease: ros2probe_wire::Duration::Finite(20_000_000_000),
+            lease: ros2probe_wire::RtpsDuration::Finite(Duration::from_secs(20)),
             secured: false,
             restored: false,
             addresses: Addresses::default(),

@@ -3,6 +3,7 @@
 use alloc::boxed::Box;
 use alloc::string::String;
 use alloc::vec::Vec;
+use core::time::Duration;
 
 use super::{UserData, guid, push_locator, vendor};
 use crate::cursor::{Cursor, Endianness, Reason, WireError};
@@ -12,10 +13,10 @@ use crate::parameters::{ParameterId, ParameterList};
 use crate::qos;
 use crate::rtps::{Locator, ProtocolVersion, VendorId};
 use crate::text;
-use crate::time::Duration;
+use crate::time::RtpsDuration;
 
 /// Lease of a participant that announces none (RTPS 2.5, 9.6.2.2.1).
-const DEFAULT_LEASE: Duration = Duration::Finite(100_000_000_000);
+const DEFAULT_LEASE: RtpsDuration = RtpsDuration::Finite(Duration::from_secs(100));
 /// Most properties kept per participant, and the longest name or value of one.
 const MAX_PROPERTIES: usize = 32;
 const MAX_PROPERTY_LEN: usize = 256;
@@ -45,7 +46,7 @@ pub struct ParticipantAnnouncement {
     /// The protocol version it speaks; zero if not announced.
     pub protocol_version: ProtocolVersion,
     /// Time without a message after which the participant is gone.
-    pub lease: Duration,
+    pub lease: RtpsDuration,
     /// Its domain; `None` from Fast DDS 2.x, where the port implies it.
     pub domain_id: Option<DomainId>,
     /// Its domain's tag; empty is the default.

@@ -11,7 +11,9 @@ use crate::names::MAX_LEN;
 use crate::qos::{Durability, HistoryKind, Liveliness, Qos, Reliability};
 use crate::rtps::ProtocolVersion;
 use crate::testing::{self, Encoder, hurt};
-use crate::time::Duration;
+use core::time::Duration;
+
+use crate::time::RtpsDuration;
 
 const PREFIX: GuidPrefix = GuidPrefix([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12]);
 const NO_INLINE_QOS: InlineQos = InlineQos {
@@ -97,7 +99,10 @@ fn a_participant_as_cyclone_dds_announces_it() {
         participant.protocol_version,
         ProtocolVersion { major: 2, minor: 1 }
     );
-    assert_eq!(participant.lease, Duration::Finite(10_000_000_000));
+    assert_eq!(
+        participant.lease,
+        RtpsDuration::Finite(Duration::from_secs(10))
+    );
     assert_eq!(participant.domain_id, Some(DomainId(0)));
     assert_eq!(participant.enclave.as_deref(), Some("/"));
     assert!(participant.is_ros() && !participant.is_secured && !participant.is_truncated);
@@ -131,7 +136,10 @@ fn a_participant_as_fast_dds_announces_it() {
         "010f0d043f4752ad00000000.000001c1"
     );
     assert_eq!(participant.vendor, VendorId::EPROSIMA);
-    assert_eq!(participant.lease, Duration::Finite(20_000_000_000));
+    assert_eq!(
+        participant.lease,
+        RtpsDuration::Finite(Duration::from_secs(20))
+    );
     assert_eq!(participant.domain_id, None);
     assert_eq!(participant.entity_name, "/");
     // The NUL that Fast DDS counts into the user data is not part of the enclave.
@@ -167,7 +175,7 @@ fn endpoints_as_fast_dds_announces_them() {
     );
     assert_eq!(writer.qos.reliability, Reliability::RELIABLE);
     assert_eq!(writer.qos.durability, Durability::TRANSIENT_LOCAL);
-    assert_eq!(writer.qos.deadline, Duration::Infinite);
+    assert_eq!(writer.qos.deadline, RtpsDuration::Infinite);
     assert_eq!(writer.qos.liveliness, Liveliness::AUTOMATIC);
     // Neither announced nor set to a default.
     assert_eq!(writer.qos.history, None);
@@ -201,7 +209,10 @@ fn endpoints_as_cyclone_dds_announces_them() {
     assert_eq!(reader.qos.history.unwrap().kind, HistoryKind::KEEP_ALL);
     assert_eq!(rosout.topic.as_str(), "rt/rosout");
     assert_eq!(rosout.qos.history.unwrap().depth, 1000);
-    assert_eq!(rosout.qos.lifespan, Duration::Finite(10_000_000_000));
+    assert_eq!(
+        rosout.qos.lifespan,
+        RtpsDuration::Finite(Duration::from_secs(10))
+    );
     let readers = captured_endpoints(testing::CYCLONE_SEDP_READERS);
     assert_eq!(readers.len(), 5);
 }
@@ -214,7 +225,10 @@ fn what_rustdds_announces() {
         "0112fa8840171addfe777b8f.000001c1"
     );
     assert_eq!(participant.vendor, VendorId::RUSTDDS);
-    assert_eq!(participant.lease, Duration::Finite(50_000_000_000));
+    assert_eq!(
+        participant.lease,
+        RtpsDuration::Finite(Duration::from_secs(50))
+    );
     // A ROS participant that announces neither its enclave nor its domain.
     assert!(!participant.is_ros() && participant.domain_id.is_none());
     let [writer, events, _] = captured_endpoints(testing::RUSTDDS_SEDP)
@@ -351,7 +365,10 @@ fn identity_is_never_made_up() {
 #[test]
 fn what_is_not_announced_has_the_specifications_default() {
     let participant = announced(&participant_list().bytes).unwrap();
-    assert_eq!(participant.lease, Duration::Finite(100_000_000_000));
+    assert_eq!(
+        participant.lease,
+        RtpsDuration::Finite(Duration::from_secs(100))
+    );
     assert_eq!(
         (participant.domain_id, participant.domain_tag.as_str()),
         (None, "")
@@ -405,7 +422,7 @@ fn security_filters_and_domain_tags_are_noticed() {
     assert!(endpoint.content_filter && endpoint.is_secured);
     assert_eq!(
         endpoint.qos.minimum_separation,
-        Duration::Finite(1_000_000_000)
+        RtpsDuration::Finite(Duration::from_secs(1))
     );
 }
 
@@ -556,7 +573,7 @@ proptest! {
         prop_assert_eq!(endpoint.qos.reliability, Reliability(expected));
         prop_assert_eq!(endpoint.qos.durability, Durability(durability));
         prop_assert_eq!(endpoint.qos.history.unwrap().depth, depth);
-        prop_assert_eq!(endpoint.qos.lifespan, Duration::from_wire(lifespan.0, lifespan.1));
+        prop_assert_eq!(endpoint.qos.lifespan, RtpsDuration::from_wire(lifespan.0, lifespan.1));
         let ours: Vec<_> = endpoint.qos.partitions.iter().map(ToString::to_string).collect();
         prop_assert_eq!(ours, partitions);
     }

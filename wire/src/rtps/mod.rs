@@ -102,6 +102,8 @@ impl SequenceNumber {
     pub const UNKNOWN: Self = Self(u64::MAX << 32);
     /// The number before the first; no change has it.
     pub const ZERO: Self = Self(0);
+    /// The number of a writer's first change.
+    pub const FIRST: Self = Self(1);
     /// The largest number that a change can have.
     pub const MAX: Self = Self(u64::MAX >> 1);
 
@@ -152,6 +154,13 @@ impl SequenceNumber {
     #[must_use]
     pub const fn steps_since(self, other: Self) -> u64 {
         self.0.saturating_sub(other.0)
+    }
+
+    /// Returns how far apart the numbers are, whichever is higher.
+    #[inline]
+    #[must_use]
+    pub const fn distance(self, other: Self) -> u64 {
+        self.0.abs_diff(other.0)
     }
 
     /// Iterates over the numbers from this one to before `end`.

@@ -27,7 +27,7 @@ const MAX_LISTED: usize = 65_536;
 const COARSE: Duration = Duration::from_secs(1);
 /// Number of rounds in which a new process may still be mounting directories; afterwards it is
 /// inspected only once per so many rounds.
-const YOUNG: u32 = 10;
+const MOUNTING_ROUNDS: u32 = 10;
 const ROUNDS: u32 = 32;
 /// Levels of cgroups and processes of a scope that are visited.
 const DEPTH: usize = 8;
@@ -207,7 +207,7 @@ impl ShmDirectories {
         let before = std::mem::take(&mut self.processes);
         for pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
-            let is_settled = met > YOUNG && met % ROUNDS != pid % ROUNDS;
+            let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // Its path may lead through another process, which may have ended.
                 Some(directory) if is_settled && (directory.seen || directory.path.exists()) => {

@@ -11,7 +11,7 @@ use crate::bell::Bell;
 const MAX_RECORDS: usize = 16_384;
 const MAX_BYTES: usize = 16 << 20;
 /// Bytes from which the worker is woken: a camera fills them in a fifth of a second.
-const MUCH: usize = 1 << 20;
+const WAKE_BYTES: usize = 1 << 20;
 
 /// One item of the queue.
 #[derive(Debug)]
@@ -69,13 +69,13 @@ impl Inbox {
             return;
         }
         let waiting = &mut *self.waiting();
-        let had_much = waiting.bytes >= MUCH;
+        let was_woken = waiting.bytes >= WAKE_BYTES;
         for item in found.drain(..) {
             waiting.put(item);
         }
         if let Some(bell) = self.bell.as_ref()
-            && !had_much
-            && waiting.bytes >= MUCH
+            && !was_woken
+            && waiting.bytes >= WAKE_BYTES
         {
             bell.ring();
         }
@@ -85,7 +85,7 @@ impl Inbox {
     #[must_use]
     pub fn take(&self) -> Vec<Item> {
         let waiting = &mut *self.waiting();
-        if let Some(bell) = self.bell.as_ref().filter(|_| waiting.bytes >= MUCH) {
+        if let Some(bell) = self.bell.as_ref().filter(|_| waiting.bytes >= WAKE_BYTES) {
             bell.silence();
         }
         waiting.bytes = 0;
@@ -192,11 +192,11 @@ mod tests {
             wait(&[listener], Duration::ZERO).unwrap() == Some(0)
         };
         for _ in 0..2 {
-            inbox.put(&mut vec![message(MUCH - 1)]);
+            inbox.put(&mut vec![message(WAKE_BYTES - 1)]);
             assert!(!rings());
             inbox.put(&mut vec![message(1), message(1)]);
             assert!(rings());
-            inbox.put(&mut vec![message(MUCH)]);
+            inbox.put(&mut vec![message(WAKE_BYTES)]);
             assert_eq!(inbox.take().len(), 4);
             assert!(!rings());
         }

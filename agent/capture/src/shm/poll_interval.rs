@@ -26,15 +26,15 @@ const MEETING: f64 = 10e-6;
 /// Time of busy polling after each message: messages arrive in bursts.
 const BURSTS: f64 = 200e-6;
 /// Duration of close polling after a participant creates its files, and after each announcement.
-const NEWCOMER: f64 = 0.3;
-const NEWS: f64 = 0.1;
+const PARTICIPANT_WATCH: f64 = 0.3;
+const ANNOUNCEMENT_WATCH: f64 = 0.1;
 /// CPU credit for close polling: its maximum, and its growth per second.
 const CREDIT: f64 = 10.0;
 const CREDIT_PER_SECOND: f64 = 0.01;
 /// Longest sleep while every message is needed. In a burst a sender reuses its buffers after some
 /// 100 us, and its reader is faster than that.
 const EVERY: f64 = 50e-6;
-const SOON: f64 = 20e-6;
+const EARLY_WAKE: f64 = 20e-6;
 /// CPU time that may be saved for that, so that a short recording is complete, and overdrawn.
 const SAVINGS: f64 = 5.0;
 const OVERDRAFT: f64 = 0.25;
@@ -122,12 +122,12 @@ impl PollInterval {
 
     /// Starts close polling for a moment, within the credit: a participant is starting.
     pub fn newcomer(&mut self, now: f64) {
-        self.watch_closely(now + NEWCOMER);
+        self.watch_closely(now + PARTICIPANT_WATCH);
     }
 
     /// Extends close polling: an announcement was read, and more may follow.
     pub fn news(&mut self, now: f64) {
-        self.watch_closely(now + NEWS);
+        self.watch_closely(now + ANNOUNCEMENT_WATCH);
     }
 
     /// Returns whether it polls closely because a participant is starting.
@@ -206,7 +206,11 @@ impl PollInterval {
             let slower = EVERY * self.stretch.max(SLOWER);
             return Duration::from_secs_f64(slower.min(LONGEST));
         }
-        Duration::from_secs_f64(if now < self.awake_until { SOON } else { EVERY })
+        Duration::from_secs_f64(if now < self.awake_until {
+            EARLY_WAKE
+        } else {
+            EVERY
+        })
     }
 
     fn watch_closely(&mut self, until: f64) {

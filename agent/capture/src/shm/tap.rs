@@ -27,8 +27,8 @@ use recent_messages::{Identity, RecentMessages};
 const MAX_PORTS: usize = 512;
 const MAX_SEGMENTS: usize = 512;
 /// Most messages read per poll; the rest of a flood is read in the next.
-const PER_LOOK: usize = 2048;
-const PER_LOOK_IN_A_HURRY: usize = 64;
+const MAX_PER_POLL: usize = 2048;
+const MAX_PER_URGENT_POLL: usize = 64;
 /// Silence after which a port is polled less often, and that interval.
 const SILENT_AFTER: u64 = 2_000_000_000;
 const SILENT_EVERY: u64 = 10_000_000;
@@ -39,7 +39,7 @@ const LIST_EVERY: u64 = 100_000_000;
 /// Interval of polling a port that is not initialized yet.
 const TRY_EVERY: u64 = 1_000_000;
 const FIND_EVERY: u64 = 1_000_000_000;
-const FIND_IN_A_HURRY: u64 = 10_000_000_000;
+const URGENT_FIND_EVERY: u64 = 10_000_000_000;
 
 /// The open files and the read positions.
 pub struct Tap {
@@ -251,9 +251,9 @@ impl Tap {
             self.spend(thread_cpu().saturating_sub(before));
         }
         let most = if self.is_hurried {
-            PER_LOOK_IN_A_HURRY
+            MAX_PER_URGENT_POLL
         } else {
-            PER_LOOK
+            MAX_PER_POLL
         };
         let mut announced = 0;
         let ports = self.ports.len();
@@ -432,7 +432,7 @@ impl Tap {
     /// Opens new files and closes those that are gone or were replaced.
     fn scan(&mut self, now: u64, found: &mut Vec<Item>) {
         let every = if self.is_hurried {
-            FIND_IN_A_HURRY
+            URGENT_FIND_EVERY
         } else {
             FIND_EVERY
         };

@@ -23,7 +23,7 @@ const LOCKS: &str = "/proc/locks";
 const MAX_TEXT: u64 = 4 << 20;
 /// Number of rounds in which a new process may still be loading libraries; afterwards it is
 /// inspected only once per so many rounds.
-const YOUNG: u32 = 10;
+const LOADING_ROUNDS: u32 = 10;
 const ROUNDS: u32 = 32;
 
 /// Device and inode of a library's file, as in the processes' maps.
@@ -144,7 +144,7 @@ impl Processes {
         for pid in self.scope.processes() {
             let known = before.remove(&pid);
             let met = known.as_ref().map_or(0, |known| known.met);
-            let is_asked = met <= YOUNG
+            let is_asked = met <= LOADING_ROUNDS
                 || met % ROUNDS == pid % ROUNDS
                 || all
                     && known

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
-use ros2probe_testing::program_run::{self, Hook, Kernel, Seen};
+use ros2probe_testing::program_run::{self, FrameResult, Hook, Kernel};
 use ros2probe_wire::filter::Counter;
 use ros2probe_wire::frame::{self, Link, PacketType, Payload};
 use ros2probe_wire::record::{Record, Verdict, flag, guid_words, kind};

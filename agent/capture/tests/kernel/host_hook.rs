@@ -347,7 +347,7 @@ fn a_full_ring_costs_captures_and_nothing_else() -> Result<()> {
         .count();
     assert_eq!(whole, 17, "as many as a ring of a megabyte holds");
     let attempts = observed.counter(Counter::Captured)?;
-    assert_eq!(attempts, whole as u64 + lost, "each is told");
+    assert_eq!(attempts, whole as u64 + lost, "each is reported");
     Ok(())
 }
 
@@ -406,12 +406,12 @@ fn a_socket_in_use_is_remembered_while_more_than_there_is_room_for_come_and_go()
         );
         forgotten(&observed);
     }
-    let told = forgotten(&observed) as usize;
-    println!("{told} of {met} forgotten");
+    let reported = forgotten(&observed) as usize;
+    println!("{reported} of {met} forgotten");
     let room = SOCKET_CAPACITY as usize;
     assert!(
-        (met - room..=met - room * 3 / 4).contains(&told),
-        "{told} of {met}"
+        (met - room..=met - room * 3 / 4).contains(&reported),
+        "{reported} of {met}"
     );
     let deadline = Instant::now() + Duration::from_secs(5);
     while observed.filter.socket(cookie(&used))?.is_none() {

@@ -221,7 +221,7 @@ fn limits(health: &Health) -> Vec<Finding> {
 fn evictions(health: &Health) -> Vec<Finding> {
     let is_told = |table: &str| {
         let limit = limit(table);
-        limit.is_some_and(|key| health.limits.iter().any(|told| told.limit == key))
+        limit.is_some_and(|key| health.limits.iter().any(|known| known.limit == key))
     };
     let full = health.tables.iter().filter(|table| table.evictions > 0);
     let full = full.filter(|table| !is_told(&table.table));

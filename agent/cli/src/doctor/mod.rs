@@ -148,12 +148,12 @@ mod tests {
     fn without_files_and_privileges_each_line_is_still_printed_once_in_order() {
         let (_directory, host) = host(&[]);
         let report = examine(&host, &configured(), &Reach::Nobody("no agent".to_owned()));
-        let told = areas(&report);
-        let mut once = told.clone();
+        let listed = areas(&report);
+        let mut once = listed.clone();
         once.sort();
         once.dedup();
-        assert_eq!(told, once);
-        assert!(!told.contains(&Area::Graph));
+        assert_eq!(listed, once);
+        assert!(!listed.contains(&Area::Graph));
         assert!(
             report
                 .findings

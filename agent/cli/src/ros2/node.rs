@@ -102,10 +102,11 @@ mod tests {
     #[test]
     fn a_list_keeps_doubles_and_warns_of_them() {
         let nodes = names(&[("/_ros2cli_1", 1), ("/_robot/lidar", 1), ("/talker", 2)]);
-        let told = list(&nodes, false, false);
-        assert_eq!(told.text, "/_robot/lidar\n/talker\n/talker\n");
+        let printed = list(&nodes, false, false);
+        assert_eq!(printed.text, "/_robot/lidar\n/talker\n/talker\n");
         assert!(
-            told.warning
+            printed
+                .warning
                 .unwrap()
                 .starts_with("WARNING: Be aware that there are nodes")
         );
@@ -140,17 +141,18 @@ mod tests {
     #[test]
     fn an_empty_section_is_one_empty_line_and_hidden_names_are_left_out() {
         let talker = node("/talker", 1);
-        let told = info("/talker", Some(&talker), false).unwrap();
+        let printed = info("/talker", Some(&talker), false).unwrap();
         assert_eq!(
-            told.text,
+            printed.text,
             "/talker\n  Subscribers:\n\n  Publishers:\n    /rosout: rcl_interfaces/msg/Log\n  \
              Service Servers:\n\n  Service Clients:\n\n  Action Servers:\n    /fib: a/action/Fib\n  \
              Action Clients:\n\n"
         );
-        assert_eq!(told.warning, None);
-        let told = info("/talker", Some(&talker), true).unwrap();
+        assert_eq!(printed.warning, None);
+        let printed = info("/talker", Some(&talker), true).unwrap();
         assert!(
-            told.text
+            printed
+                .text
                 .contains("    /fib/_action/send_goal: a/action/Fib_SendGoal\n")
         );
     }

@@ -233,11 +233,11 @@ impl App {
     /// Age of the topic list. `None` before the first.
     #[must_use]
     pub fn age(&self, now: Instant) -> Option<Duration> {
-        let told = now.saturating_duration_since(self.updated?);
+        let age = now.saturating_duration_since(self.updated?);
         let health = self.health.as_ref();
         let before = health.and_then(|(health, _)| health.age_seconds);
         let before = before.filter(|age| (0.0..1e9).contains(age));
-        Some(told + Duration::from_secs_f64(before.unwrap_or_default()))
+        Some(age + Duration::from_secs_f64(before.unwrap_or_default()))
     }
 
     /// Processes a fact from the agent.

@@ -278,13 +278,13 @@ fn a_bag_recorded_from_a_replay_reads_back() {
         assert!(recorded.status.success(), "{}", text(&recorded.stderr));
         bag
     });
-    let told = bags.each_ref().map(|bag| {
+    let reported = bags.each_ref().map(|bag| {
         let info = both(&["bag", "info", bag]);
         assert!(info.status.success(), "{}", text(&info.stderr));
         text(&info.stdout).replace(bag, "")
     });
     assert_eq!(messages(&bags[1]), messages(&bags[0]));
-    assert!(told[0].contains("/chatter"), "{}", told[0]);
+    assert!(reported[0].contains("/chatter"), "{}", reported[0]);
 }
 
 /// Topic, times and bytes of a bag's messages, as the `mcap` crate reads them.

@@ -144,8 +144,11 @@ fn a_recreated_cgroup_is_seen_again_and_reported_while_it_is_missing() -> Result
                 &elsewhere,
                 "http://127.0.0.1:17401/events?after=0&follow=false",
             )?;
-            let told = events.matches(what).count();
-            ensure!(told == round, "{told} of {round} {what} in {events}");
+            let reported = events.matches(what).count();
+            ensure!(
+                reported == round,
+                "{reported} of {round} {what} in {events}"
+            );
             Ok(())
         })
     };
@@ -198,8 +201,8 @@ fn a_briefly_missing_cgroup_is_reported_and_seen_again() -> Result<()> {
         eventually(|| {
             let page = agent.scrape()?;
             for name in ["ros2probe.capture.blind", "ros2probe.capture.seeing"] {
-                let told = page.sum("ros2probe_events_total", &[("name", name)]);
-                ensure!(told == f64::from(round), "{told} of {round} {name}");
+                let reported = page.sum("ros2probe_events_total", &[("name", name)]);
+                ensure!(reported == f64::from(round), "{reported} of {round} {name}");
             }
             Ok(())
         })?;

@@ -100,14 +100,14 @@ fn a_receiver_gets_events_of_new_nodes_losses_and_silence() -> Result<()> {
         changed.attributes.get("from").is_some_and(|it| it == "ok"),
         "{changed:?}"
     );
-    let told = || -> f64 {
+    let reported = || -> f64 {
         let losses = records(&receiver, "ros2.message.lost").into_iter();
         let counts = losses.filter_map(|loss| loss.attributes.get("count")?.parse::<f64>().ok());
         counts.sum()
     };
-    agent.scrape_until("what was told", |page| {
+    agent.scrape_until("what was reported", |page| {
         let lost = page.sum("ros2_topic_lost_messages_total", &[("topic", "/imu")]);
-        lost > 0.0 && (lost - told()).abs() < 0.5
+        lost > 0.0 && (lost - reported()).abs() < 0.5
     })?;
 
     monitor.terminate()?;

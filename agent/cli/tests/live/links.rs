@@ -285,11 +285,11 @@ fn a_network_namespace_is_reported_while_its_path_is_missing() -> Result<()> {
     let words = ["-c", "echo inside && exec sleep 1000"];
     let mut keeper = Process::start(&link.robot.on_network(), "sh", words)?;
     keeper.wait_for("inside", Duration::from_secs(60))?;
-    let told = |name: &str, times: u32| {
+    let reported = |name: &str, times: u32| {
         wait_until(name, || {
             let page = observed.agent.scrape()?;
-            let told = page.sum("ros2probe_events_total", &[("name", name)]);
-            Ok(told == f64::from(times))
+            let reported = page.sum("ros2probe_events_total", &[("name", name)]);
+            Ok(reported == f64::from(times))
         })
     };
     for round in 1..=2 {
@@ -298,14 +298,14 @@ fn a_network_namespace_is_reported_while_its_path_is_missing() -> Result<()> {
         let page = observed.agent.scrape()?;
         assert_eq!(page.value("ros2probe_ready", &[]), Some(0.0));
         // The agent checks for events once a second: it does not report a shorter blindness.
-        told("ros2probe.capture.blind", round)?;
+        reported("ros2probe.capture.blind", round)?;
         run(&format!(
             "mount --bind /proc/{}/ns/net {place}",
             keeper.pid()
         ))?;
         wait_until("seen again", || Ok(is_ready()))?;
-        told("ros2probe.capture.blind", round)?;
-        told("ros2probe.capture.seeing", round)?;
+        reported("ros2probe.capture.blind", round)?;
+        reported("ros2probe.capture.seeing", round)?;
     }
     let mut sender = Sender::new(&link.robot, "127.0.0.1:0", "127.0.0.1:7400")?;
     observed.counts_each_sample_once("/inside", &mut sender)

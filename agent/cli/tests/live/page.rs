@@ -64,17 +64,17 @@ fn the_stream_shows_a_robot_as_it_runs() -> Result<()> {
 }
 
 /// Returns the name of the topic with messages of type Imu.
-fn the_stream_separates_structure_and_figures(told: &[Value]) -> Result<String> {
-    let first = told.first().context("no line")?;
+fn the_stream_separates_structure_and_figures(reported: &[Value]) -> Result<String> {
+    let first = reported.first().context("no line")?;
     ensure!(first["open"]["source"] == "host", "{first}");
-    let batches = told.iter().filter(|line| line.get("values").is_some());
+    let batches = reported.iter().filter(|line| line.get("values").is_some());
     let batches: Vec<&Value> = batches.map(|line| &line["values"]).collect();
     ensure!(
         (2..=7).contains(&batches.len()),
         "{} batches in 5 s",
         batches.len()
     );
-    let graphs: Vec<_> = told
+    let graphs: Vec<_> = reported
         .iter()
         .filter(|line| line.get("graph").is_some())
         .collect();
@@ -144,15 +144,18 @@ fn processes_are_listed(host: &Namespace, robots: &[Process]) -> Result<()> {
 fn messages_are_decoded(host: &Namespace, topic: &str) -> Result<()> {
     let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
     // On a busy machine the robot itself may send nothing for seconds.
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     harness::wait_until("a stream with a message", || {
-        told = lines(host, &path, 3)?;
-        Ok(told.iter().any(|line| line.get("message").is_some()))
+        reported = lines(host, &path, 3)?;
+        Ok(reported.iter().any(|line| line.get("message").is_some()))
     })?;
-    let known = told.iter().find(|line| line.get("type").is_some());
-    let known = known.with_context(|| format!("{told:?}"))?;
+    let known = reported.iter().find(|line| line.get("type").is_some());
+    let known = known.with_context(|| format!("{reported:?}"))?;
     ensure!(known["type"]["known"] == true, "{known}");
-    let messages: Vec<_> = told.iter().filter_map(|line| line.get("message")).collect();
+    let messages: Vec<_> = reported
+        .iter()
+        .filter_map(|line| line.get("message"))
+        .collect();
     ensure!(
         (1..=16).contains(&messages.len()),
         "{} messages in 3 s",
@@ -191,12 +194,12 @@ impl Demo {
             .stdout(Stdio::piped())
             .spawn()?;
         let output = BufReader::new(child.stdout.take().context("no output")?);
-        let (told, lines) = std::sync::mpsc::channel();
+        let (reported, lines) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
             output
                 .lines()
                 .map_while(Result::ok)
-                .all(|line| told.send(line).is_ok())
+                .all(|line| reported.send(line).is_ok())
         });
         Ok(Self { child, lines })
     }

@@ -370,14 +370,14 @@ fn a_storage_that_takes_no_more_ends_a_recording_in_order() -> Result<()> {
         Ok(now["state"] == "ended")
     })?;
     let (_, ended) = robot.ask("DELETE", "/recordings/full", &Value::Null)?;
-    let told = ended["error"].as_str().unwrap_or_default();
-    ensure!(told.starts_with("no space left to write "), "{ended:#}");
+    let reported = ended["error"].as_str().unwrap_or_default();
+    ensure!(reported.starts_with("no space left to write "), "{ended:#}");
     let events = robot.events("ros2probe.recording.ended")?;
     let reasons: Vec<_> = events
         .iter()
         .map(|event| &event["attributes"]["reason"])
         .collect();
-    ensure!(reasons == [told], "{events:?}");
+    ensure!(reasons == [reported], "{events:?}");
     // Files of its disk are reached through the process.
     let root = format!("/proc/{}/root", robot.agent.process.pid());
     let bag = robot.bags().join("full");

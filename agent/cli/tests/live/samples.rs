@@ -347,8 +347,8 @@ fn readers_that_stop_or_die_delay_no_other() -> Result<()> {
     }
     open_are(9.0)?;
     let missed = [("reason", "queue_full")];
-    let told = |page: &Scrape| page.sum("ros2probe_missed_messages_total", &missed) > 20.0;
-    let page = observed.agent.scrape_until("told", told)?;
+    let reported = |page: &Scrape| page.sum("ros2probe_missed_messages_total", &missed) > 20.0;
+    let page = observed.agent.scrape_until("reported", reported)?;
     let label = [("topic", "/points")];
     ensure!(
         page.sum("ros2_topic_messages_total", &label) == 160.0,

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_daemon::config::Expectations;
+use ros2probe_daemon::config::watch::ExpectationValues;
 use ros2probe_testing::local_agent::{self, Answer, LocalAgent, PATIENCE, capture, exchange};
 use serde_json::Value;
 

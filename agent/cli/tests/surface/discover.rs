@@ -267,7 +267,7 @@ fn participants_with_dds_security_or_without_an_address_are_not_contacted() {
         process: ProcessFacts::default(),
         first_seen: Timestamp(1),
         last_seen: Timestamp(1),
-        lease: ros2probe_wire::Duration::Infinite,
+        lease: ros2probe_wire::RtpsDuration::Infinite,
         secured,
         restored: false,
         addresses: Addresses {

@@ -148,9 +148,9 @@ fn events_of_a_robot_are_in_order_and_filtered_by_name_and_topic() {
     let page = agent.get("/metrics").body;
     for (name, count) in &counts {
         let series = format!("ros2probe_events_total{{name=\"{name}\"}}");
-        let told = local_agent::metric(&page, &series);
+        let reported = local_agent::metric(&page, &series);
         assert_eq!(
-            told,
+            reported,
             Some(f64::from(u32::try_from(*count).unwrap())),
             "{name}"
         );
@@ -171,11 +171,11 @@ fn events_of_a_robot_are_in_order_and_filtered_by_name_and_topic() {
         &agent,
         "&name=ros2.endpoint.*,ros2.node.lost&topic=/chatter",
     );
-    let told = chatter
+    let reported = chatter
         .iter()
         .map(|message| (message.event.as_str(), message.attribute("role")));
     assert_eq!(
-        told.collect::<Vec<_>>(),
+        reported.collect::<Vec<_>>(),
         [
             ("ros2.endpoint.discovered", "reader".into()),
             ("ros2.endpoint.discovered", "writer".into()),
@@ -206,11 +206,11 @@ fn a_client_that_reconnects_continues_or_gets_the_number_it_missed() {
 
     let (_, number) = end.id.split_once('-').unwrap();
     for other_run in [format!("5f0a1b2c3d4e5-{number}"), format!("{}9", end.id)] {
-        let told = again("/events?follow=false", &other_run);
-        assert_eq!(told[0].event, "lagged", "{other_run}");
-        assert_eq!(told[0].json()["reason"], "restarted");
-        assert!(told[0].json()["missed"].is_null());
-        assert_eq!(told[1..], all);
+        let reported = again("/events?follow=false", &other_run);
+        assert_eq!(reported[0].event, "lagged", "{other_run}");
+        assert_eq!(reported[0].json()["reason"], "restarted");
+        assert!(reported[0].json()["missed"].is_null());
+        assert_eq!(reported[1..], all);
     }
     for (path, status) in [
         ("/events?after=last", 422),
@@ -366,16 +366,16 @@ fn a_replay_reports_every_endpoint_in_the_captures_time() {
         capture.writer(time, 0, guid, &topic, number as u64 + 1);
     }
     capture.write(&path);
-    let told = |speed: &str| {
+    let reported = |speed: &str| {
         let mut agent = LocalAgent::replay(&mut rp(), &path, &["--speed", speed]);
         agent.wait_for_log("the capture has ended");
         let events = kept(&agent, "&name=ros2.endpoint.*");
-        let told = events
+        let reported = events
             .iter()
             .map(|event| (event.event.clone(), event.attribute("topic")));
-        told.collect::<Vec<_>>()
+        reported.collect::<Vec<_>>()
     };
-    let at_once = told("max");
+    let at_once = reported("max");
     assert_eq!(at_once.len(), 422, "{:?}", at_once.last());
-    assert_eq!(at_once, told("4"));
+    assert_eq!(at_once, reported("4"));
 }

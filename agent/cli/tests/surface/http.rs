@@ -118,11 +118,14 @@ fn a_reload_takes_over_what_is_right_and_keeps_what_was_when_it_is_wrong() {
     assert!(line.contains("No such file"), "{line}");
     for (event, count) in [("reloaded", 1.0), ("reload_failed", 2.0)] {
         let series = format!("ros2probe_events_total{{name=\"ros2probe.config.{event}\"}}");
-        agent.wait_for_metric(&series, |told| told == count);
+        agent.wait_for_metric(&series, |reported| reported == count);
     }
     let kept = "/events?after=0&follow=false&name=ros2probe.config.*";
-    let told = request(agent.api, "GET", kept, "").body;
-    assert!(told.contains("watch[0]: must begin with a slash"), "{told}");
+    let reported = request(agent.api, "GET", kept, "").body;
+    assert!(
+        reported.contains("watch[0]: must begin with a slash"),
+        "{reported}"
+    );
     agent.signal("-TERM");
     assert!(agent.wait().success());
 }

@@ -8,29 +8,30 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
+use std::ops::{Deref, DerefMut};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
 use crate::rp;
 use ros2probe_daemon::agent_facts::{AgentFacts, SourceKind};
-use ros2probe_daemon::config::{Limit, Limits, Watch, Watchlist};
+use ros2probe_daemon::config::{Limit, Limits};
 use ros2probe_daemon::subscriptions::{
     Caps, Depth, Item, Overflow, Request, Selection, Subscription, Subscriptions, Topic,
 };
 use ros2probe_daemon::surface::MetricSources;
 use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::observer::Settings;
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
-use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
-use ros2probe_testing::model::host::{self, BOB, Host, Seen};
-use ros2probe_wire::time::MILLISECOND;
+use ros2probe_testing::model::domain::VirtualDomain;
+use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
+use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use tokio_util::sync::CancellationToken;
 
-const STRING: &str = "std_msgs::msg::dds_::String_";
+/// Lease of each participant, in seconds.
+const LEASE: u32 = 10_000;
 
 /// State of a cap: how much of it is used, and how often it was reached.
 fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
@@ -52,58 +53,33 @@ fn standing(limits: Limits, snapshot: Snapshot, limit: Limit) -> (u64, u64) {
     (facts.used, facts.reached)
 }
 
-/// A model with some caps, watching everything.
+/// A domain in virtual time, all of it watched by a model with some caps.
 struct World {
     limits: Limits,
-    observer: Observer,
-    now: u64,
+    domain: VirtualDomain,
+}
+
+impl Deref for World {
+    type Target = VirtualDomain;
+
+    fn deref(&self) -> &VirtualDomain {
+        &self.domain
+    }
+}
+
+impl DerefMut for World {
+    fn deref_mut(&mut self) -> &mut VirtualDomain {
+        &mut self.domain
+    }
 }
 
 impl World {
     fn new(limits: Limits) -> Self {
-        let mut observer = Observer::new(Settings::default().with_limits(&limits));
-        observer.input(Input::Watchlist(Arc::new(
-            Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap(),
-        )));
-        observer.input(Input::Time(Timestamp(host::START)));
+        let settings = Settings::default().with_limits(&limits);
         Self {
             limits,
-            observer,
-            now: host::START,
+            domain: VirtualDomain::new(&["/**"], settings),
         }
-    }
-
-    fn put(&mut self, message: Message) {
-        let envelope = forge::multicast(self.now, 0);
-        self.observer.input(Input::Datagram {
-            envelope: &envelope,
-            payload: &message.bytes(),
-            handover: None,
-        });
-    }
-
-    fn wait(&mut self, milliseconds: u64) {
-        self.now += milliseconds * MILLISECOND;
-        self.observer.input(Input::Time(Timestamp(self.now)));
-    }
-
-    fn participant(&mut self, prefix: GuidPrefix) {
-        let payload = forge::participant(prefix, 10_000, None);
-        self.put(Message::from(prefix).data(SPDP, 1, &payload));
-    }
-
-    fn writer(&mut self, guid: Guid, number: u64, topic: &str) {
-        let payload = forge::endpoint(guid, topic, STRING, true);
-        self.put(Message::from(guid.prefix).data(SEDP_WRITERS, number, &payload));
-    }
-
-    fn sample(&mut self, guid: Guid, number: u64) {
-        let payload = [0, 1, 0, 0, 9, 9, 9, 9];
-        self.put(Message::from(guid.prefix).data(guid.entity, number, &payload));
-    }
-
-    fn snapshot(&self) -> Snapshot {
-        self.observer.snapshot(Timestamp(self.now))
     }
 
     fn standing(&self, limit: Limit) -> (u64, u64) {
@@ -126,18 +102,18 @@ fn participants_beyond_the_cap_are_left_out_until_one_goes() {
         ..Limits::default()
     });
     for _ in 0..4 {
-        (1..=2).for_each(|number| world.participant(prefix(number)));
+        (1..=2).for_each(|number| world.participant(prefix(number), LEASE));
         world.wait(1_000);
     }
-    world.participant(prefix(3));
+    world.participant(prefix(3), LEASE);
     assert_eq!(world.standing(Limit::Participants), (2, 1));
     // Existing writers are counted as before.
-    world.writer(writer(1, 1), 1, "rt/a");
+    world.endpoint(writer(1, 1), 1, "rt/a");
     world.sample(writer(1, 1), 1);
     assert_eq!(world.snapshot().topics[0].publishers.len(), 1);
     let guid = Guid::new(prefix(2), EntityId::PARTICIPANT);
     world.put(Message::from(prefix(2)).dispose_by_hash(SPDP, 2, guid));
-    world.participant(prefix(3));
+    world.participant(prefix(3), LEASE);
     assert_eq!(world.standing(Limit::Participants), (2, 1));
     let known = world.snapshot().participants;
     assert!(known.iter().any(|known| known.guid.prefix == prefix(3)));
@@ -150,11 +126,11 @@ fn endpoints_beyond_the_cap_are_left_out_until_one_goes() {
         ..Limits::default()
     });
     for _ in 0..4 {
-        world.participant(prefix(1));
+        world.participant(prefix(1), LEASE);
         world.wait(1_000);
     }
     for (number, topic) in [(1, "rt/a"), (2, "rt/b"), (3, "rt/c")] {
-        world.writer(writer(1, number), number.into(), topic);
+        world.endpoint(writer(1, number), number.into(), topic);
     }
     assert_eq!(world.standing(Limit::Endpoints), (2, 1));
     for number in 1..=10 {
@@ -167,7 +143,7 @@ fn endpoints_beyond_the_cap_are_left_out_until_one_goes() {
     };
     assert_eq!(messages(&world, "/a"), Some(10));
     world.put(Message::from(prefix(1)).dispose_by_hash(SEDP_WRITERS, 4, writer(1, 2)));
-    world.writer(writer(1, 3), 5, "rt/c");
+    world.endpoint(writer(1, 3), 5, "rt/c");
     assert_eq!(world.standing(Limit::Endpoints), (2, 1));
     assert_eq!(messages(&world, "/c"), Some(0));
 }
@@ -178,9 +154,9 @@ fn topics_beyond_the_cap_are_listed_and_measured_once_there_is_room() {
         topics: 2,
         ..Limits::default()
     });
-    world.participant(prefix(1));
+    world.participant(prefix(1), LEASE);
     for (number, topic) in [(1, "rt/a"), (2, "rt/b"), (3, "rt/c")] {
-        world.writer(writer(1, number), number.into(), topic);
+        world.endpoint(writer(1, number), number.into(), topic);
     }
     assert_eq!(world.standing(Limit::Topics), (2, 1));
     assert_eq!(world.snapshot().topics.len(), 3);
@@ -234,7 +210,7 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     };
     let mut host = Host::with(Settings::default().with_limits(&limits));
     let bob = host.reader(BOB, 7411);
-    let at = |socket: u64| Seen {
+    let at = |socket: u64| CapturePoint {
         socket,
         ..bob.multicast(socket)
     };

@@ -172,17 +172,17 @@ fn a_sample_request_changes_no_count_and_gets_each_counted_sample_once() {
                 SampleOutcome::Missed(missed) => Some((missed.reason, missed.samples)),
                 SampleOutcome::Sample(_) => None,
             });
-            let mut told: BTreeMap<_, u64> = BTreeMap::new();
+            let mut reported: BTreeMap<_, u64> = BTreeMap::new();
             for (reason, samples) in missed {
-                *told.entry(reason).or_default() += samples;
+                *reported.entry(reason).or_default() += samples;
             }
-            told.remove(&MissedReason::Unannounced);
+            reported.remove(&MissedReason::Unannounced);
             let mut expected = BTreeMap::from([
                 (MissedReason::Incomplete, incomplete),
                 (MissedReason::Lost, lost - incomplete),
             ]);
             expected.retain(|_, samples| *samples > 0);
-            assert_eq!(told, expected, "{name}");
+            assert_eq!(reported, expected, "{name}");
         }
     }
     assert!(messages >= 64, "{messages}");

@@ -16,7 +16,7 @@ use super::shape::{
     ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
     WatchShape,
 };
-use super::watch::{Expectations, Retain, Watch, check_globs, check_pattern};
+use super::watch::{ExpectationValues, Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
     RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
@@ -233,16 +233,18 @@ impl Reader {
                 format!("is {high}, below min_rate_hz, which is {low}"),
             );
         }
+        let values = ExpectationValues {
+            min_rate_hz: entry.min_rate_hz,
+            max_rate_hz: entry.max_rate_hz,
+            max_loss_ratio: entry.max_loss_ratio,
+            max_latency_ms: entry.max_latency_ms,
+            max_silence_s: entry.max_silence_s,
+        };
         Watch {
             pattern: entry.topic,
             domain_id: entry.domain.map(DomainId),
-            expectations: Expectations {
-                min_rate_hz: entry.min_rate_hz,
-                max_rate_hz: entry.max_rate_hz,
-                max_loss_ratio: entry.max_loss_ratio,
-                max_latency_ms: entry.max_latency_ms,
-                max_silence_s: entry.max_silence_s,
-            },
+            // Values out of their ranges are reported already, by the schema or above.
+            expectations: Expectations::try_from(values).unwrap_or_default(),
             per_subscriber: entry.per_subscriber,
             trace: entry.trace.unwrap_or_default(),
             retain: entry.retain.into(),

@@ -46,9 +46,9 @@ impl Announcer {
     pub(super) fn missing(&self) -> impl Iterator<Item = SequenceNumber> + '_ {
         let (first, last) = match &self.available {
             Some(range) => (*range.start(), *range.end()),
-            None => (SequenceNumber(1), SequenceNumber::ZERO),
+            None => (SequenceNumber::FIRST, SequenceNumber::ZERO),
         };
-        let first = first.max(SequenceNumber(1));
+        let first = first.max(SequenceNumber::FIRST);
         let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
         first
             .until(last.next())

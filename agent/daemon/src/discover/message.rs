@@ -128,7 +128,7 @@ impl Message {
             )
             .end();
         let (reader, writer) = (SUBSCRIPTIONS_READER, EntityId::SEDP_SUBSCRIPTIONS_WRITER);
-        let numbers = [number(SequenceNumber(1)); 2].concat();
+        let numbers = [number(SequenceNumber::FIRST); 2].concat();
         let heartbeat = [&reader.0[..], &writer.0, &numbers, &1u32.to_le_bytes()];
         self.data(reader, writer, 1, &payload).submessage(
             SubmessageId::HEARTBEAT,
@@ -272,12 +272,13 @@ impl Parameters {
 #[cfg(test)]
 mod tests {
     use std::net::Ipv4Addr;
+    use std::time::Duration;
 
     use ros2probe_wire::discovery::{self, Discovery, Role};
     use ros2probe_wire::record;
     use ros2probe_wire::rtps::{InlineQos, Payload};
     use ros2probe_wire::walk::{self, Envelope, Found, Outcome};
-    use ros2probe_wire::{Duration, Record};
+    use ros2probe_wire::{Record, RtpsDuration};
 
     use super::*;
 
@@ -322,7 +323,7 @@ mod tests {
         );
         assert_eq!(
             (announced.vendor, announced.lease),
-            (VENDOR, Duration::Finite(3_000_000_000))
+            (VENDOR, RtpsDuration::Finite(Duration::from_secs(3)))
         );
         assert_eq!(
             (announced.enclave, announced.builtin_endpoints.0),

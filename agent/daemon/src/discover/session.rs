@@ -8,12 +8,12 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddrV4;
 use std::ops::RangeInclusive;
+use std::time::Duration;
 
 use ros2probe_wire::discovery::{self, Discovery, EndpointAnnouncement, Role};
 use ros2probe_wire::entities::{NodeEntities, ParticipantEntities};
 use ros2probe_wire::record::{Body, Sample};
 use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
@@ -29,15 +29,15 @@ pub const MOST_PACKETS: u32 = 6;
 
 /// Silence after which the announcement is repeated once, in nanoseconds. Both vendors announce
 /// themselves within 2 ms.
-const SILENCE: u64 = 500 * MILLISECOND;
+const SILENCE: Duration = Duration::from_millis(500);
 /// Time from the first HEARTBEAT to the request, for the second one to arrive.
-const GATHER: u64 = 20 * MILLISECOND;
+const GATHER: Duration = Duration::from_millis(20);
 /// Longest wait for requested samples before another request.
-const TIMEOUT: u64 = 300 * MILLISECOND;
+const TIMEOUT: Duration = Duration::from_millis(300);
 /// Longest wait for the node list after everything else.
-const NODES_TIMEOUT: u64 = 500 * MILLISECOND;
+const NODES_TIMEOUT: Duration = Duration::from_millis(500);
 /// Longest conversation.
-const LIMIT: u64 = 3_000 * MILLISECOND;
+const LIMIT: Duration = Duration::from_secs(3);
 /// Most fragmented samples in assembly.
 const MOST_PARTIAL: usize = 8;
 /// Most user writers whose HEARTBEAT is kept until the writer of the node list is known.
@@ -143,7 +143,7 @@ impl Session {
     /// Packets of a conversation without losses, with requests of maximal size.
     #[must_use]
     pub fn plan(&self) -> Vec<Outgoing> {
-        let first = SequenceNumber(1);
+        let first = SequenceNumber::FIRST;
         let full = || (first, first.until(first + MOST_NUMBERS));
         let mut plan = vec![
             self.to_discovery("introduction", self.message().announce(self.local)),
@@ -184,10 +184,10 @@ impl Session {
             self.began = now;
             self.introduce(now, &mut outgoing);
         }
-        let is_deaf = self.heard.is_none() && since(self.announced, now) >= SILENCE;
+        let is_deaf = self.heard.is_none() && now - self.announced >= SILENCE;
         if is_deaf && self.sent.packets == 1 {
             self.introduce(now, &mut outgoing);
-        } else if is_deaf || since(self.began, now) >= LIMIT {
+        } else if is_deaf || now - self.began >= LIMIT {
             self.end(&mut outgoing);
             return outgoing;
         }
@@ -394,10 +394,10 @@ impl Session {
         let Some(heard) = self.heard else { return };
         let both = self.publications.available.is_some() && self.subscriptions.available.is_some();
         let due = match self.asked {
-            None => both || since(heard, now) >= GATHER,
+            None => both || now - heard >= GATHER,
             Some(asked) => {
                 let came = self.publications.is_answered() && self.subscriptions.is_answered();
-                came || since(asked, now) >= TIMEOUT
+                came || now - asked >= TIMEOUT
             }
         };
         // One of the remaining packets is for the node request and one for the goodbye.
@@ -439,9 +439,9 @@ impl Session {
 
     /// Requests missing fragments of incomplete samples.
     fn request_fragments(&mut self, now: Timestamp, outgoing: &mut Vec<Outgoing>) {
-        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| since(**at, now) >= GATHER;
+        let due = |(_, at): &(&(EntityId, SequenceNumber), &Timestamp)| now - **at >= GATHER;
         let stuck: Vec<_> = self.partial.iter().filter(due).map(|(it, _)| *it).collect();
-        if stuck.is_empty() || self.partial.values().any(|at| since(*at, now) < GATHER) {
+        if stuck.is_empty() || self.partial.values().any(|at| now - *at < GATHER) {
             return;
         }
         for is_builtin in [true, false] {
@@ -474,7 +474,7 @@ impl Session {
             self.send(datagram, outgoing);
         }
         // They have the same timeout as other requests.
-        let later = Timestamp(now.0.saturating_add(TIMEOUT - GATHER));
+        let later = now + TIMEOUT - GATHER;
         for at in self.partial.values_mut() {
             *at = later;
         }
@@ -486,9 +486,9 @@ impl Session {
             return false;
         };
         let settled = match self.asked {
-            Some(asked) => self.missing() == 0 || since(asked, now) >= TIMEOUT,
+            Some(asked) => self.missing() == 0 || now - asked >= TIMEOUT,
             // A participant without endpoints announces the empty range 1..0.
-            None => since(heard, now) >= GATHER && self.missing() == 0,
+            None => now - heard >= GATHER && self.missing() == 0,
         };
         if !settled {
             return false;
@@ -498,8 +498,8 @@ impl Session {
         }
         match &mut self.nodes {
             Nodes::Listed(_) | Nodes::Missing => true,
-            Nodes::Requested(asked) => since(*asked, now) >= NODES_TIMEOUT,
-            Nodes::Open { since: open } => since(*open.get_or_insert(now), now) >= NODES_TIMEOUT,
+            Nodes::Requested(asked) => now - *asked >= NODES_TIMEOUT,
+            Nodes::Open { since: open } => now - *open.get_or_insert(now) >= NODES_TIMEOUT,
         }
     }
 
@@ -575,8 +575,4 @@ impl Traffic {
         self.packets += 1;
         self.bytes += length as u64;
     }
-}
-
-fn since(earlier: Timestamp, now: Timestamp) -> u64 {
-    now.0.saturating_sub(earlier.0)
 }

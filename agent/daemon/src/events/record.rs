@@ -517,8 +517,8 @@ fn seconds(at: Timestamp, last: Timestamp) -> f64 {
 /// leap day is the last day of a year.
 fn rfc3339(at: Timestamp) -> String {
     let (days, rest) = (
-        at.0 / SECOND / SECONDS_OF_A_DAY,
-        at.0 / SECOND % SECONDS_OF_A_DAY,
+        at.whole_seconds() / SECONDS_OF_A_DAY,
+        at.whole_seconds() % SECONDS_OF_A_DAY,
     );
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);

@@ -3,7 +3,6 @@
 
 use std::collections::HashMap;
 
-use crate::subscriptions::line::seconds;
 use ros2probe_api::endpoints::Endpoint;
 use ros2probe_api::participants::UnknownWriter;
 use ros2probe_api::samples::OfferedQos;
@@ -233,10 +232,10 @@ impl From<&EndpointFacts> for Publisher {
                 reliability: qos.reliability.to_string(),
                 durability: qos.durability.to_string(),
                 history: facts.history(),
-                deadline_seconds: qos.deadline.nanoseconds().map(seconds),
-                lifespan_seconds: qos.lifespan.nanoseconds().map(seconds),
+                deadline_seconds: qos.deadline.seconds(),
+                lifespan_seconds: qos.lifespan.seconds(),
                 liveliness: qos.liveliness.to_string(),
-                liveliness_lease_seconds: qos.liveliness_lease.nanoseconds().map(seconds),
+                liveliness_lease_seconds: qos.liveliness_lease.seconds(),
             },
         }
     }

@@ -8,9 +8,9 @@ mod unrecorded;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::qos::Qos;
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
 use super::disk_quota::DiskQuota;
@@ -29,9 +29,9 @@ use ros2probe_model::dispatch::{Offered, Sample};
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
 /// most this much.
-const FLUSH: u64 = SECOND;
+const FLUSH: Duration = Duration::from_secs(1);
 /// Interval of syncs to disk. A power failure loses at most this much.
-const SYNC: u64 = 5 * SECOND;
+const SYNC: Duration = Duration::from_secs(5);
 /// Most writers of one topic whose first sequence number is kept.
 const WRITERS: usize = 256;
 
@@ -402,16 +402,15 @@ impl<'a> Recorder<'a> {
         if self.synced.0 == 0 {
             (self.flushed, self.synced) = (now, now);
         }
-        let since = |before: Timestamp| now.0.abs_diff(before.0);
-        if since(self.flushed) >= FLUSH
+        if now.distance(self.flushed) >= FLUSH
             && let Some(quota) = &self.quota
         {
             quota.check()?;
         }
-        if since(self.synced) >= SYNC {
+        if now.distance(self.synced) >= SYNC {
             (self.flushed, self.synced) = (now, now);
             self.writer.sync()
-        } else if since(self.flushed) >= FLUSH {
+        } else if now.distance(self.flushed) >= FLUSH {
             self.flushed = now;
             self.writer.flush()
         } else {

@@ -73,10 +73,7 @@ impl SampleRing {
     /// Evicts samples that are too old at `now`.
     pub fn advance(&mut self, now: Timestamp) {
         let Some(span) = self.span else { return };
-        let is_old = |sample: &Arc<Sample>| {
-            let age = now.0.saturating_sub(sample.time.0);
-            u128::from(age) > span.as_nanos()
-        };
+        let is_old = |sample: &Arc<Sample>| now - sample.time > span;
         while self.samples.front().is_some_and(is_old) {
             self.pop();
         }

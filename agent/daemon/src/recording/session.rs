@@ -21,7 +21,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval of status reports.
 const REPORT_INTERVAL: Duration = Duration::from_millis(500);
 /// Longest wait for messages sent before the end.
-const FAREWELL: Duration = Duration::from_secs(2);
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Command to a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,7 +99,7 @@ pub fn record<E>(
             Ok(CommandOutcome::Out) => report_activity(Activity::Recording(&recorder)),
             Ok(CommandOutcome::Stop) => {
                 if stopping.is_none() {
-                    stopping = Some((now(), Instant::now() + FAREWELL));
+                    stopping = Some((now(), Instant::now() + DRAIN_TIMEOUT));
                     report_activity(Activity::Completing);
                 }
             }

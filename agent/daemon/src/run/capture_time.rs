@@ -1,25 +1,27 @@
 //! Time in a capture, as typed by a user.
 
 use std::str::FromStr;
+use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 /// A time in a capture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CaptureTime {
     /// Time since the epoch.
     At(Timestamp),
-    /// Nanoseconds since the capture's first packet.
-    After(u64),
+    /// Time since the capture's first packet.
+    After(Duration),
 }
 
 impl CaptureTime {
     /// Absolute time in a capture that begins at `beginning`.
     #[must_use]
-    pub const fn in_capture(self, beginning: Timestamp) -> Timestamp {
+    pub fn in_capture(self, beginning: Timestamp) -> Timestamp {
         match self {
             Self::At(time) => time,
-            Self::After(nanoseconds) => Timestamp(beginning.0.saturating_add(nanoseconds)),
+            Self::After(elapsed) => beginning + elapsed,
         }
     }
 }
@@ -43,11 +45,11 @@ impl FromStr for CaptureTime {
         }
         let whole: u64 = whole.parse().map_err(|_| WRONG)?;
         let fraction: u64 = format!("{fraction:0<9}").parse().map_err(|_| WRONG)?;
-        let nanoseconds = whole.checked_mul(1_000_000_000);
+        let nanoseconds = whole.checked_mul(SECOND);
         let nanoseconds = nanoseconds.and_then(|whole| whole.checked_add(fraction));
         let nanoseconds = nanoseconds.ok_or(WRONG)?;
         Ok(if is_after {
-            Self::After(nanoseconds)
+            Self::After(Duration::from_nanos(nanoseconds))
         } else {
             Self::At(Timestamp(nanoseconds))
         })
@@ -63,8 +65,11 @@ mod tests {
         let at = |text: &str| text.parse::<CaptureTime>();
         let exact = Timestamp(1_795_142_407_300_015_394);
         assert_eq!(at("1795142407.300015394"), Ok(CaptureTime::At(exact)));
-        assert_eq!(at("+2.5"), Ok(CaptureTime::After(2_500_000_000)));
-        assert_eq!(at("+3"), Ok(CaptureTime::After(3_000_000_000)));
+        assert_eq!(
+            at("+2.5"),
+            Ok(CaptureTime::After(Duration::from_millis(2500)))
+        );
+        assert_eq!(at("+3"), Ok(CaptureTime::After(Duration::from_secs(3))));
         for wrong in [
             "",
             "+",

@@ -39,9 +39,9 @@ const PUBLISH: Duration = Duration::from_secs(1);
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
 /// Longest interval of clock items to subscribers during silence.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
-const CLOCK_NANOSECONDS: u64 = 100_000_000;
-/// Step back of the clock, in nanoseconds, that means it was set.
-const SET_BACK: u64 = 1_000_000_000;
+const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
+/// Step back of the clock that means it was set.
+const SET_BACK: Duration = Duration::from_secs(1);
 
 /// The working thread ended with an error.
 #[derive(Debug, thiserror::Error)]
@@ -210,8 +210,7 @@ impl Run {
     /// Next time at which a replay has to return: for a clock item to subscriptions, or at the end
     /// of a second. `None` if neither is needed.
     fn step(&self, subscribed: bool) -> Option<Timestamp> {
-        let published_until =
-            subscribed.then(|| Timestamp(self.published_until.0.saturating_add(CLOCK_NANOSECONDS)));
+        let published_until = subscribed.then(|| self.published_until + CLOCK_INTERVAL);
         let second = self.history.as_ref().map(History::due);
         // Before the first packet, the capture's time is unknown.
         let second = second.filter(|second| second.0 > 0);
@@ -241,7 +240,7 @@ impl Run {
         self.outputs.events.add(output.events, now);
         self.outputs.spans.add(output.spans);
         let clock = self.observer.dispatched_until(now);
-        if clock.0.saturating_add(SET_BACK) < self.published_until.0 {
+        if clock + SET_BACK < self.published_until {
             self.published_until = clock;
         }
         let news = (clock > self.published_until).then_some(clock);

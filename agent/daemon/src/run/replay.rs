@@ -19,8 +19,8 @@ use ros2probe_model::observer::Observer;
 
 /// Interval of progress reports on a terminal.
 const PROGRESS: Duration = Duration::from_secs(1);
-/// Gap between packets, in nanoseconds, that the replay skips in one step.
-const FAR: u64 = 3600 * 1_000_000_000;
+/// Gap between packets that the replay skips in one step.
+const FAR: Duration = Duration::from_secs(3600);
 
 /// Polling interval of requests while a replay is paused.
 const PAUSE_POLL: Duration = Duration::from_millis(5);
@@ -184,7 +184,7 @@ impl Replay {
                 if let Some(until) = later
                     && delay.is_zero()
                 {
-                    let is_far = time.0 - until.0 > FAR;
+                    let is_far = time - until > FAR;
                     let time = if is_far { time.0 - 1 } else { until.0 };
                     self.clock = self.clock.max(Timestamp(time));
                     break;
@@ -415,6 +415,5 @@ fn before(time: Timestamp, delay: Duration, speed: Speed) -> Timestamp {
     };
     let distance =
         Duration::try_from_secs_f64(delay.as_secs_f64() * factor).unwrap_or(Duration::MAX);
-    let nanoseconds = u64::try_from(distance.as_nanos()).unwrap_or(u64::MAX);
-    Timestamp(time.0.saturating_sub(nanoseconds))
+    time - distance
 }

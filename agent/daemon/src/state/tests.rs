@@ -229,7 +229,10 @@ fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
     }
     fs::remove_dir(obstacle).unwrap();
     assert!(!keeper.wants(0, start + 2 * PERIOD), "nothing has changed");
-    assert!(keeper.wants(0, start + AGAIN), "there may be room again");
+    assert!(
+        keeper.wants(0, start + RETRY_INTERVAL),
+        "there may be room again"
+    );
     assert!(!keeper.wants(1, start + PERIOD / 2), "it is too soon");
     assert!(keeper.wants(1, start + PERIOD));
     assert_eq!(keeper.facts().writes, 0);

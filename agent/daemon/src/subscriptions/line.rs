@@ -1,12 +1,13 @@
 //! Conversion of subscription items to lines of the API's stream, and back.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_api::samples::{self, Clock, End, Line, OfferedQos};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Liveliness, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{Duration, Timestamp};
+use ros2probe_wire::{RtpsDuration, Timestamp};
 
 use super::Item;
 use ros2probe_model::dispatch::{Missed, MissedReason, Offered, Sample, Topic};
@@ -88,10 +89,6 @@ pub(super) fn announced(offered: &samples::Offered) -> Offered {
 }
 
 fn offered_qos(qos: &Qos) -> OfferedQos {
-    let finite = |duration| match duration {
-        Duration::Finite(nanoseconds) => Some(seconds(nanoseconds)),
-        Duration::Infinite => None,
-    };
     OfferedQos {
         reliability: qos.reliability.to_string(),
         durability: qos.durability.to_string(),
@@ -99,10 +96,10 @@ fn offered_qos(qos: &Qos) -> OfferedQos {
             None => "UNKNOWN".to_owned(),
             Some(history) => history.to_string(),
         },
-        deadline_seconds: finite(qos.deadline),
-        lifespan_seconds: finite(qos.lifespan),
+        deadline_seconds: qos.deadline.seconds(),
+        lifespan_seconds: qos.lifespan.seconds(),
         liveliness: qos.liveliness.to_string(),
-        liveliness_lease_seconds: finite(qos.liveliness_lease),
+        liveliness_lease_seconds: qos.liveliness_lease.seconds(),
     }
 }
 
@@ -153,21 +150,9 @@ fn history(words: &str) -> Option<History> {
     })
 }
 
-fn duration(seconds: Option<f64>) -> Duration {
-    let Some(seconds) = seconds else {
-        return Duration::Infinite;
-    };
-    let duration = std::time::Duration::try_from_secs_f64(seconds).ok();
-    let nanoseconds = duration.and_then(|duration| u64::try_from(duration.as_nanos()).ok());
-    nanoseconds.map_or(Duration::Infinite, Duration::Finite)
-}
-
-#[expect(
-    clippy::cast_precision_loss,
-    reason = "durations of QoS are given in milliseconds"
-)]
-pub(crate) fn seconds(nanoseconds: u64) -> f64 {
-    nanoseconds as f64 / 1e9
+fn duration(seconds: Option<f64>) -> RtpsDuration {
+    let duration = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    duration.map_or(RtpsDuration::Infinite, RtpsDuration::Finite)
 }
 
 fn nanoseconds(time: Timestamp) -> i64 {
@@ -216,7 +201,7 @@ mod tests {
             reliability: Reliability::BEST_EFFORT,
             durability: Durability::TRANSIENT_LOCAL,
             history: history("KEEP_LAST (5)"),
-            deadline: Duration::Finite(100_000_000),
+            deadline: RtpsDuration::Finite(Duration::from_millis(100)),
             ..Qos::defaults(Role::Writer, VendorId([0, 0]))
         };
         let facts = offered_qos(&qos);
@@ -227,7 +212,7 @@ mod tests {
         assert_eq!(super::qos(&facts), qos);
         assert_eq!(history("KEEP_LAST (x)"), None);
         assert_eq!(history("KEEP_ALL").unwrap().kind, HistoryKind::KEEP_ALL);
-        assert_eq!(duration(Some(-1.0)), Duration::Infinite);
+        assert_eq!(duration(Some(-1.0)), RtpsDuration::Infinite);
         assert_eq!(durability("?").name(), None);
     }
 }

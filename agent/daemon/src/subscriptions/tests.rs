@@ -107,7 +107,7 @@ fn a_slow_reader_loses_the_oldest_and_gets_their_number_before_the_rest() {
         all.deliver(vec![given(&[1], number, Some(1000))], None);
     }
     let Some(Item::Missed(missed)) = slow.try_next() else {
-        panic!("nothing was told");
+        panic!("nothing was reported");
     };
     assert_eq!((missed.first.0, missed.last.0, missed.samples), (1, 6, 6));
     assert_eq!(missed.reason, MissedReason::QueueFull);
@@ -163,7 +163,7 @@ fn one_message_larger_than_the_queue_takes_nothing_else_with_it() {
     all.deliver(vec![given_of("tf", &[1], 1, Some(100))], None);
     all.deliver(vec![given(&[1], 1, Some(5000))], None);
     let Some(Item::Missed(missed)) = slow.try_next() else {
-        panic!("nothing was told");
+        panic!("nothing was reported");
     };
     assert_eq!((&*missed.topic.name, missed.samples), ("/points", 1));
     assert_eq!(numbers(&mut slow), [1]);

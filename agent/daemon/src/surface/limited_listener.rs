@@ -17,12 +17,12 @@ use crate::limit_facts::{LimitFigures, Slot, Slots};
 
 /// Longest time for a refused client to read the answer, and largest number of such clients at
 /// once.
-const FAREWELL: Duration = Duration::from_secs(1);
+const REFUSAL_TIMEOUT: Duration = Duration::from_secs(1);
 const FAREWELLS: usize = 64;
 /// Bytes of a request that are read so that its sender receives the answer.
 const REQUEST: u64 = 64 << 10;
 /// Longest time that a connection that makes room may take to close.
-const ROOM: Duration = Duration::from_millis(100);
+const EVICTION_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// A listener with a limited number of connections; further ones are refused and closed.
 #[derive(Debug)]
@@ -77,7 +77,7 @@ impl<L> LimitedListener<L> {
                 }
             }
         };
-        timeout(ROOM, freed).await.ok()
+        timeout(EVICTION_TIMEOUT, freed).await.ok()
     }
 
     /// Answers a connection without a slot in the background. Few such answers are kept at a time.
@@ -87,7 +87,7 @@ impl<L> LimitedListener<L> {
             && self.leaving.len() < FAREWELLS
         {
             self.leaving.spawn(async move {
-                let _ = timeout(FAREWELL, refusal.send(stream)).await;
+                let _ = timeout(REFUSAL_TIMEOUT, refusal.send(stream)).await;
             });
         }
     }

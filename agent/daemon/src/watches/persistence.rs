@@ -13,7 +13,9 @@ use std::time::Duration;
 use ros2probe_wire::DomainId;
 use serde::{Deserialize, Serialize};
 
-use crate::config::watch::{Expectations, Retain, Watch, check_pattern, check_trace};
+use crate::config::watch::{
+    ExpectationValues, Expectations, Retain, Watch, check_pattern, check_trace,
+};
 use crate::config::{Limit, check_globs};
 use crate::state::{Form, Found, Newer, StateDirectory, from_json};
 
@@ -26,7 +28,7 @@ const FORM: Form<Document> = Form {
     readers: &[(VERSION, from_json)],
 };
 /// Changes within this time are written once.
-const TOGETHER: Duration = Duration::from_millis(50);
+const WRITE_DELAY: Duration = Duration::from_millis(50);
 /// Time after a failure until the next attempt.
 const AGAIN: Duration = Duration::from_secs(30);
 
@@ -134,14 +136,14 @@ impl TryFrom<Line> for Watch {
         {
             return Err(format!("invalid domain {domain_id}"));
         }
-        let expectations = Expectations {
+        let values = ExpectationValues {
             min_rate_hz: line.min_rate_hz,
             max_rate_hz: line.max_rate_hz,
             max_loss_ratio: line.max_loss_ratio,
             max_latency_ms: line.max_latency_ms,
             max_silence_s: line.max_silence_s,
         };
-        expectations.check()?;
+        let expectations = Expectations::try_from(values)?;
         check_trace(line.trace)?;
         Ok(Self {
             pattern: line.topic,
@@ -156,13 +158,13 @@ impl TryFrom<Line> for Watch {
 
 impl From<&Watch> for Line {
     fn from(watch: &Watch) -> Self {
-        let Expectations {
+        let ExpectationValues {
             min_rate_hz,
             max_rate_hz,
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
-        } = watch.expectations;
+        } = watch.expectations.values();
         Self {
             topic: watch.pattern.clone(),
             domain_id: watch.domain_id.map(|id| id.0),
@@ -259,7 +261,7 @@ impl Mailbox {
         let pending = pending.unwrap_or_else(PoisonError::into_inner);
         // Further changes may follow immediately.
         let open = |pending: &mut Pending| !pending.is_closed;
-        let waited = self.changed.wait_timeout_while(pending, TOGETHER, open);
+        let waited = self.changed.wait_timeout_while(pending, WRITE_DELAY, open);
         let mut pending = waited.unwrap_or_else(PoisonError::into_inner).0;
         pending.latest.take()
     }
@@ -286,7 +288,7 @@ mod tests {
             retain: Retain::Last,
             expectations: Expectations {
                 min_rate_hz: Some(9.5),
-                max_silence_s: Some(1.0),
+                max_silence: Some(Duration::from_secs(1)),
                 ..Expectations::default()
             },
             ..Watch::named("/points").unwrap()

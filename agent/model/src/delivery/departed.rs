@@ -19,15 +19,13 @@ impl Delivery {
             (self.waiting, self.presumed_lost) = (None, false);
             return;
         }
-        let since = self.waiting.get_or_insert(context.now).0;
-        let mut until = alive.map_or(0, |alive| {
-            alive.0.min(context.now.0.saturating_sub(UNDER_WAY))
-        });
-        if !self.presumed_lost && since.saturating_add(SILENCE) <= context.now.0 {
+        let since = *self.waiting.get_or_insert(context.now);
+        let mut until = alive.map_or(Timestamp(0), |alive| alive.min(context.now - UNDER_WAY));
+        if !self.presumed_lost && since + SILENCE <= context.now {
             self.presumed_lost = true;
-            until = until.max(since.saturating_add(FIRST_MOMENTS));
+            until = until.max(since + FIRST_MOMENTS);
         }
-        let lost = left_by(Timestamp(until)).filter(|number| *number >= self.next());
+        let lost = left_by(until).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
             self.exists(number, context);
         }

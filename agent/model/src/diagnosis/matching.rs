@@ -6,8 +6,9 @@
 
 use std::fmt;
 use std::str::Chars;
+use std::time::Duration;
 
-use ros2probe_wire::Duration;
+use ros2probe_wire::RtpsDuration;
 use ros2probe_wire::qos::{DataRepresentation, Presentation, Qos};
 use ros2probe_wire::rtps::VendorId;
 
@@ -195,12 +196,12 @@ pub fn effort(offered: &Qos, requested: &Qos) -> usize {
 
 /// Returns whether the offer is at most the request. Implementations round differently between
 /// nanoseconds and 2^-32 s, so a difference of one nanosecond is ignored.
-fn within(offered: Duration, requested: Duration) -> bool {
+fn within(offered: RtpsDuration, requested: RtpsDuration) -> bool {
     match (offered, requested) {
-        (_, Duration::Infinite) => true,
-        (Duration::Infinite, Duration::Finite(_)) => false,
-        (Duration::Finite(offered), Duration::Finite(requested)) => {
-            offered <= requested.saturating_add(1)
+        (_, RtpsDuration::Infinite) => true,
+        (RtpsDuration::Infinite, RtpsDuration::Finite(_)) => false,
+        (RtpsDuration::Finite(offered), RtpsDuration::Finite(requested)) => {
+            offered <= requested.saturating_add(Duration::from_nanos(1))
         }
     }
 }
@@ -315,13 +316,13 @@ mod tests {
                 qos.durability = Durability::TRANSIENT_LOCAL;
             }),
             (Policy::Deadline, |qos| {
-                qos.deadline = Duration::Finite(5_000_000);
+                qos.deadline = RtpsDuration::Finite(Duration::from_millis(5));
             }),
             (Policy::Liveliness, |qos| {
                 qos.liveliness = Liveliness::MANUAL_BY_TOPIC;
             }),
             (Policy::Liveliness, |qos| {
-                qos.liveliness_lease = Duration::Finite(1);
+                qos.liveliness_lease = RtpsDuration::Finite(Duration::from_nanos(1));
             }),
             (Policy::DestinationOrder, |qos| {
                 qos.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
@@ -351,7 +352,7 @@ mod tests {
             assert_eq!(reversed.is_empty(), !is_symmetric, "{policy:?}");
         }
         let mut late = weak.clone();
-        late.latency_budget = Duration::Finite(1_000);
+        late.latency_budget = RtpsDuration::Finite(Duration::from_nanos(1_000));
         assert_eq!(policies(&late, &weak), [Policy::LatencyBudget]);
         let mut best_effort = weak.clone();
         best_effort.reliability = Reliability::BEST_EFFORT;
@@ -410,10 +411,10 @@ mod tests {
     #[test]
     fn a_nanosecond_of_rounding_is_no_difference() {
         let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
-        writer.deadline = Duration::Finite(100_000_001);
-        reader.deadline = Duration::Finite(100_000_000);
+        writer.deadline = RtpsDuration::Finite(Duration::from_nanos(100_000_001));
+        reader.deadline = RtpsDuration::Finite(Duration::from_nanos(100_000_000));
         assert_eq!(policies(&writer, &reader), []);
-        writer.deadline = Duration::Finite(100_000_002);
+        writer.deadline = RtpsDuration::Finite(Duration::from_nanos(100_000_002));
         assert_eq!(policies(&writer, &reader), [Policy::Deadline]);
     }
 
@@ -456,7 +457,7 @@ mod tests {
             let [reliability, durability, liveliness, ownership, order, scope] = kinds;
             // Durations differ by whole microseconds, far more than rounding does.
             let [deadline, budget, lease] = durations
-                .map(|it| it.map_or(Duration::Infinite, |it| Duration::Finite(it * 1_000)));
+                .map(|it| it.map_or(RtpsDuration::Infinite, |it| RtpsDuration::Finite(Duration::from_micros(it))));
             let mut qos = Qos::defaults(Role::Writer, CYCLONE);
             qos.reliability = Reliability(1 + reliability % 2);
             qos.durability = Durability(durability);

@@ -1,18 +1,18 @@
 //! Recent disposals: delayed copies of an announcement or samples must not bring the entity back.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
-use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::facts::Origin;
 use crate::size::Size;
 
 /// Announcements older than a disposal are ignored for this long after it.
-const STALE_WITHIN: u64 = 500 * MILLISECOND;
+const STALE_WITHIN: Duration = Duration::from_millis(500);
 const MAX_DISPOSALS: usize = 256;
 /// Samples that were already sent arrive within this time.
-const UNDER_WAY: u64 = 4 * STALE_WITHIN;
+const UNDER_WAY: Duration = Duration::from_secs(2);
 
 /// The latest disposals, oldest first.
 #[derive(Debug, Default)]
@@ -43,7 +43,7 @@ impl Disposals {
 
     /// Returns whether the entity was disposed so recently that its samples may still arrive.
     pub(super) fn is_recent(&self, guid: Guid, now: Timestamp) -> bool {
-        let fresh = |at: Timestamp| at.0.saturating_add(UNDER_WAY) > now.0;
+        let fresh = |at: Timestamp| at + UNDER_WAY > now;
         self.latest
             .iter()
             .any(|(disposed, at, ..)| *disposed == guid && fresh(*at))
@@ -58,7 +58,7 @@ impl Disposals {
                 *disposed == guid
                     && *sender == origin.sender
                     && *number > origin.sequence_number
-                    && at.0.saturating_add(STALE_WITHIN) > origin.at.0
+                    && *at + STALE_WITHIN > origin.at
             })
     }
 }

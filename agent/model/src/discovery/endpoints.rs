@@ -39,7 +39,7 @@ impl Discovery {
         }
         let guid = announcement.guid;
         let announces_readers =
-            announcement.role == Role::Reader && origin.sequence_number == SequenceNumber(1);
+            announcement.role == Role::Reader && origin.sequence_number == SequenceNumber::FIRST;
         let pending = PendingEndpoint {
             at: origin.at,
             announces_readers,

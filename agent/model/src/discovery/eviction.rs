@@ -10,23 +10,25 @@
 //! A search visits the whole table, and a flood would trigger one per packet. So one search serves
 //! many newcomers, and the rate of searches is limited.
 
+use std::time::Duration;
+
 use ros2probe_wire::{EntityId, Guid, Timestamp};
 
+use super::Discovery;
 use super::facts::{Participant, named};
 use super::priority::Priority;
-use super::{Discovery, SECOND};
 use crate::journal::Journal;
 
 /// A participant seen over at least this span is established.
-const ESTABLISHED: u64 = 2 * SECOND;
+const ESTABLISHED: Duration = Duration::from_secs(2);
 /// A participant that is not established is silent after this time without a packet.
-const UNESTABLISHED_SILENCE: u64 = 5 * SECOND;
+const UNESTABLISHED_SILENCE: Duration = Duration::from_secs(5);
 /// Any participant is silent after this time without a packet, whatever its lease: real ones
 /// announce themselves at least every 30 seconds (RTPS 2.5, 8.5.3.3.2).
-pub(super) const FORSAKEN: u64 = 90 * SECOND;
+pub(super) const MAX_SILENCE: Duration = Duration::from_secs(90);
 /// Minimum time between two searches of a full table; it grows with the number of entries.
-const SEARCH: u64 = SECOND / 10;
-const SEARCH_EACH: u64 = 10_000;
+const SEARCH: Duration = Duration::from_millis(100);
+const SEARCH_EACH: Duration = Duration::from_micros(10);
 /// Largest number of candidates of each kind that one search finds.
 const FOUND: usize = 64;
 
@@ -129,8 +131,7 @@ impl Victims {
             list.sort_unstable_by(|one, other| other.cmp(one));
             list.shrink_to(FOUND);
         }
-        let pause = SEARCH.max(SEARCH_EACH * visited);
-        self.search_after = Timestamp(now.0.saturating_add(pause));
+        self.search_after = now + SEARCH.max(SEARCH_EACH.saturating_mul(visited));
     }
 
     /// Returns the next entry to evict for this newcomer.
@@ -172,7 +173,7 @@ impl Victim {
         let last_seen = participant.last_seen;
         Self {
             priority,
-            is_established: last_seen.0.saturating_sub(participant.first_seen.0) >= ESTABLISHED,
+            is_established: last_seen - participant.first_seen >= ESTABLISHED,
             last_seen,
             guid,
         }
@@ -245,16 +246,16 @@ impl Discovery {
 
 /// Returns the priority of this participant if it is silent, otherwise `None`.
 fn silence_priority(participant: &Participant, now: Timestamp) -> Option<Priority> {
-    let last = participant.last_seen.0;
-    let is_silent_for = |span: u64| last.saturating_add(span) <= now.0;
+    let last = participant.last_seen;
+    let is_silent_for = |silence: Duration| last + silence <= now;
     let priority = participant.priority();
     if priority.local {
         return None;
     }
-    if is_silent_for(FORSAKEN) {
+    if is_silent_for(MAX_SILENCE) {
         return Some(Priority::NOTHING);
     }
-    let is_established = last.saturating_sub(participant.first_seen.0) >= ESTABLISHED;
+    let is_established = last - participant.first_seen >= ESTABLISHED;
     (!is_established && is_silent_for(UNESTABLISHED_SILENCE)).then_some(priority)
 }
 

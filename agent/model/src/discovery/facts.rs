@@ -8,7 +8,7 @@ use ros2probe_wire::discovery::{ParticipantAnnouncement, Role, TypeHash};
 use ros2probe_wire::entities::NodeEntities;
 use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::{Locator, VendorId};
-use ros2probe_wire::{DomainId, Duration, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp};
 use serde::{Deserialize, Serialize};
 
 use super::priority::Priority;
@@ -60,7 +60,7 @@ pub struct ParticipantProxy {
     /// Process id, or its low 16 bits.
     pub process_id: Option<u32>,
     /// Lease.
-    pub lease: Duration,
+    pub lease: RtpsDuration,
     /// Whether it announces DDS security.
     pub secured: bool,
     /// Whether its endpoints accept shared memory, unless they announce otherwise.

@@ -7,6 +7,7 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::discovery::{Role, TypeHash};
 use ros2probe_wire::names::{DdsTopic, RosType};
@@ -15,7 +16,9 @@ use ros2probe_wire::qos::{
     Liveliness, Ownership, Presentation, Qos, Reliability,
 };
 use ros2probe_wire::rtps::VendorId;
-use ros2probe_wire::{DomainId, Duration, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{
+    DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp, time,
+};
 use serde::{Deserialize, Serialize};
 
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
@@ -411,15 +414,14 @@ fn is_plain(text: &str) -> bool {
     text.is_empty() || text.len() <= MAX_NAME_LEN && DdsTopic::parse(text).is_ok()
 }
 
-const fn nanoseconds(duration: Duration) -> Option<u64> {
-    match duration {
-        Duration::Finite(nanoseconds) => Some(nanoseconds),
-        Duration::Infinite => None,
-    }
+fn nanoseconds(duration: RtpsDuration) -> Option<u64> {
+    duration.finite().map(time::nanoseconds)
 }
 
-fn duration(nanoseconds: Option<u64>) -> Duration {
-    nanoseconds.map_or(Duration::Infinite, Duration::Finite)
+fn duration(nanoseconds: Option<u64>) -> RtpsDuration {
+    nanoseconds.map_or(RtpsDuration::Infinite, |nanoseconds| {
+        RtpsDuration::Finite(Duration::from_nanos(nanoseconds))
+    })
 }
 
 #[cfg(test)]
@@ -432,7 +434,7 @@ mod tests {
         let guid = Guid::new(prefix, EntityId([0, 0, 1, 3]));
         let defaults = Qos::defaults(Role::Writer, VendorId::CYCLONE);
         let mut qos = defaults.clone();
-        qos.latency_budget = Duration::Finite(7);
+        qos.latency_budget = RtpsDuration::Finite(Duration::from_nanos(7));
         qos.destination_order = DestinationOrder::BY_SOURCE_TIMESTAMP;
         qos.presentation.is_ordered = true;
         qos.representations = vec![DataRepresentation::XCDR2];

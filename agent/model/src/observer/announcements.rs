@@ -65,12 +65,12 @@ impl Observer {
         } else {
             (found.payload(), found.inline_qos(vendor))
         };
-        let told = inline_qos.and_then(|inline_qos| match stage {
+        let processed = inline_qos.and_then(|inline_qos| match stage {
             "spdp" => self.participant(vendor, payload, &inline_qos, origin),
             "sedp" => self.endpoint(writer.entity, vendor, payload, &inline_qos, origin),
             _ => self.entities(writer, payload, origin),
         });
-        if let Err(error) = told {
+        if let Err(error) = processed {
             self.decode_error(stage, error.reason);
         }
     }

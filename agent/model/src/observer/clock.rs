@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::time::SECOND;
+use ros2probe_wire::time::{SECOND, nanoseconds};
 
 use super::{JUMP, Observer, TICK, graph};
 use crate::diagnosis;
@@ -17,12 +17,12 @@ impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
     pub(super) fn advance(&mut self, now: Timestamp) {
         let now = self.wall_clock.model_time(now);
-        if self.clock.0 == 0 || now.0.saturating_sub(self.clock.0) > JUMP {
-            self.clock = Timestamp(now.0 - now.0 % TICK);
+        if self.clock.0 == 0 || now - self.clock > JUMP {
+            self.clock = Timestamp(now.0 - now.0 % nanoseconds(TICK));
             self.tick(self.clock);
         }
-        while now.0.saturating_sub(self.clock.0) >= TICK {
-            self.clock = Timestamp(self.clock.0 + TICK);
+        while now - self.clock >= TICK {
+            self.clock = self.clock + TICK;
             self.tick(self.clock);
         }
     }

@@ -7,7 +7,7 @@ use ros2probe_wire::qos::{Durability, Reliability};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
-use super::{MATCHES_AT_ONCE, Observer, graph, naming};
+use super::{MAX_MATCHES_PER_ROUND, Observer, graph, naming};
 use crate::discovery::Endpoint;
 use crate::dispatch::{self, Offered};
 use crate::header::begins_with_header;
@@ -62,7 +62,7 @@ impl Observer {
         };
         let patterns =
             self.watchlist.globs() + self.sample_requests.iter().map(requested).sum::<usize>();
-        for _ in 0..(MATCHES_AT_ONCE / patterns.max(1)).max(1) {
+        for _ in 0..(MAX_MATCHES_PER_ROUND / patterns.max(1)).max(1) {
             let Some(id) = self.pending_topics.pop() else {
                 break;
             };

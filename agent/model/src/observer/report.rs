@@ -256,15 +256,15 @@ fn unknown_writers(observer: &Observer, now: Timestamp) -> Vec<UnknownWriterFact
 
 /// Combines what a participant announces about its process with the owner of its socket.
 fn process(proxy: Option<&ParticipantProxy>, holder: Option<&SocketFacts>) -> ProcessFacts {
-    let said = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
+    let announced = |text: fn(&ParticipantProxy) -> &Option<Arc<str>>| {
         proxy.and_then(|proxy| text(proxy).clone())
     };
     let held = |text: fn(&SocketFacts) -> &Option<Arc<str>>| holder.and_then(|it| text(it).clone());
     let id = holder.and_then(|holder| holder.process_id);
     ProcessFacts {
-        host: said(|proxy| &proxy.host),
+        host: announced(|proxy| &proxy.host),
         id: id.or_else(|| proxy.and_then(|proxy| proxy.process_id)),
-        name: said(|proxy| &proxy.process_name).or_else(|| held(|holder| &holder.process)),
+        name: announced(|proxy| &proxy.process_name).or_else(|| held(|holder| &holder.process)),
         cgroup: held(|holder| &holder.cgroup),
     }
 }

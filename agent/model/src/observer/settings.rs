@@ -1,6 +1,6 @@
 //! Capacities and times of the model.
 
-use ros2probe_wire::time::SECOND;
+use std::time::Duration;
 
 use crate::limits::Limits;
 use crate::payloads;
@@ -26,10 +26,10 @@ pub struct Settings {
     pub sample_bytes: usize,
     /// Bytes of samples that are reassembled for subscriptions.
     pub payload_bytes: usize,
-    /// Nanoseconds for which a topic without endpoints stays in snapshots.
-    pub topic_grace: u64,
-    /// Longest time in nanoseconds from a request for payloads to the first captured payload.
-    pub payload_delay: u64,
+    /// Time for which a topic without endpoints stays in snapshots.
+    pub topic_grace: Duration,
+    /// Longest time from a request for payloads to the first captured payload.
+    pub payload_delay: Duration,
     /// Whether records contain the sender; those of a capture file do not.
     pub directed: bool,
 }
@@ -46,7 +46,7 @@ impl Default for Settings {
             interest: 16_384,
             sample_bytes: 1 << 20,
             payload_bytes: 20 << 20,
-            topic_grace: 600 * SECOND,
+            topic_grace: Duration::from_secs(600),
             payload_delay: payloads::PAYLOAD_DELAY,
             directed: true,
         }

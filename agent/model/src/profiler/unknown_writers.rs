@@ -1,8 +1,8 @@
 //! Writers whose announcement was missed: their cap and eviction.
 
 use std::ops::RangeInclusive;
+use std::time::Duration;
 
-use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::{
@@ -11,6 +11,9 @@ use super::{
 use crate::journal::Journal;
 use crate::receivers::GraphView;
 use crate::writer::{Traits, Writer};
+
+/// Minimum time between two searches for writers to evict.
+const SEARCH_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Changes of unknown writers.
 #[derive(Debug, Default)]
@@ -63,11 +66,11 @@ impl Profiler {
         let evictable = self.writers.iter().filter(|(_, measured)| {
             measured.topic.is_none()
                 && measured.writer.messages() < ESTABLISHED_MESSAGES
-                && measured.last_seen.0.saturating_add(EVICTABLE_AFTER) <= now.0
+                && measured.last_seen + EVICTABLE_AFTER <= now
         });
         let oldest = evictable.min_by_key(|(guid, measured)| (measured.last_seen, **guid));
         let Some(guid) = oldest.map(|(guid, _)| *guid) else {
-            self.search_after = Timestamp(now.0.saturating_add(SECOND / 10));
+            self.search_after = now + SEARCH_INTERVAL;
             return false;
         };
         self.unknown_writer_evictions += 1;

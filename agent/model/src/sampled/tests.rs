@@ -1,6 +1,6 @@
 use super::super::sequence::{FAR, REACH, Settled};
 use super::*;
-use ros2probe_wire::time::SECOND;
+use ros2probe_wire::time::{SECOND, nanoseconds};
 
 struct View {
     sampled: Sampled,
@@ -18,10 +18,10 @@ impl View {
     }
 
     fn see(&mut self, number: u64) -> SampledUpdate {
-        self.part(number, Seen::Whole)
+        self.part(number, Completeness::Complete)
     }
 
-    fn part(&mut self, number: u64, seen: Seen) -> SampledUpdate {
+    fn part(&mut self, number: u64, seen: Completeness) -> SampledUpdate {
         self.now += SECOND / 100;
         let now = Timestamp(self.now);
         self.sampled.sample(
@@ -58,7 +58,12 @@ fn what_was_not_seen_was_sent_and_is_no_loss() {
 #[test]
 fn a_sample_is_seen_once_in_however_many_fragments_and_copies() {
     let mut view = View::new();
-    let parts = [Seen::Part, Seen::Part, Seen::Whole, Seen::Whole];
+    let parts = [
+        Completeness::Partial,
+        Completeness::Partial,
+        Completeness::Complete,
+        Completeness::Complete,
+    ];
     let update = parts.map(|seen| view.part(1, seen));
     assert_eq!(update.map(|update| update.samples), [1, 0, 0, 0]);
     assert_eq!(
@@ -85,19 +90,19 @@ fn a_sample_needs_its_later_fragments_although_its_number_is_known() {
     let mut view = View::new();
     view.see(1);
     let has = |view: &View, number| view.sampled.has(number, view.sequence.next());
-    view.part(2, Seen::Part);
+    view.part(2, Completeness::Partial);
     assert_eq!(
         [1, 2, 3].map(|number| has(&view, SequenceNumber(number))),
         [true, false, false]
     );
     // The next sample begins before this one is whole.
-    view.part(3, Seen::Part);
-    view.part(2, Seen::Whole);
+    view.part(3, Completeness::Partial);
+    view.part(2, Completeness::Complete);
     assert_eq!(
         [2, 3].map(|number| has(&view, SequenceNumber(number))),
         [true, false]
     );
-    view.part(3, Seen::Tail);
+    view.part(3, Completeness::LastFragment);
     view.see(500);
     // 300 is too old to be waited for, and numbers skipped by a GAP are not waited for either.
     assert!(has(&view, SequenceNumber(300)) && !has(&view, SequenceNumber(499)));
@@ -186,7 +191,11 @@ fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
         4
     );
     view.now += SECOND;
-    for seen in [Seen::Part, Seen::Part, Seen::Whole] {
+    for seen in [
+        Completeness::Partial,
+        Completeness::Partial,
+        Completeness::Complete,
+    ] {
         assert_eq!(view.part(4, seen).samples, 0);
     }
     assert_eq!(view.counts(), (2, 5));
@@ -196,7 +205,7 @@ fn a_sample_announced_by_a_heartbeat_and_seen_late_is_no_restart() {
 fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     let mut view = View::new();
     let settle = |view: &mut View| {
-        view.now += PATIENCE;
+        view.now += nanoseconds(ARRIVAL_TIMEOUT);
         view.sampled.tick(Timestamp(view.now));
         view.sampled.take_unseen()
     };
@@ -211,7 +220,7 @@ fn what_was_not_seen_is_left_out_once_when_it_has_waited() {
     assert_eq!(view.sampled.unseen_since(), None);
     assert!(!view.see(4).finished, "given after it was left out");
     // Neither a part of a sample nor a HEARTBEAT makes it seen.
-    view.part(6, Seen::Part);
+    view.part(6, Completeness::Partial);
     let now = Timestamp(view.now);
     view.sampled
         .exist(SequenceNumber(8), FAR, now, &mut view.sequence);
@@ -277,12 +286,12 @@ fn a_forged_number_far_ahead_counts_as_one_message_and_ends_no_other() {
     for number in 1..=5 {
         view.see(number);
     }
-    view.part(6, Seen::Part);
-    let forged = view.part(1 << 40, Seen::Part);
+    view.part(6, Completeness::Partial);
+    let forged = view.part(1 << 40, Completeness::Partial);
     assert_eq!((forged.samples, forged.finished), (1, false));
-    assert!(view.part(1 << 40, Seen::Whole).finished);
-    assert!(!view.part(1 << 40, Seen::Whole).finished);
-    assert!(view.part(6, Seen::Whole).finished);
+    assert!(view.part(1 << 40, Completeness::Complete).finished);
+    assert!(!view.part(1 << 40, Completeness::Complete).finished);
+    assert!(view.part(6, Completeness::Complete).finished);
     assert_eq!(view.see(7).samples, 1);
     let now = Timestamp(view.now);
     let messages = view

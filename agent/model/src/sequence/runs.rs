@@ -60,7 +60,7 @@ impl Sequence {
             return number - self.next > reach;
         }
         let newer = source.is_some_and(|source| {
-            self.newest_source.0 > 0 && source.0 > self.newest_source.0.saturating_add(INCARNATION)
+            self.newest_source.0 > 0 && source > self.newest_source + INCARNATION
         });
         // A restarted writer fills no gaps of its previous run.
         let unconfirmed = self.unconfirmed.as_ref();
@@ -104,7 +104,7 @@ impl Sequence {
         let Some((first, _)) = run.numbers.first() else {
             return run;
         };
-        let jump = first.0.checked_sub(self.next.0);
+        let jump = (*first >= self.next).then(|| *first - self.next);
         // A run of only a few samples has no losses far from it.
         let most = match self.followed < CONFIRMATIONS {
             true => FAR,

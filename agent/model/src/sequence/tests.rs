@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use super::*;
 use ros2probe_wire::time::SECOND;
 
@@ -71,7 +73,7 @@ impl Bench {
             let (lost, irrelevant) = (&mut self.lost, &mut self.irrelevant);
             self.sequence.advance(
                 Timestamp(self.now),
-                (SECOND, SECOND),
+                (Duration::from_secs(1), Duration::from_secs(1)),
                 None,
                 &mut |settled| {
                     note(settled, lost, irrelevant);
@@ -192,7 +194,7 @@ fn what_the_writer_withdrew_is_decided_after_the_grace_and_not_the_window() {
     let mut lost = Vec::new();
     for (after, decided) in [(SECOND - 1, &[][..]), (SECOND, &[2, 3])] {
         let now = Timestamp(bench.now + after);
-        let windows = (10 * SECOND, SECOND);
+        let windows = (Duration::from_secs(10), Duration::from_secs(1));
         let mut note = |settled| note(settled, &mut lost, &mut Vec::new());
         bench.sequence.advance(now, windows, None, &mut note);
         assert_eq!(lost, decided);
@@ -391,11 +393,21 @@ fn checkpoints_do_not_pile_up_while_a_growing_sample_holds_the_others() {
             now,
             &mut count,
         );
-        sequence.advance(now, (SECOND, SECOND), Some(SequenceNumber(100)), &mut count);
+        sequence.advance(
+            now,
+            (Duration::from_secs(1), Duration::from_secs(1)),
+            Some(SequenceNumber(100)),
+            &mut count,
+        );
         let [.., checkpoints, _] = sequence.sizes();
         assert!(checkpoints.entries <= checkpoints.cap, "{checkpoints:?}");
     }
     let end = Timestamp(2000 * SECOND);
-    sequence.advance(end, (SECOND, SECOND), None, &mut count);
+    sequence.advance(
+        end,
+        (Duration::from_secs(1), Duration::from_secs(1)),
+        None,
+        &mut count,
+    );
     assert_eq!(lost, 9_998);
 }

@@ -3,6 +3,8 @@
 //! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
 //! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
 
+use std::time::Duration;
+
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::FAR;
@@ -12,7 +14,7 @@ pub(super) const CONFIRMATIONS: u8 = 5;
 /// Largest number of samples remembered per run; a datagram may contain several.
 const KEPT: usize = 32;
 /// Copies of one datagram arrive at several sockets within this time.
-const COPIES: i64 = 5_000_000;
+const COPIES: Duration = Duration::from_millis(5);
 
 /// The run, and unconfirmed claims of HEARTBEATs and GAPs.
 #[derive(Debug, Default)]
@@ -60,7 +62,7 @@ impl UnconfirmedRun {
             return (false, false);
         }
         let last = numbers.last().map(|(last, _)| *last);
-        let opens = last.is_none_or(|last| last.0.abs_diff(number.0) > FAR);
+        let opens = last.is_none_or(|last| last.distance(number) > FAR);
         if opens {
             self.run.numbers.clear();
             self.evidence = 0;
@@ -92,7 +94,7 @@ impl UnconfirmedRun {
     /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
         let last = self.run.numbers.last().filter(|_| self.evidence > 0);
-        last.is_some_and(|(last, _)| *last < live && last.0.abs_diff(number.0) <= FAR)
+        last.is_some_and(|(last, _)| *last < live && last.distance(number) <= FAR)
     }
 
     pub(super) fn is_whole(&self, number: SequenceNumber) -> bool {
@@ -133,7 +135,7 @@ impl UnconfirmedRun {
         if !is_same {
             self.claim = (next, now);
         }
-        is_same && now.nanoseconds_since(at) >= COPIES
+        is_same && now - at >= COPIES
     }
 
     /// Records the numbers that a GAP skips.

@@ -1,6 +1,8 @@
 //! Effects of time and discovery on deliveries: gaps settle, sockets get owners, receivers appear
 //! and vanish.
 
+use std::time::Duration;
+
 use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
@@ -11,7 +13,7 @@ use crate::receivers::{Matched, readers};
 use crate::route::Route;
 
 /// A route is dropped after this long without a record, unless it leads to a known reader.
-const FORGET: u64 = 60 * SECOND;
+const ROUTE_TIMEOUT: Duration = Duration::from_secs(60);
 
 impl Subscribers {
     /// Settles samples whose waiting time is over, and drops routes that have been silent for long.
@@ -28,7 +30,7 @@ impl Subscribers {
         self.expect(context, false);
         if now.0.is_multiple_of(SECOND) {
             self.routes.retain(|known| {
-                known.matched == Matched::Yes || known.last_seen.0.saturating_add(FORGET) > now.0
+                known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
             });
             self.drop_orphans(context);
         }

@@ -112,8 +112,8 @@ fn a_vanished_topic_stays_for_its_grace_period() {
         Timestamp(1),
     );
     topics.leave(id, guid(1), Timestamp(100));
-    topics.expire(Timestamp(599), 500);
+    topics.expire(Timestamp(599), Duration::from_nanos(500));
     assert!(topics.get(id).unwrap().is_vanished());
-    topics.expire(Timestamp(600), 500);
+    topics.expire(Timestamp(600), Duration::from_nanos(500));
     assert!(topics.is_empty());
 }

@@ -117,7 +117,7 @@ fn a_message_is_sent_from_its_first_to_its_last_fragment_and_settled_by_each_rea
     assert_eq!((sent.message.size, sent.message.fragments), (10_000, 10));
     assert_eq!(sent.message.source, RtpsTime(99));
     assert_eq!(tracer.size().0, 1);
-    tracer.advance(Timestamp(1_900 + PATIENCE + 1));
+    tracer.advance(Timestamp(1_901) + ACKNACK_TIMEOUT);
     assert_eq!(tracer.size(), (0, MAX_OPEN, 0));
     assert_eq!(take(&mut tracer, &[acknack(reader(3), 9, 9_000)], 1.0), []);
 }
@@ -210,7 +210,7 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
     assert_eq!(taken.spans.len(), MAX_FINISHED);
     assert!(taken.lost > 10_000);
     tracer.forget(WRITER);
-    tracer.advance(Timestamp(SECOND + PATIENCE + 1));
+    tracer.advance(Timestamp(SECOND + 1) + ACKNACK_TIMEOUT);
     assert_eq!(tracer.size().0, 0);
 }
 

@@ -15,7 +15,7 @@ impl Writer {
     ) {
         let source = source.timestamp();
         if self.traits.keeps_history {
-            let old = source.is_none_or(|source| source.0.saturating_add(HISTORY) < wall_clock.0);
+            let old = source.is_none_or(|source| source + HISTORY < wall_clock);
             let first = self.reception.sequence().first();
             if !newest || number < first || number == first && old {
                 return;
@@ -27,7 +27,7 @@ impl Writer {
         let mut negative = false;
         if let Some(source) = source {
             let delay = wall_clock.nanoseconds_since(source);
-            let is_plausible = source.0.abs_diff(wall_clock.0) <= PLAUSIBLE;
+            let is_plausible = source.distance(wall_clock) <= PLAUSIBLE;
             self.implausible_latency += u64::from(!is_plausible);
             negative |= delay < 0;
             if delay >= 0 && is_plausible {

@@ -6,7 +6,7 @@ use ros2probe_wire::{Record, Timestamp};
 use super::{Counted, MeasurementContext, Writer, reach, record_time, seconds};
 use crate::dispatch::MissedReason;
 use crate::journal::{Journal, Missing};
-use crate::sampled::{Sampled, SampledUpdate, Seen};
+use crate::sampled::{Completeness, Sampled, SampledUpdate};
 use crate::samples::Budget;
 
 impl Writer {
@@ -58,7 +58,7 @@ impl Writer {
         }
         let reach = reach(record);
         let sequence = self.reception.sequence_mut();
-        let told = match record.body() {
+        let announced = match record.body() {
             Body::Sample(sample) => {
                 let update = self.sampled_update(sample, reach, context.budget)?;
                 return self.sampled_sample(
@@ -78,8 +78,8 @@ impl Writer {
             }
             Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
         };
-        self.tally.messages += told;
-        self.tally.window.current(now).messages += told;
+        self.tally.messages += announced;
+        self.tally.window.current(now).messages += announced;
         None
     }
 
@@ -104,10 +104,10 @@ impl Writer {
         };
         let is_exact = sample.record().flags & flag::EXACT != 0;
         let seen = match is_whole {
-            true => Seen::Whole,
+            true => Completeness::Complete,
             // Polling shared memory may yield a sample after the uprobe did.
-            false if sample.is_end() && !is_exact => Seen::Tail,
-            false => Seen::Part,
+            false if sample.is_end() && !is_exact => Completeness::LastFragment,
+            false => Completeness::Partial,
         };
         let sequence = self.reception.sequence_mut();
         Some(sampled.sample((number, seen, source), reach, now, sequence))
@@ -125,7 +125,11 @@ impl Writer {
                 self.reception.assemble(fragments, false, context.budget)
             }
         };
-        let seen = if is_whole { Seen::Whole } else { Seen::Part };
+        let seen = if is_whole {
+            Completeness::Complete
+        } else {
+            Completeness::Partial
+        };
         let number = sample.sequence_number();
         let update = self.sampled.as_mut()?.catch_up(number, seen);
         let now = record_time(sample.record());
@@ -143,12 +147,12 @@ impl Writer {
         let disposals = u64::from(!is_message && update.samples > 0);
         let messages = update.samples - disposals;
         let bytes = u64::from(sample.size());
-        let told = (update.alike - disposals).saturating_mul(bytes);
+        let alike_bytes = (update.alike - disposals).saturating_mul(bytes);
         self.tally.messages += messages;
-        self.tally.bytes = self.tally.bytes.saturating_add(told);
+        self.tally.bytes = self.tally.bytes.saturating_add(alike_bytes);
         let slot = self.tally.window.current(now);
         slot.messages += messages;
-        slot.bytes = slot.bytes.saturating_add(told);
+        slot.bytes = slot.bytes.saturating_add(alike_bytes);
         if messages > 0 {
             self.last_message = self.last_message.max(Some(now));
         }

@@ -4,6 +4,7 @@ use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::allocator;
 use ros2probe_model::history::History;
@@ -207,7 +208,10 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
     let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
     let before = allocator::held();
     let mut observer = observer();
-    let mut history = History::new(SECONDS, Limits::default().topics);
+    let mut history = History::new(
+        Duration::from_secs(SECONDS as u64),
+        Limits::default().topics,
+    );
     let mut largest = Largest::new();
     let (mut half, mut now) = (0, START);
     for turn in 0..messages {
@@ -311,7 +315,7 @@ fn forged_record(dice: &mut Dice, newest: u64, now: u64) -> Record {
     if is_sent {
         flags |= flag::OUTGOING;
     } else if dice.pick(3) == 0 {
-        flags |= [flag::NO_ROOM, flag::NOT_REASSEMBLED][dice.pick(2) as usize];
+        flags |= [flag::SOCKET_FULL, flag::NOT_REASSEMBLED][dice.pick(2) as usize];
     }
     let directed = match dice.pick(3) {
         0 if kind != kind::ACKNACK => Guid::default(),

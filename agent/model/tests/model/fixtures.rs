@@ -111,7 +111,7 @@ fn participants(name: &str, facts: &Facts, replayed: &Replayed) {
             found.contains(vendor) || vendor.contains(&found),
             "{ours:?}"
         );
-        let lease = ours.lease.nanoseconds().map(|lease| lease as f64 / 1e9);
+        let lease = ours.lease.seconds();
         assert_eq!(lease, Some(theirs.lease), "{name}: lease of {guid}");
         assert_eq!(
             (ours.domain_id, ours.enclave.as_deref()),
@@ -177,16 +177,9 @@ fn endpoints(name: &str, facts: &Facts, replayed: &Replayed) {
         };
         assert_eq!(ours.history(), history, "{what}");
         let lifespan = theirs.lifespan.as_ref().and_then(serde_json::Value::as_f64);
+        assert_eq!(ours.qos.lifespan.seconds(), lifespan, "{what}");
         assert_eq!(
-            ours.qos
-                .lifespan
-                .nanoseconds()
-                .map(|span| span as f64 / 1e9),
-            lifespan,
-            "{what}"
-        );
-        assert_eq!(
-            (ours.qos.deadline.nanoseconds(), ours.qos.liveliness.label()),
+            (ours.qos.deadline.finite(), ours.qos.liveliness.label()),
             (None, "AUTOMATIC")
         );
         let hash = theirs
@@ -426,14 +419,14 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
         }
         let at = line.t + SETTLED;
         // A node lists itself before it announces itself.
-        let told = facts
+        let reported = facts
             .ros_discovery_info
             .iter()
             .filter(|sample| sample.t < at as f64 / 1e9);
-        let told: BTreeSet<_> = told
+        let reported: BTreeSet<_> = reported
             .flat_map(|sample| sample.nodes.iter().map(truth::FactsNode::name))
             .collect();
-        if !line.nodes.iter().all(|node| told.contains(node)) {
+        if !line.nodes.iter().all(|node| reported.contains(node)) {
             continue;
         }
         let Some(view) = replayed.view_at(at) else {

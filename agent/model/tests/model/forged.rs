@@ -9,7 +9,7 @@ use ros2probe_model::dispatch::{Dispatch, SampleOutcome};
 use ros2probe_model::input::Input;
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_model::snapshot::Measurement;
-use ros2probe_testing::model::host::{BOB, Host, Seen};
+use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
 
@@ -50,7 +50,7 @@ impl Run {
         }
     }
 
-    fn play(&self, forgery: &dyn Fn(&mut Host, Seen)) -> Host {
+    fn play(&self, forgery: &dyn Fn(&mut Host, CapturePoint)) -> Host {
         let mut host = Host::new();
         host.writer(self.reliable);
         let bob = host.reader(BOB, 7411);
@@ -71,7 +71,7 @@ impl Run {
         host
     }
 
-    fn counts(&self, forgery: &dyn Fn(&mut Host, Seen)) -> Counts {
+    fn counts(&self, forgery: &dyn Fn(&mut Host, CapturePoint)) -> Counts {
         let host = self.play(forgery);
         let facts = host.measurement();
         let deliveries = host.deliveries();
@@ -90,12 +90,17 @@ impl Run {
     }
 
     /// Asserts that the counts with this forgery equal those without, plus `more` messages.
-    fn stays_exact(&self, more: u64, forgery: &dyn Fn(&mut Host, Seen)) {
+    fn stays_exact(&self, more: u64, forgery: &dyn Fn(&mut Host, CapturePoint)) {
         self.stays_exact_but(more, 0, forgery);
     }
 
     /// Asserts the same, except that `unmeasured` latencies are missing.
-    fn stays_exact_but(&self, more: u64, unmeasured: u64, forgery: &dyn Fn(&mut Host, Seen)) {
+    fn stays_exact_but(
+        &self,
+        more: u64,
+        unmeasured: u64,
+        forgery: &dyn Fn(&mut Host, CapturePoint),
+    ) {
         let honest = self.counts(&|_, _| {});
         assert_eq!((honest.messages, honest.delivered), (990, 990));
         let expected = Counts {
@@ -506,7 +511,7 @@ proptest! {
         seconds in -100_000_i64..100_000,
     ) {
         let run = Run::new(reliable, if is_slow { 1000 } else { 10 });
-        let forgery = |host: &mut Host, bob: Seen| {
+        let forgery = |host: &mut Host, bob: CapturePoint| {
             let record = stamped(host.record(bob, kind, number), seconds);
             let last = number + length;
             host.put(match kind {

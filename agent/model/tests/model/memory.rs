@@ -15,7 +15,7 @@ use ros2probe_model::limits::{Limit, Limits};
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
-use ros2probe_testing::model::host::{self, BOB, Host, Seen};
+use ros2probe_testing::model::host::{self, BOB, CapturePoint, Host};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 
@@ -36,7 +36,7 @@ fn an_idle_delivery_takes_less_than_a_kibibyte_and_a_half() {
     const ROUNDS: u64 = 6;
     let mut worlds: Vec<_> = (0..ROUNDS).map(|_| Host::new()).collect();
     let address = worlds[0].reader(BOB, 7411);
-    let at = |socket: u64| Seen {
+    let at = |socket: u64| CapturePoint {
         socket,
         ..address.multicast(socket)
     };
@@ -167,7 +167,7 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
         pages.push(exposition.render(Format::Classic).unwrap());
     }
     let all = resident() - before;
-    let mut told = String::new();
+    let mut reported = String::new();
     let mut expected = 0;
     for facts in sources.limits.facts(&sources.latest.state()) {
         let row = facts.limit.row();
@@ -180,13 +180,13 @@ fn entries_take_no_more_than_the_table_of_limits_says() {
                 | Limit::Flows
         );
         if is_modelled {
-            told.push_str(&format!("{} {} of {}, ", row.key, facts.used, facts.cap));
-            assert!(facts.used * 10 >= facts.cap * 9, "{told}");
+            reported.push_str(&format!("{} {} of {}, ", row.key, facts.used, facts.cap));
+            assert!(facts.used * 10 >= facts.cap * 9, "{reported}");
             expected += row.bytes * row.default;
         }
     }
     println!(
-        "{told}model {} KiB, with two snapshots and pages ({} KiB each) {} KiB, table {} KiB",
+        "{reported}model {} KiB, with two snapshots and pages ({} KiB each) {} KiB, table {} KiB",
         modelled >> 10,
         pages[0].len() >> 10,
         all >> 10,

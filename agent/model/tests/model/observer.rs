@@ -9,16 +9,15 @@ mod lifecycle;
 mod storms;
 mod unknown_writers;
 
-use std::sync::Arc;
+use std::ops::{Deref, DerefMut};
 
 use ros2probe_model::event::EventKind;
-use ros2probe_model::input::Input;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Measurement, Snapshot, TopicFacts};
-use ros2probe_model::watch::{Expectations, Watch, Watchlist};
-use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_model::observer::Settings;
+use ros2probe_model::snapshot::{Measurement, TopicFacts};
+use ros2probe_testing::model::domain::{VirtualDomain, watchlist};
+use ros2probe_testing::model::forge::Message;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix};
 
 const START: u64 = 1_795_143_000 * SECOND;
 
@@ -36,12 +35,23 @@ const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
 
 const BOB: GuidPrefix = GuidPrefix(*b"\x01\x10bobby-host");
 
-/// An observer in virtual time.
+/// A domain in virtual time.
 struct World {
-    observer: Observer,
-    now: u64,
-    /// Domain whose multicast port receives everything.
-    domain_id: u16,
+    domain: VirtualDomain,
+}
+
+impl Deref for World {
+    type Target = VirtualDomain;
+
+    fn deref(&self) -> &VirtualDomain {
+        &self.domain
+    }
+}
+
+impl DerefMut for World {
+    fn deref_mut(&mut self) -> &mut VirtualDomain {
+        &mut self.domain
+    }
 }
 
 impl World {
@@ -50,49 +60,20 @@ impl World {
     }
 
     fn with(patterns: &[&str], settings: Settings) -> Self {
-        let mut observer = Observer::new(settings);
-        observer.input(Input::Watchlist(Arc::new(watchlist(patterns))));
-        observer.input(Input::Time(Timestamp(START)));
         Self {
-            observer,
-            now: START,
-            domain_id: 0,
+            domain: VirtualDomain::new(patterns, settings),
         }
     }
 
-    fn put(&mut self, message: Message) {
-        let envelope = forge::multicast(self.now, self.domain_id);
-        self.observer.input(Input::Datagram {
-            envelope: &envelope,
-            payload: &message.bytes(),
-            handover: None,
-        });
-    }
-
-    fn wait(&mut self, milliseconds: u64) {
-        self.now += milliseconds * MILLISECOND;
-        self.observer.input(Input::Time(Timestamp(self.now)));
-    }
-
     fn spdp(&mut self, prefix: GuidPrefix, lease_seconds: u32) {
-        let payload = forge::participant(prefix, lease_seconds, None);
-        self.put(Message::from(prefix).data(SPDP, 1, &payload));
+        self.participant(prefix, lease_seconds);
     }
 
     fn sedp(&mut self, guid: Guid, topic: &str) {
-        let (sedp, number) = match guid.entity.is_writer() {
-            true => (SEDP_WRITERS, u64::from(guid.entity.0[2])),
-            false => (SEDP_READERS, u64::from(guid.entity.0[2])),
-        };
-        let payload = forge::endpoint(guid, topic, STRING, true);
-        self.put(Message::from(guid.prefix).data(sedp, number, &payload));
+        self.endpoint(guid, guid.entity.0[2].into(), topic);
     }
 
-    fn nodes(&mut self, prefix: GuidPrefix, number: u64, nodes: &[(&str, &str, Guid)]) {
-        let payload = forge::entities(prefix, 24, nodes);
-        self.put(Message::from(prefix).data(NODES, number, &payload));
-    }
-
+    /// Sends a sample with the current time as its timestamp.
     fn sample(&mut self, guid: Guid, number: u64) {
         let message = Message::from(guid.prefix).info_ts(self.now);
         self.put(message.data(guid.entity, number, &[0, 1, 0, 0, 9, 9, 9, 9]));
@@ -104,10 +85,6 @@ impl World {
             self.sample(guid, number);
             self.wait(10);
         }
-    }
-
-    fn snapshot(&self) -> Snapshot {
-        self.observer.snapshot(Timestamp(self.now))
     }
 
     fn topic(&self, domain_id: u32, name: &str) -> Option<TopicFacts> {
@@ -133,8 +110,8 @@ impl World {
     /// Returns the events since the last call, with their times since the start.
     fn events(&mut self) -> Vec<(u64, EventKind)> {
         let events = self.observer.drain().events.events.into_iter();
-        let told = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
-        told.collect()
+        let reported = events.map(|event| ((event.at.0 - START) / MILLISECOND, event.kind));
+        reported.collect()
     }
 
     fn node_names(&self) -> Vec<String> {
@@ -144,18 +121,6 @@ impl World {
             .map(|node| node.name.to_string())
             .collect()
     }
-}
-
-fn watchlist(patterns: &[&str]) -> Watchlist {
-    let watch = |pattern: &&str| Watch {
-        pattern: (*pattern).to_owned(),
-        domain_id: None,
-        expectations: Expectations::default(),
-        per_subscriber: false,
-        trace: 0.0,
-        retain: ros2probe_model::watch::Retain::None,
-    };
-    Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
 
 fn alice(entity: EntityId) -> Guid {

@@ -10,7 +10,9 @@ use ros2probe_model::observer::Settings;
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 use ros2probe_testing::model::forge;
 use ros2probe_testing::model::forge::Message;
-use ros2probe_testing::model::host::{ALICE, BOB, Host, MILLISECOND, READER, START, Seen, WRITER};
+use ros2probe_testing::model::host::{
+    ALICE, BOB, CapturePoint, Host, MILLISECOND, READER, START, WRITER,
+};
 use ros2probe_wire::record::kind;
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
@@ -30,7 +32,7 @@ fn sample_requests(host: &mut Host, ids: &[u64], depth: Depth) {
 }
 
 /// Returns a host with a reader of Bob's that acknowledges.
-fn listening() -> (Host, Seen) {
+fn listening() -> (Host, CapturePoint) {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     request(&mut host, Depth::Arrivals);
@@ -258,7 +260,7 @@ proptest! {
         host.wait(15_000);
         let mut times = Vec::new();
         let mut numbers = Vec::new();
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for given in host.observer.drain().samples {
             match given.outcome {
                 SampleOutcome::Sample(sample) => {
@@ -267,14 +269,14 @@ proptest! {
                 }
                 SampleOutcome::Missed(missed) => {
                     prop_assert_eq!(missed.reason, MissedReason::Lost);
-                    told.extend(missed.first.0..=missed.last.0);
+                    reported.extend(missed.first.0..=missed.last.0);
                 }
             }
         }
         prop_assert_eq!(numbers, expected);
         prop_assert!(times.is_sorted());
-        prop_assert_eq!(told.len() as u64, host.measurement().lost);
-        prop_assert_eq!(told, lost);
+        prop_assert_eq!(reported.len() as u64, host.measurement().lost);
+        prop_assert_eq!(reported, lost);
         prop_assert_eq!(host.measurement().messages, times.len() as u64);
     }
 }
@@ -284,7 +286,7 @@ const DORA: GuidPrefix = GuidPrefix(*b"\x01\x10dora-sends");
 /// A host on which Dora's writer sends before its announcement, with Bob's reader.
 struct Unannounced {
     host: Host,
-    bob: Seen,
+    bob: CapturePoint,
 }
 
 impl Unannounced {
@@ -372,7 +374,7 @@ fn a_subscription_gets_what_preceded_the_announcement_since_it_began() {
     dora.announce(false);
     dora.data(5);
     let given = dora.host.observer.drain().samples.into_iter();
-    let mut told: Vec<_> = given
+    let mut reported: Vec<_> = given
         .filter_map(|given| match given.outcome {
             SampleOutcome::Missed(missed) => {
                 Some((given.to.to_vec(), missed.first.0, missed.last.0))
@@ -380,8 +382,8 @@ fn a_subscription_gets_what_preceded_the_announcement_since_it_began() {
             SampleOutcome::Sample(_) => None,
         })
         .collect();
-    told.sort();
-    assert_eq!(told, [(vec![1], 1, 4), (vec![2], 4, 4)]);
+    reported.sort();
+    assert_eq!(reported, [(vec![1], 1, 4), (vec![2], 4, 4)]);
 }
 
 #[test]
@@ -410,8 +412,8 @@ fn a_sample_before_the_announcement_never_repeated_is_unannounced() {
             dora.data(7);
         }
         if reliable && !acknowledged {
-            let told: Vec<_> = missed(&mut dora.host);
-            assert_eq!(told.len(), 2, "{told:?}");
+            let reported: Vec<_> = missed(&mut dora.host);
+            assert_eq!(reported.len(), 2, "{reported:?}");
         }
         assert_eq!(dora.host.measurement().lost, 0);
     }

@@ -150,15 +150,15 @@ fn everything_shown_is_restored_and_the_filter_updated() {
         Guid { entity: NODES, .. } => Verdict::Capture,
         _ => Verdict::Meter,
     };
-    let mut told = after.drain().interest;
-    told.sort_unstable_by_key(|(guid, _)| *guid);
+    let mut reported = after.drain().interest;
+    reported.sort_unstable_by_key(|(guid, _)| *guid);
     let all = [ALICE, BOB].map(|prefix| [NODES, WRITER, READER].map(|it| Guid::new(prefix, it)));
     let all: Vec<_> = all
         .as_flattened()
         .iter()
         .map(|it| (*it, Some(wanted(*it))))
         .collect();
-    assert_eq!(told, all);
+    assert_eq!(reported, all);
     let churn = after.snapshot(Timestamp(at)).churn;
     assert!(churn.is_empty(), "nothing happened to the robot: {churn:?}");
 }

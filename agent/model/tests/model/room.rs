@@ -1,21 +1,19 @@
 //! Tables filled by forgeries: a real newcomer of higher priority is admitted, existing entries
 //! stay, and no flood makes a packet expensive.
 
+use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ros2probe_model::input::Input;
 use ros2probe_model::limits::Limits;
-use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Snapshot, SocketFacts, TopicFacts};
-use ros2probe_model::watch::{Watch, Watchlist};
-use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_model::observer::Settings;
+use ros2probe_model::snapshot::{SocketFacts, TopicFacts};
+use ros2probe_testing::model::domain::{VirtualDomain, watchlist};
+use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
-use ros2probe_wire::time::MILLISECOND;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record};
 
-const START: u64 = 1_795_143_000_000 * MILLISECOND;
-const STRING: &str = "std_msgs::msg::dds_::String_";
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
 const READER: EntityId = EntityId([0, 0, 0x13, 0x04]);
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
@@ -25,62 +23,46 @@ const CAROL: GuidPrefix = GuidPrefix(*b"\x01\x10carol-host");
 const LEASE: u32 = 10_000;
 
 struct World {
-    observer: Observer,
-    now: u64,
+    domain: VirtualDomain,
+}
+
+impl Deref for World {
+    type Target = VirtualDomain;
+
+    fn deref(&self) -> &VirtualDomain {
+        &self.domain
+    }
+}
+
+impl DerefMut for World {
+    fn deref_mut(&mut self) -> &mut VirtualDomain {
+        &mut self.domain
+    }
 }
 
 impl World {
     fn new(patterns: &[&str], limits: &Limits) -> Self {
-        let mut observer = Observer::new(Settings::default().with_limits(limits));
-        observer.input(Input::Watchlist(Arc::new(watchlist(patterns))));
-        observer.input(Input::Time(Timestamp(START)));
+        let settings = Settings::default().with_limits(limits);
         Self {
-            observer,
-            now: START,
+            domain: VirtualDomain::new(patterns, settings),
         }
     }
 
-    fn put(&mut self, message: Message) {
-        let envelope = forge::multicast(self.now, 0);
-        self.observer.input(Input::Datagram {
-            envelope: &envelope,
-            payload: &message.bytes(),
-            handover: None,
-        });
-    }
-
-    fn wait(&mut self, milliseconds: u64) {
-        self.now += milliseconds * MILLISECOND;
-        self.observer.input(Input::Time(Timestamp(self.now)));
-    }
-
     fn spdp(&mut self, prefix: GuidPrefix) {
-        let payload = forge::participant(prefix, LEASE, None);
-        self.put(Message::from(prefix).data(SPDP, 1, &payload));
+        self.participant(prefix, LEASE);
     }
 
     fn sedp(&mut self, guid: Guid, topic: &str) {
-        let sedp = match guid.entity.is_writer() {
-            true => SEDP_WRITERS,
-            false => SEDP_READERS,
-        };
-        let payload = forge::endpoint(guid, topic, STRING, true);
-        self.put(Message::from(guid.prefix).data(sedp, 1, &payload));
+        self.endpoint(guid, 1, topic);
     }
 
-    fn nodes(&mut self, prefix: GuidPrefix, names: &[String]) {
+    fn name_nodes(&mut self, prefix: GuidPrefix, names: &[String]) {
         let writer = Guid::new(prefix, WRITER);
         let nodes: Vec<_> = names
             .iter()
             .map(|name| ("/", name.as_str(), writer))
             .collect();
-        let payload = forge::entities(prefix, 24, &nodes);
-        self.put(Message::from(prefix).data(EntityId([0, 0, 4, 3]), 1, &payload));
-    }
-
-    fn sample(&mut self, guid: Guid, number: u64) {
-        let payload = [0, 1, 0, 0, 9, 9, 9, 9];
-        self.put(Message::from(guid.prefix).data(guid.entity, number, &payload));
+        self.nodes(prefix, 1, &nodes);
     }
 
     /// Sends a packet of this participant from its socket on this host.
@@ -111,10 +93,6 @@ impl World {
         assert!(self.table("participants").0 >= u64::from(count));
     }
 
-    fn snapshot(&self) -> Snapshot {
-        self.observer.snapshot(Timestamp(self.now))
-    }
-
     fn knows(&self, prefix: GuidPrefix) -> bool {
         let known = self.snapshot().participants;
         known.iter().any(|known| known.guid.prefix == prefix)
@@ -135,11 +113,6 @@ impl World {
         let table = tables.find(|table| table.table == name).unwrap();
         (table.size, table.evictions)
     }
-}
-
-fn watchlist(patterns: &[&str]) -> Watchlist {
-    let watch = |pattern: &&str| Watch::named(pattern).unwrap();
-    Watchlist::new(patterns.iter().map(watch).collect()).unwrap()
 }
 
 fn forged(number: u32) -> GuidPrefix {
@@ -480,12 +453,12 @@ fn nodes_of_a_participant_that_is_worth_more_find_room_among_forged_ones() {
     let names: Vec<_> = (0..600).map(|number| format!("forged_{number}")).collect();
     for number in 0..8 {
         world.spdp(forged(number));
-        world.nodes(forged(number), &names);
+        world.name_nodes(forged(number), &names);
     }
     assert_eq!(world.table("nodes").0, 4096);
     world.spdp(ALICE);
     world.sedp(writer(ALICE), "rt/points");
-    world.nodes(ALICE, &["driver".to_owned()]);
+    world.name_nodes(ALICE, &["driver".to_owned()]);
     let nodes = world.snapshot().nodes;
     assert!(nodes.iter().any(|node| node.name == "/driver"));
     assert!(world.table("nodes").0 <= 4096);

@@ -126,7 +126,7 @@ impl Dissection {
         let (prefix, entity) = writer.split_at(24);
         let mut samples = Samples::default();
         let mut fragments: BTreeMap<u64, BTreeSet<u32>> = BTreeMap::new();
-        let (mut began, mut newest, mut told) = (None, 0, 0);
+        let (mut began, mut newest, mut announced) = (None, 0, 0);
         let mut requested = BTreeSet::new();
         for frame in &self.frames {
             let own = frame.prefix == prefix;
@@ -146,7 +146,8 @@ impl Dissection {
                         let counts = number > *began.get_or_insert(number);
                         let missed = number < newest || requested.contains(&number);
                         samples.retransmitted += u64::from(counts && missed);
-                        samples.announced_early += u64::from(counts && !missed && number <= told);
+                        samples.announced_early +=
+                            u64::from(counts && !missed && number <= announced);
                         samples.whole.insert(number, frame.time);
                         samples.extend(number);
                         newest = newest.max(number);
@@ -164,7 +165,7 @@ impl Dissection {
                         }
                         samples.extend(number);
                     }
-                    Content::Heartbeat { last } => told = told.max(last),
+                    Content::Heartbeat { last } => announced = announced.max(last),
                     Content::Request { .. } | Content::Other => {}
                 }
             }

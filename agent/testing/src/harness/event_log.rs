@@ -55,7 +55,7 @@ impl EventLog {
         for event in self.0.iter().filter(|event| event.ev == ev) {
             let number = event.seq.context("an event without a number")? + 1;
             ensure!(
-                event.sn.is_none_or(|told| told == number),
+                event.sn.is_none_or(|sn| sn == number),
                 "the writer did not number its samples one by one: {event:?}"
             );
             ensure!(numbers.insert(number), "twice: {event:?}");

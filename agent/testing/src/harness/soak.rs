@@ -125,7 +125,7 @@ impl Curve {
         stop: &AtomicBool,
     ) -> Result<Curve> {
         let since = Instant::now();
-        let (mut needs, mut next, mut told) = (Vec::new(), since, since);
+        let (mut needs, mut next, mut logged) = (Vec::new(), since, since);
         while !stop.load(Ordering::Relaxed) {
             if Instant::now() < next {
                 std::thread::sleep(Duration::from_millis(50));
@@ -133,8 +133,8 @@ impl Curve {
             }
             next = Instant::now() + period;
             let need = Need::of(pid, host, since)?;
-            if told.elapsed() >= Duration::from_secs(60) {
-                told = Instant::now();
+            if logged.elapsed() >= Duration::from_secs(60) {
+                logged = Instant::now();
                 eprintln!("{name}: {need}");
             }
             needs.push(need);

@@ -29,14 +29,14 @@ const STRING: &str = "std_msgs::msg::dds_::String_";
 
 /// Place at which a record is seen.
 #[derive(Clone, Copy)]
-pub struct Seen {
+pub struct CapturePoint {
     pub socket: u64,
     pub address: SocketAddrV4,
     pub directed: Option<GuidPrefix>,
     pub flags: u16,
 }
 
-impl Seen {
+impl CapturePoint {
     /// Returns the same receiver's multicast socket.
     pub fn multicast(self, socket: u64) -> Self {
         Self {
@@ -118,11 +118,11 @@ impl Host {
     }
 
     /// Adds a participant with one reader, at this unicast port.
-    pub fn reader(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
+    pub fn reader(&mut self, prefix: GuidPrefix, port: u16) -> CapturePoint {
         let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
         self.participant(prefix, address);
         self.subscribe(prefix, 1);
-        Seen {
+        CapturePoint {
             socket: port.into(),
             address,
             directed: None,
@@ -148,12 +148,12 @@ impl Host {
     }
 
     /// Adds a participant with a reader of another topic only.
-    pub fn bystander(&mut self, prefix: GuidPrefix, port: u16) -> Seen {
+    pub fn bystander(&mut self, prefix: GuidPrefix, port: u16) -> CapturePoint {
         let address = SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, 2), port);
         self.participant(prefix, address);
         let payload = forge::endpoint(Guid::new(prefix, READER), "rt/other", STRING, true);
         self.announce(Message::from(prefix).data(SEDP_READERS, 1, &payload));
-        Seen {
+        CapturePoint {
             socket: port.into(),
             address,
             directed: None,
@@ -162,7 +162,7 @@ impl Host {
     }
 
     /// Reports that the participant's process holds the socket, as its own packets show.
-    pub fn owner(&mut self, seen: Seen, prefix: GuidPrefix) {
+    pub fn owner(&mut self, seen: CapturePoint, prefix: GuidPrefix) {
         let process_id = u32::from(prefix.0[2]);
         let sending = 1000 + u64::from(process_id);
         for cookie in [sending, seen.socket] {
@@ -203,7 +203,7 @@ impl Host {
     }
 
     /// Returns a record of Alice's writer.
-    pub fn record(&self, seen: Seen, kind: u8, number: u64) -> Record {
+    pub fn record(&self, seen: CapturePoint, kind: u8, number: u64) -> Record {
         let [a, b, c, d] = seen.address.ip().octets();
         let directed = seen
             .directed
@@ -237,22 +237,22 @@ impl Host {
         self.observer.input(Input::Record(&record));
     }
 
-    pub fn data(&mut self, seen: Seen, number: u64) {
+    pub fn data(&mut self, seen: CapturePoint, number: u64) {
         self.put(self.record(seen, kind::DATA, number));
     }
 
     /// Reports that the socket had no room for the record.
-    pub fn no_room(&mut self, seen: Seen, number: u64) {
+    pub fn socket_full(&mut self, seen: CapturePoint, number: u64) {
         let arrival = self.record(seen, kind::DATA, number);
         self.put(Record {
-            flags: seen.flags | flag::NO_ROOM,
+            flags: seen.flags | flag::SOCKET_FULL,
             ..arrival
         });
         self.put(arrival);
     }
 
     /// Returns fragments of a sample with ten, joined over `elapsed` nanoseconds.
-    pub fn fragments(&self, seen: Seen, number: u64, start: u32, count: u32) -> Record {
+    pub fn fragments(&self, seen: CapturePoint, number: u64, start: u32, count: u32) -> Record {
         Record {
             fragment_start: start,
             fragments: count << 16 | 1000,
@@ -264,7 +264,7 @@ impl Host {
         }
     }
 
-    pub fn heartbeat(&mut self, seen: Seen, first: u64, last: u64) {
+    pub fn heartbeat(&mut self, seen: CapturePoint, first: u64, last: u64) {
         self.put(Record {
             payload_len: u32::try_from(last >> 32).unwrap(),
             encapsulation: last as u32,
@@ -273,12 +273,12 @@ impl Host {
     }
 
     /// Acknowledges all samples below `base` by Bob's reader.
-    pub fn acknack(&mut self, bob: Seen, base: u64) {
+    pub fn acknack(&mut self, bob: CapturePoint, base: u64) {
         self.request(bob, base, 0, 0);
     }
 
     /// Acknowledges, and requests some of the next `bits` samples.
-    pub fn request(&mut self, bob: Seen, base: u64, bits: u32, bitmap: u32) {
+    pub fn request(&mut self, bob: CapturePoint, base: u64, bits: u32, bitmap: u32) {
         self.put(Record {
             reader: guid_words(Guid::new(BOB, READER)),
             stamp_seconds: bits,
@@ -288,7 +288,7 @@ impl Host {
     }
 
     /// Announces that this sample will not be sent.
-    pub fn gap(&mut self, seen: Seen, number: u64) {
+    pub fn gap(&mut self, seen: CapturePoint, number: u64) {
         self.put(Record {
             payload_len: 0,
             encapsulation: u32::try_from(number).unwrap() + 1,

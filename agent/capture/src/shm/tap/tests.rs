@@ -379,7 +379,7 @@ fn a_flood_at_one_port_does_not_starve_the_others() {
     let descriptor = segment.put(&sample(1));
     let mut found = Vec::new();
     for round in 0..4 {
-        for _ in 0..2 * PER_LOOK_IN_A_HURRY {
+        for _ in 0..2 * MAX_PER_URGENT_POLL {
             flooded.push(descriptor);
         }
         if round == 0 {

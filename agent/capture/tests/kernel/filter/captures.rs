@@ -186,7 +186,7 @@ fn compare(path: &Path, interest: &BTreeMap<Guid, Verdict>) -> (usize, usize) {
     let (mut user, mut records, mut captures) = (user_space(), 0, 0);
     let mut runs = Runs::default();
     for (number, packet) in packets.iter().enumerate() {
-        let Seen {
+        let FrameResult {
             kept,
             records: found,
         } = kernel.frame(&packet.bytes);

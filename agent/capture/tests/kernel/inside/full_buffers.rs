@@ -88,14 +88,14 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         let records = observed.records(writer, SETTLED);
         let (refused, seen): (Vec<_>, Vec<_>) = records
             .iter()
-            .partition(|record| record.flags & flag::NO_ROOM != 0);
+            .partition(|record| record.flags & flag::SOCKET_FULL != 0);
         assert_eq!(fragment_numbers(refused.iter().copied()), missing);
         assert_eq!(refused.len(), missing.len());
         assert_eq!(fragment_numbers(seen.iter().copied()), sent);
         for record in &refused {
             // Each cancels one arrival: the same record except for the flag.
             let arrival = Record {
-                flags: record.flags & !flag::NO_ROOM,
+                flags: record.flags & !flag::SOCKET_FULL,
                 ..**record
             };
             assert!(seen.contains(&&arrival), "{record:?}");
@@ -105,7 +105,7 @@ fn what_a_socket_has_no_room_for_is_named_and_nothing_else() {
         let errors = after.0 + after.1 - before.0 - before.1;
         assert_eq!(errors, missing.len() as u64);
         let socket = observed.filter.socket(cookie(&receiver)).unwrap().unwrap();
-        assert_eq!(socket.no_room, errors);
+        assert_eq!(socket.rcvbuf_errors, errors);
         let owner = &observed.owners(cookie(&receiver))[&cookie(&receiver)];
         assert_eq!(owner.drops.map(u64::from), Some(errors));
     }
@@ -144,7 +144,7 @@ fn without_btf_full_sockets_are_reported_while_every_socket_is_seen() {
     assert!(!missing.is_empty() && missing.len() < sent.len());
     let records = std::iter::from_fn(|| filter.next_record());
     let refused: Vec<_> = records
-        .filter(|record| record.writer() == writer && record.flags & flag::NO_ROOM != 0)
+        .filter(|record| record.writer() == writer && record.flags & flag::SOCKET_FULL != 0)
         .collect();
     assert_eq!(
         (fragment_numbers(&refused), refused.len()),
@@ -184,20 +184,23 @@ fn of_two_sockets_in_one_group_only_the_full_one_is_reported() {
     let records = observed.records(writer, SETTLED);
     let refused: Vec<_> = records
         .iter()
-        .filter(|record| record.flags & flag::NO_ROOM != 0)
+        .filter(|record| record.flags & flag::SOCKET_FULL != 0)
         .collect();
     assert!(refused.iter().all(|record| record.socket == cookie(&slow)));
     assert_eq!(fragment_numbers(refused.iter().copied()), missing);
     assert_eq!(refused.len(), missing.len());
-    let no_room = |socket| {
+    let rcvbuf_errors = |socket| {
         observed
             .filter
             .socket(cookie(socket))
             .unwrap()
             .unwrap()
-            .no_room
+            .rcvbuf_errors
     };
-    assert_eq!((no_room(&slow), no_room(&quick)), (missing.len() as u64, 0));
+    assert_eq!(
+        (rcvbuf_errors(&slow), rcvbuf_errors(&quick)),
+        (missing.len() as u64, 0)
+    );
 }
 
 #[test]
@@ -224,7 +227,7 @@ fn of_samples_in_pieces_the_lost_fragments_are_named() {
     );
     let records = observed.records(writer, SETTLED);
     let refused = || {
-        let refused = |record: &&Record| record.flags & flag::NO_ROOM != 0;
+        let refused = |record: &&Record| record.flags & flag::SOCKET_FULL != 0;
         records.iter().filter(refused)
     };
     assert_eq!(
@@ -354,7 +357,7 @@ fn losses_on_several_cpus_at_once_beside_other_full_sockets_stay_apart() {
         if record.socket != cookie(&receiver) {
             continue;
         }
-        if record.flags & flag::NO_ROOM == 0 {
+        if record.flags & flag::SOCKET_FULL == 0 {
             arrived += 1;
         } else {
             refused.push((record.writer(), record.sequence_number));

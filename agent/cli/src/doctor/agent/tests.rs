@@ -87,7 +87,7 @@ fn a_cap_that_is_or_was_reached_is_a_warning_with_the_line_to_change() {
             "limits.recordings is reached: 100 of 100, nothing refused so far",
         ]
     );
-    assert_eq!(of("evictions").len(), 1, "told once: {findings:?}");
+    assert_eq!(of("evictions").len(), 1, "reported once: {findings:?}");
     assert!(of("topics_rejected").is_empty());
     for finding in findings.iter().filter(|each| each.check == "limits") {
         let line = &finding.remedies[0].line;

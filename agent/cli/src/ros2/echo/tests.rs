@@ -142,8 +142,8 @@ fn a_writer_whose_messages_cannot_be_read_is_named_once() {
     let mut echo = Echo::new(Options::default());
     let message_type = message_type();
     let mut tell = |payload: &[u8]| {
-        let told = echo.message(&sample(), Some(&message_type), payload);
-        told.unwrap()
+        let printed = echo.message(&sample(), Some(&message_type), payload);
+        printed.unwrap()
     };
     let first = tell(&payload()[..30]);
     assert_eq!(first.out, None);
@@ -172,8 +172,8 @@ MSG: a/Info\nuint8 event_type\nint64 sequence_number";
             csv,
             ..Options::default()
         };
-        let told = Echo::new(options).event(&sample(), &message_type, &payload, interface);
-        told.out.unwrap()
+        let printed = Echo::new(options).event(&sample(), &message_type, &payload, interface);
+        printed.out.unwrap()
     };
     assert_eq!(
         print(Style::Block, false, None),

@@ -71,8 +71,8 @@ impl Repair {
             let facts = acknowledgement(seen, &sent.guid, &reader)?;
             let received = Truth::of(&subscriber, "sub").ok()?;
             let first = *received.missing(&sent.numbers).first()?;
-            let told = facts.acknowledged == SequenceNumber(first - 1) && facts.missing > 0;
-            (told && facts.acknowledged + facts.lag_samples == SequenceNumber(newest))
+            let reported = facts.acknowledged == SequenceNumber(first - 1) && facts.missing > 0;
+            (reported && facts.acknowledged + facts.lag_samples == SequenceNumber(newest))
                 .then_some(facts)
         })?;
         let seen = witness.latest().context("no snapshot")?;

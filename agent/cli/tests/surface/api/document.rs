@@ -67,7 +67,7 @@ fn assert_expectations_are_documented(document: &Value) {
     let schema = ros2probe_daemon::config::Config::schema();
     let configured = &schema["$defs"]["WatchShape"]["anyOf"][1]["properties"];
     let body = &document["components"]["schemas"]["WatchRequest"]["properties"];
-    let (mut low, mut high) = (Expectations::default(), Expectations::default());
+    let (mut low, mut high) = (ExpectationValues::default(), ExpectationValues::default());
     for (key, place) in [
         ("min_rate_hz", (&mut low.min_rate_hz, &mut high.min_rate_hz)),
         ("max_rate_hz", (&mut low.max_rate_hz, &mut high.max_rate_hz)),
@@ -91,11 +91,12 @@ fn assert_expectations_are_documented(document: &Value) {
             *place = value;
         }
     }
-    assert_eq!((low.check(), high.check()), (Ok(()), Ok(())));
-    let beyond = |change: fn(&mut Expectations)| {
-        let mut wrong = Expectations::default();
+    let is_valid = |values| Expectations::try_from(values).is_ok();
+    assert!(is_valid(low) && is_valid(high));
+    let beyond = |change: fn(&mut ExpectationValues)| {
+        let mut wrong = ExpectationValues::default();
         change(&mut wrong);
-        wrong.check().is_err()
+        !is_valid(wrong)
     };
     assert!(beyond(|wrong| wrong.min_rate_hz = Some(-0.1)));
     assert!(beyond(|wrong| wrong.max_rate_hz = Some(1_000_000.1)));

@@ -52,8 +52,8 @@ fn check(scenarios: &[Scenario]) {
         let bag = directory.path().join(format!("bag{index}"));
         let output = convert(&scenario.capture, &bag, &["--include-hidden-topics"]);
         let stderr = String::from_utf8_lossy(&output.stderr);
-        let told: Report = serde_json::from_value(report(&bag)).unwrap();
-        let code = if told.is_complete() { 0 } else { 3 };
+        let reported: Report = serde_json::from_value(report(&bag)).unwrap();
+        let code = if reported.is_complete() { 0 } else { 3 };
         assert_eq!(output.status.code(), Some(code), "{name}: {stderr}");
         assert!(!stderr.contains("stdin"), "{name}: {stderr}");
         let (complete, incomplete, gaps) = on_the_wire(scenario);

@@ -99,7 +99,7 @@ pub const FIXED: &[[&str; 4]] = &[
         "no_table_grows_beyond_its_cap_whatever_is_forged",
     ],
     [
-        "MATCHES_AT_ONCE",
+        "MAX_MATCHES_PER_ROUND",
         "agent/model/src/observer.rs",
         "agent/model/tests/model/observer/interest.rs",
         "lists_of_costly_globs_are_asked_a_part_at_a_time",

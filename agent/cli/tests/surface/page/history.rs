@@ -33,14 +33,14 @@ fn the_history_of_a_topic_adds_up_to_what_was_counted() {
         // The last, unfinished second is in no row.
         let counted = measured["messages"].as_u64().unwrap();
         let rate = measured["rate_hertz"].as_f64().unwrap().max(1.0);
-        let told = sum("messages");
+        let reported = sum("messages");
         assert!(
-            told <= counted && counted - told <= 3 * rate as u64 + 3,
-            "{name}: {told} of {counted}"
+            reported <= counted && counted - reported <= 3 * rate as u64 + 3,
+            "{name}: {reported} of {counted}"
         );
         assert!(sum("lost_messages") <= measured["lost_messages"].as_u64().unwrap());
         lost += sum("lost_messages");
-        seen += told;
+        seen += reported;
     }
     assert!(seen > 0 && lost > 0, "{seen} messages, {lost} lost");
 }

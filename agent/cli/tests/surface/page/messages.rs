@@ -28,12 +28,12 @@ fn messages_are_decoded_five_a_second_at_most() {
     let path = format!("/topics/{}/messages", topic.replace('/', "%2F"));
     let opened = Instant::now();
     let mut lines = Lines::open(agent.api, &path, "").unwrap_or_else(|_| panic!("{path}"));
-    let (mut told, mut known) = (Vec::new(), Value::Null);
-    while told.len() < 3 {
+    let (mut reported, mut known) = (Vec::new(), Value::Null);
+    while reported.len() < 3 {
         match lines.next().unwrap() {
             (name, value) if name == "type" => known = value,
-            (name, value) if name == "message" => told.push(value),
-            (name, value) if name == "end" => panic!("{value} after {told:?}"),
+            (name, value) if name == "message" => reported.push(value),
+            (name, value) if name == "end" => panic!("{value} after {reported:?}"),
             _ => {}
         }
     }
@@ -48,7 +48,7 @@ fn messages_are_decoded_five_a_second_at_most() {
             .contains("string data"),
         "{known}"
     );
-    for message in &told {
+    for message in &reported {
         assert!(
             message["value"]["data"]
                 .as_str()
@@ -60,13 +60,17 @@ fn messages_are_decoded_five_a_second_at_most() {
     }
     // However late this program reads them.
     let most = 1.0 + 5.0 * opened.elapsed().as_secs_f64();
-    assert!(told.len() as f64 <= most, "{told:?}");
-    for pair in told.windows(2) {
+    assert!(reported.len() as f64 <= most, "{reported:?}");
+    for pair in reported.windows(2) {
         let [time, next] = [&pair[0], &pair[1]].map(|message| message["time"].as_f64().unwrap());
-        assert!(next > time, "{told:?}");
+        assert!(next > time, "{reported:?}");
         let number = |message: &Value| message["sequence_number"].as_u64().unwrap();
         let skipped = pair[1]["skipped"].as_u64().unwrap();
-        assert_eq!(number(&pair[1]) - number(&pair[0]), skipped + 1, "{told:?}");
+        assert_eq!(
+            number(&pair[1]) - number(&pair[0]),
+            skipped + 1,
+            "{reported:?}"
+        );
     }
     for (query, status) in [
         ("?max_hertz=6", 422),

@@ -214,10 +214,10 @@ fn a_client_that_does_not_read_costs_nothing_and_misses_no_change() {
         named
     };
     let known = by_name(&graph, state.into_values().collect());
-    let told = by_name(
+    let reported = by_name(
         line(&first, "graph"),
         rows(&line(&first, "values")["topics"]).clone(),
     );
-    assert!(!told.is_empty());
-    assert_eq!(known, told);
+    assert!(!reported.is_empty());
+    assert_eq!(known, reported);
 }

@@ -1,3 +1,4 @@
+use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, GuidPrefix, SequenceNumber};
 
 use super::*;

@@ -6,7 +6,6 @@ use super::index::Index;
 use super::measured::measurement;
 use ros2probe_api::endpoints::{Endpoint, Process, Qos};
 use ros2probe_model::snapshot::{EndpointFacts, ProcessFacts};
-use ros2probe_wire::Duration;
 use ros2probe_wire::rtps::VendorId;
 
 /// Returns the answer's form of a writer or reader.
@@ -25,10 +24,10 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
             reliability: Cow::Borrowed(qos.reliability.label()),
             durability: Cow::Borrowed(qos.durability.label()),
             history: Cow::Owned(facts.history()),
-            deadline_seconds: seconds(qos.deadline),
-            lifespan_seconds: seconds(qos.lifespan),
+            deadline_seconds: qos.deadline.seconds(),
+            lifespan_seconds: qos.lifespan.seconds(),
             liveliness: Cow::Borrowed(qos.liveliness.label()),
-            liveliness_lease_seconds: seconds(qos.liveliness_lease),
+            liveliness_lease_seconds: qos.liveliness_lease.seconds(),
             ownership: Cow::Borrowed(qos.ownership.label()),
             partitions: texts(&qos.partitions),
         },
@@ -53,14 +52,6 @@ pub(super) fn vendor(vendor: VendorId) -> Cow<'static, str> {
         Some(name) => Cow::Borrowed(name),
         None => Cow::Owned(vendor.to_string()),
     }
-}
-
-/// Returns a duration in seconds, or `None` if it is infinite.
-#[expect(clippy::cast_precision_loss, reason = "microseconds survive")]
-pub(super) fn seconds(duration: Duration) -> Option<f64> {
-    duration
-        .nanoseconds()
-        .map(|nanoseconds| nanoseconds as f64 / 1e9)
 }
 
 /// Returns borrowed texts of the snapshot.

@@ -12,7 +12,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::Context;
-use super::endpoint::{process, seconds, vendor};
+use super::endpoint::{process, vendor};
 use super::measured::measurement;
 use super::parameters::Parameters;
 use super::problem::Problem;
@@ -84,7 +84,7 @@ fn view<'a>(facts: &'a ParticipantFacts, counts: &Counts<'a>) -> Participant<'a>
         readers: counts.map_or(0, |(.., readers)| *readers),
         metatraffic_addresses: Cow::Borrowed(&facts.addresses.metatraffic),
         default_addresses: Cow::Borrowed(&facts.addresses.default),
-        lease_seconds: seconds(facts.lease),
+        lease_seconds: facts.lease.seconds(),
         first_seen_timestamp_seconds: facts.first_seen.seconds(),
         last_seen_timestamp_seconds: facts.last_seen.seconds(),
         secured: facts.secured,

@@ -82,7 +82,7 @@ mod tests {
     use super::*;
     use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
     use ros2probe_wire::rtps::VendorId;
-    use ros2probe_wire::{DomainId, Duration, Guid, Timestamp};
+    use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
     fn participant(id: u32, cgroup: Option<&str>) -> ParticipantFacts {
         ParticipantFacts {
@@ -98,7 +98,7 @@ mod tests {
             },
             first_seen: Timestamp(1),
             last_seen: Timestamp(1),
-            lease: Duration::Infinite,
+            lease: RtpsDuration::Infinite,
             secured: false,
             restored: false,
             addresses: Default::default(),

@@ -21,7 +21,7 @@ use super::body::Body;
 use super::parameters::{Name, Parameters};
 use super::problem::{Code, Problem, ProblemBody};
 use super::security::MAX_BODY;
-use crate::config::watch::{self, Watch, check_pattern, check_trace};
+use crate::config::watch::{self, ExpectationValues, Watch, check_pattern, check_trace};
 use crate::watches::{self, Done, Entry, Refused};
 use ros2probe_api::watches::{
     Expectations, Origin, Retain, TopicState, WatchList, WatchRequest, WatchState, WatchedTopic,
@@ -228,7 +228,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
             DomainId::MAX
         ));
     }
-    let expectations = watch::Expectations {
+    let values = ExpectationValues {
         min_rate_hz: settings.min_rate_hz,
         max_rate_hz: settings.max_rate_hz,
         max_loss_ratio: settings.max_loss_ratio,
@@ -236,8 +236,9 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         max_silence_s: settings.max_silence_s,
     };
     let trace = settings.trace;
-    match expectations.check().and_then(|()| check_trace(trace)) {
-        Ok(()) => Ok(Watch {
+    let expectations = watch::Expectations::try_from(values);
+    match expectations.and_then(|expectations| check_trace(trace).map(|()| expectations)) {
+        Ok(expectations) => Ok(Watch {
             pattern: topic,
             domain_id: domain_id.map(DomainId),
             expectations,
@@ -355,12 +356,13 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
 }
 
 pub(super) fn expectations(expectations: &watch::Expectations) -> Expectations {
+    let values = expectations.values();
     Expectations {
-        min_rate_hz: expectations.min_rate_hz,
-        max_rate_hz: expectations.max_rate_hz,
-        max_loss_ratio: expectations.max_loss_ratio,
-        max_latency_ms: expectations.max_latency_ms,
-        max_silence_s: expectations.max_silence_s,
+        min_rate_hz: values.min_rate_hz,
+        max_rate_hz: values.max_rate_hz,
+        max_loss_ratio: values.max_loss_ratio,
+        max_latency_ms: values.max_latency_ms,
+        max_silence_s: values.max_silence_s,
     }
 }
 

@@ -37,7 +37,7 @@ const UNITS: &[(&str, &str)] = &[
 ];
 
 /// Counted items as UCUM annotations, which no mapping turns into a suffix.
-const THINGS: &[(&str, &str)] = &[
+const ANNOTATIONS: &[(&str, &str)] = &[
     ("datagrams", "{datagram}"),
     ("deliveries", "{delivery}"),
     ("drops", "{drop}"),
@@ -92,7 +92,7 @@ impl Metric {
             return unit;
         }
         let words = name.rsplit('_');
-        let thing = |word: &str| THINGS.iter().find(|(thing, _)| *thing == word);
+        let thing = |word: &str| ANNOTATIONS.iter().find(|(thing, _)| *thing == word);
         words.filter_map(thing).next().map_or("", |(_, unit)| unit)
     }
 

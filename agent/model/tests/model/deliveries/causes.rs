@@ -14,7 +14,7 @@ fn every_cause_is_counted_for_itself_and_all_add_up() {
         match number {
             // These samples were never sent to the host.
             10 | 20 | 30 => {}
-            40 | 41 => host.no_room(bob, number),
+            40 | 41 => host.socket_full(bob, number),
             50 => host.gap(bob, 50),
             60 => {}
             61 => {
@@ -53,7 +53,7 @@ fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_bri
         host.wait(10);
         for fragment in [4, 5, 6] {
             let late = Record {
-                flags: bob.flags | flag::NO_ROOM,
+                flags: bob.flags | flag::SOCKET_FULL,
                 ..host.fragments(bob, number, fragment, 1)
             };
             host.put(late);
@@ -77,7 +77,7 @@ fn fragments_without_room_within_a_joined_run_lose_the_sample_and_its_repair_bri
     // A retransmission is another arrival, and a part of it is dropped, too.
     let again = host.fragments(bob, 2, 4, 3);
     host.put(Record {
-        flags: bob.flags | flag::NO_ROOM,
+        flags: bob.flags | flag::SOCKET_FULL,
         ..host.fragments(bob, 2, 5, 1)
     });
     host.put(again);
@@ -107,7 +107,7 @@ fn a_retransmission_without_room_is_lost_like_the_original() {
     host.data(bob, 1);
     host.data(bob, 3);
     host.wait(100);
-    host.no_room(bob, 2);
+    host.socket_full(bob, 2);
     host.wait(12_000);
     assert_eq!(host.losses(LossCause::SocketBuffer), [2]);
     assert_eq!(host.deliveries()[0].delivered.lost(), 1);

@@ -2,7 +2,7 @@
 
 use proptest::prelude::*;
 use ros2probe_model::loss::LossCause;
-use ros2probe_testing::model::host::{BOB, Host, Seen};
+use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{flag, kind};
 
@@ -12,13 +12,13 @@ enum Fate {
     Arrives,
     ArrivesTwice,
     BeforeHost,
-    NoRoom,
+    SocketFull,
     Reassembly,
     /// Retransmitted after it was lost or dropped by a full buffer.
     Repaired,
-    RepairedAfterNoRoom,
+    RepairedAfterDrop,
     /// Retransmitted, and dropped again by a full buffer.
-    RepairHadNoRoom,
+    RepairDropped,
     Excused,
 }
 
@@ -27,18 +27,18 @@ fn fate() -> impl Strategy<Value = Fate> {
         12 => Just(Fate::Arrives),
         1 => Just(Fate::ArrivesTwice),
         2 => Just(Fate::BeforeHost),
-        2 => Just(Fate::NoRoom),
+        2 => Just(Fate::SocketFull),
         1 => Just(Fate::Reassembly),
         2 => Just(Fate::Repaired),
-        1 => Just(Fate::RepairedAfterNoRoom),
-        1 => Just(Fate::RepairHadNoRoom),
+        1 => Just(Fate::RepairedAfterDrop),
+        1 => Just(Fate::RepairDropped),
         1 => Just(Fate::Excused),
     ]
 }
 
 /// Returns the arrival of a sample, unfragmented or as fragments of which the middle ones are
 /// affected.
-fn arrival(host: &Host, bob: Seen, number: u64, fragmented: bool, part: bool) -> Record {
+fn arrival(host: &Host, bob: CapturePoint, number: u64, fragmented: bool, part: bool) -> Record {
     let record = match (fragmented, part) {
         (false, _) => host.record(bob, kind::DATA, number),
         (true, false) => Record {
@@ -61,7 +61,7 @@ proptest! {
     ) {
         let mut host = Host::new();
         let bob = host.reader(BOB, 7411);
-        let no_room = |record: Record| Record { flags: record.flags | flag::NO_ROOM, ..record };
+        let socket_full = |record: Record| Record { flags: record.flags | flag::SOCKET_FULL, ..record };
         host.put(arrival(&host, bob, 1, false, false));
         // The kernel has the writer by then, so it captures every fragment from here on.
         host.wait(300);
@@ -78,15 +78,15 @@ proptest! {
                     host.put(whole);
                 }
                 Fate::BeforeHost => {}
-                Fate::NoRoom | Fate::RepairedAfterNoRoom => {
-                    host.put(no_room(part));
+                Fate::SocketFull | Fate::RepairedAfterDrop => {
+                    host.put(socket_full(part));
                     host.put(whole);
                 }
                 Fate::Reassembly => given_up.push(number),
-                Fate::Repaired | Fate::RepairHadNoRoom => {}
+                Fate::Repaired | Fate::RepairDropped => {}
                 Fate::Excused => host.gap(bob, number),
             }
-            if matches!(fate, Fate::Repaired | Fate::RepairedAfterNoRoom | Fate::RepairHadNoRoom) {
+            if matches!(fate, Fate::Repaired | Fate::RepairedAfterDrop | Fate::RepairDropped) {
                 repairs.push((number, *fate, *fragmented));
             }
             // Retransmissions follow some samples later.
@@ -126,10 +126,10 @@ proptest! {
         };
         prop_assert_eq!(host.losses(LossCause::BeforeHost), with(&[Fate::BeforeHost]));
         prop_assert_eq!(host.losses(LossCause::Reassembly), with(&[Fate::Reassembly]));
-        let full = with(&[Fate::NoRoom, Fate::RepairHadNoRoom]);
+        let full = with(&[Fate::SocketFull, Fate::RepairDropped]);
         prop_assert_eq!(host.losses(LossCause::SocketBuffer), full);
         let facts = host.deliveries()[0].delivered;
-        let repaired = with(&[Fate::Repaired, Fate::RepairedAfterNoRoom]).len();
+        let repaired = with(&[Fate::Repaired, Fate::RepairedAfterDrop]).len();
         prop_assert_eq!(facts.recovered, repaired as u64);
         prop_assert_eq!(facts.irrelevant, with(&[Fate::Excused]).len() as u64);
         prop_assert_eq!(facts.duplicates, with(&[Fate::ArrivesTwice]).len() as u64);
@@ -138,13 +138,13 @@ proptest! {
     }
 }
 
-fn repair(host: &mut Host, bob: Seen, number: u64, fate: Fate, fragmented: bool) {
+fn repair(host: &mut Host, bob: CapturePoint, number: u64, fate: Fate, fragmented: bool) {
     host.wait(10);
-    let only_part = fate == Fate::RepairedAfterNoRoom;
+    let only_part = fate == Fate::RepairedAfterDrop;
     let again = arrival(host, bob, number, fragmented, only_part);
-    if fate == Fate::RepairHadNoRoom {
+    if fate == Fate::RepairDropped {
         host.put(Record {
-            flags: again.flags | flag::NO_ROOM,
+            flags: again.flags | flag::SOCKET_FULL,
             ..arrival(host, bob, number, fragmented, true)
         });
     }

@@ -4,7 +4,7 @@ use std::net::{Ipv4Addr, SocketAddrV4};
 
 use ros2probe_model::input::Input;
 use ros2probe_model::snapshot::SocketFacts;
-use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, READER, Seen};
+use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, GROUP, Host, READER};
 use ros2probe_wire::record::{flag, guid_words, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
@@ -19,7 +19,7 @@ fn two_subscribers_of_one_multicast_have_separate_losses() {
         if number % 5 != 0 {
             host.data(bob, number);
         } else {
-            host.no_room(bob, number);
+            host.socket_full(bob, number);
         }
         if number % 7 != 0 {
             host.data(carol, number);
@@ -165,7 +165,7 @@ fn an_address_that_two_announce_in_turn_identifies_neither() {
 fn a_silent_unknown_receiver_is_removed() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
-    let nobody = Seen {
+    let nobody = CapturePoint {
         socket: 55,
         ..bob.multicast(55)
     };
@@ -243,7 +243,7 @@ fn a_container_is_recognised_by_the_number_that_its_process_has_inside() {
             own_process_id: Some(process.into()),
             ..SocketFacts::default()
         }));
-        let seen = Seen {
+        let seen = CapturePoint {
             socket,
             address: group,
             directed: None,

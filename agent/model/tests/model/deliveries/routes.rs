@@ -6,7 +6,7 @@ use ros2probe_model::loss::LossCause;
 use ros2probe_model::observer::Settings;
 use ros2probe_model::snapshot::Direction;
 use ros2probe_model::snapshot::Subscriber;
-use ros2probe_testing::model::host::{BOB, CAROL, GROUP, Host, Seen};
+use ros2probe_testing::model::host::{BOB, CAROL, CapturePoint, GROUP, Host};
 use ros2probe_wire::Record;
 use ros2probe_wire::record::kind;
 
@@ -75,7 +75,7 @@ fn what_is_pending_when_ways_are_put_together_stays_pending_once() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
-    let large = |host: &mut Host, seen: Seen, number| {
+    let large = |host: &mut Host, seen: CapturePoint, number| {
         let record = host.record(seen, kind::DATA, number);
         host.put(Record {
             datagram_len: 60_000,
@@ -223,7 +223,7 @@ fn a_full_table_refuses_counts_and_evicts_the_silent() {
         ..Settings::default()
     });
     let bob = host.reader(BOB, 7411);
-    let at = |socket: u64| Seen {
+    let at = |socket: u64| CapturePoint {
         socket,
         ..bob.multicast(socket)
     };
@@ -272,7 +272,7 @@ fn a_storm_of_forged_destinations_stays_bounded_and_real_receivers_are_counted()
         host.data(bob, number);
         for forged in 0..100 {
             let address = u32::from_be_bytes([10, 1, 0, 0]) + (number as u32) * 100 + forged;
-            let nowhere = Seen {
+            let nowhere = CapturePoint {
                 address: SocketAddrV4::new(address.into(), 7411),
                 ..bob
             };

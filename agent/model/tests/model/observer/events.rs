@@ -1,6 +1,7 @@
 //! Events of the graph, of losses and of expectations.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_model::churn;
 use ros2probe_model::event::EventKind;
@@ -18,9 +19,9 @@ fn joining_and_leaving_are_events_with_the_known_attributes() {
     world.spdp(ALICE, 10);
     world.sedp(alice(WRITER), "rt/chatter");
     world.nodes(ALICE, 1, &[("/", "talker", alice(WRITER))]);
-    let told = world.events();
-    let changes = |told: &[(u64, EventKind)], wanted: churn::Event| {
-        let kinds = told.iter().map(|(_, kind)| match kind {
+    let reported = world.events();
+    let changes = |reported: &[(u64, EventKind)], wanted: churn::Event| {
+        let kinds = reported.iter().map(|(_, kind)| match kind {
             EventKind::Participant { change, guid, .. } => {
                 assert_eq!(guid.prefix, ALICE);
                 ("participant", *change)
@@ -45,16 +46,19 @@ fn joining_and_leaving_are_events_with_the_known_attributes() {
         let kinds: Vec<_> = kinds.collect();
         kinds.iter().filter(|(_, change)| *change == wanted).count()
     };
-    assert_eq!((told.len(), changes(&told, churn::Event::Appeared)), (3, 3));
+    assert_eq!(
+        (reported.len(), changes(&reported, churn::Event::Appeared)),
+        (3, 3)
+    );
     assert!(world.events().is_empty());
     world.wait(11_000);
-    let mut told = world.events();
+    let mut reported = world.events();
     // The missing subscriber is a finding for as long as the publisher exists.
-    told.retain(|(_, kind)| !matches!(kind, EventKind::Diagnosis { .. }));
-    assert_eq!(told.len(), 3);
-    assert_eq!(changes(&told, churn::Event::Expired), 1);
-    assert_eq!(changes(&told, churn::Event::Cascaded), 2);
-    assert!(told.iter().all(|(at, _)| *at == 10_000));
+    reported.retain(|(_, kind)| !matches!(kind, EventKind::Diagnosis { .. }));
+    assert_eq!(reported.len(), 3);
+    assert_eq!(changes(&reported, churn::Event::Expired), 1);
+    assert_eq!(changes(&reported, churn::Event::Cascaded), 2);
+    assert!(reported.iter().all(|(at, _)| *at == 10_000));
 }
 
 #[test]
@@ -71,8 +75,8 @@ fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
         world.sample(alice(WRITER), number);
     }
     let losses = |world: &mut World| -> Vec<_> {
-        let told = world.events().into_iter();
-        let losses = told.filter_map(|(_, kind)| match kind {
+        let reported = world.events().into_iter();
+        let losses = reported.filter_map(|(_, kind)| match kind {
             EventKind::Loss(burst) => Some(burst),
             _ => None,
         });
@@ -82,11 +86,14 @@ fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
     world.wait(9_000);
     assert_eq!(losses(&mut world), []);
     world.wait(4_000);
-    let told = losses(&mut world);
-    assert!((1..=2).contains(&told.len()), "{told:?}");
-    assert_eq!(told.iter().map(|burst| burst.count).sum::<u64>(), 4);
-    assert_eq!((told[0].first.0, told.last().unwrap().last.0), (2, 7));
-    for burst in &told {
+    let reported = losses(&mut world);
+    assert!((1..=2).contains(&reported.len()), "{reported:?}");
+    assert_eq!(reported.iter().map(|burst| burst.count).sum::<u64>(), 4);
+    assert_eq!(
+        (reported[0].first.0, reported.last().unwrap().last.0),
+        (2, 7)
+    );
+    for burst in &reported {
         assert_eq!(burst.writer, alice(WRITER));
         assert_eq!(burst.topic, Some((DomainId(0), "rt/chatter".into())));
         assert_eq!(burst.node.as_deref(), Some("/talker"));
@@ -96,22 +103,25 @@ fn losses_are_events_once_a_second_with_topic_and_node_even_of_a_gone_writer() {
     let dispose = Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 200, alice(WRITER));
     world.put(dispose);
     world.wait(1_000);
-    let told = losses(&mut world);
-    assert_eq!(told.len(), 1);
-    assert_eq!((told[0].first.0, told[0].last.0, told[0].count), (9, 9, 1));
-    assert_eq!(told[0].topic, Some((DomainId(0), "rt/chatter".into())));
+    let reported = losses(&mut world);
+    assert_eq!(reported.len(), 1);
+    assert_eq!(
+        (reported[0].first.0, reported[0].last.0, reported[0].count),
+        (9, 9, 1)
+    );
+    assert_eq!(reported[0].topic, Some((DomainId(0), "rt/chatter".into())));
 }
 
 #[test]
 fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
-    let expects = |pattern: &str, max_silence_s| Watch {
+    let expects = |pattern: &str, max_silence| Watch {
         expectations: Expectations {
-            max_silence_s,
+            max_silence,
             ..Expectations::default()
         },
         ..Watch::named(pattern).unwrap()
     };
-    let chatter = expects("/chatter", Some(2.0));
+    let chatter = expects("/chatter", Some(Duration::from_secs(2)));
     let mut world = World::new(&[]);
     let watch = |world: &mut World, watches: Vec<Watch>| {
         let watchlist = Watchlist::new(watches).unwrap();
@@ -124,8 +134,8 @@ fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
     world.sedp(bob(READER), "rt/chatter");
     world.stream(alice(WRITER), 1..=150);
     let states = |world: &mut World| -> Vec<_> {
-        let told = world.events().into_iter();
-        let states = told.filter_map(|(_, kind)| match kind {
+        let reported = world.events().into_iter();
+        let states = reported.filter_map(|(_, kind)| match kind {
             EventKind::Expectation {
                 from,
                 to,
@@ -169,7 +179,7 @@ fn expectations_are_judged_in_the_sources_time() {
     let mut world = World::new(&[]);
     let expectations = Expectations {
         min_rate_hz: Some(50.0),
-        max_silence_s: Some(3.0),
+        max_silence: Some(Duration::from_secs(3)),
         ..Expectations::default()
     };
     let watch = Watch {

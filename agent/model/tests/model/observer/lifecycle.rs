@@ -155,9 +155,8 @@ fn the_kernel_can_vouch_for_a_participant() {
     for _ in 0..5 {
         world.wait(8000);
         for prefix in [ALICE, BOB] {
-            world
-                .observer
-                .input(Input::ParticipantAlive(prefix, Timestamp(world.now)));
+            let alive = Input::ParticipantAlive(prefix, Timestamp(world.now));
+            world.observer.input(alive);
         }
     }
     assert_eq!(world.snapshot().participants.len(), 1);

@@ -64,7 +64,7 @@ fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
     (1..=400).for_each(|number| send(&mut world, number));
     world.spdp(BOB, 10);
     send(&mut world, 401);
-    let told = |prefix: GuidPrefix| {
+    let reported = |prefix: GuidPrefix| {
         let snapshot = world.snapshot();
         let writers = snapshot.unknown_writers.into_iter();
         let mut writers = writers.filter(|writer| writer.guid == Guid::new(prefix, WRITER));
@@ -77,16 +77,16 @@ fn an_unknown_writer_is_reported_with_its_process_guid_and_participant() {
     };
     let lidar = Some("lidar_driver".into());
     assert_eq!(
-        told(FAST),
+        reported(FAST),
         (
             Some("eProsima Fast DDS".to_owned()),
             Some(4242),
             lidar.clone()
         )
     );
-    assert_eq!(told(BOB).0.unwrap(), "Eclipse Cyclone DDS");
-    assert_eq!((told(BOB).1, told(BOB).2), (Some(4242), lidar));
-    assert_eq!((told(ALICE).1, told(ALICE).2), (None, None));
+    assert_eq!(reported(BOB).0.unwrap(), "Eclipse Cyclone DDS");
+    assert_eq!((reported(BOB).1, reported(BOB).2), (Some(4242), lidar));
+    assert_eq!((reported(ALICE).1, reported(ALICE).2), (None, None));
     let participant = world.snapshot().participants.remove(0);
     assert_eq!(participant.guid.prefix, BOB);
     assert_eq!(participant.process.id, Some(4242));

@@ -3,7 +3,7 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::{DomainId, Duration, Guid};
+use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
@@ -444,18 +444,18 @@ impl<'a> Ends<'a> {
         let value = |guid: Guid| {
             let endpoint = self.0.get(&guid)?;
             let qos = &endpoint.qos;
-            let seconds = |duration: Duration| match duration.nanoseconds() {
-                Some(nanoseconds) => format!("{} ms", nanoseconds / 1_000_000),
+            let milliseconds = |duration: RtpsDuration| match duration.finite() {
+                Some(duration) => format!("{} ms", duration.as_millis()),
                 None => "infinite".to_owned(),
             };
             match policy {
                 Policy::Reliability => Some(qos.reliability.to_string()),
                 Policy::Durability => Some(qos.durability.to_string()),
-                Policy::Deadline => Some(seconds(qos.deadline)),
+                Policy::Deadline => Some(milliseconds(qos.deadline)),
                 Policy::Liveliness => Some(format!(
                     "{}, {}",
                     qos.liveliness,
-                    seconds(qos.liveliness_lease)
+                    milliseconds(qos.liveliness_lease)
                 )),
                 Policy::Ownership => Some(qos.ownership.to_string()),
                 Policy::LatencyBudget

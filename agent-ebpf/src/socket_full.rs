@@ -47,7 +47,7 @@ pub fn refused(context: &RawTracePointContext) {
     if seen == socket {
         tell(last);
     } else {
-        count_outside(Counter::NoRoomUnseen, 1);
+        count_outside(Counter::SocketFullUnseen, 1);
     }
 }
 
@@ -120,14 +120,14 @@ fn end(last: &Last) {
 fn refusal(socket: u64) {
     if let Some(known) = SOCKETS.get_ptr_mut(&socket) {
         // SAFETY: a map value pointer checked against null.
-        add(unsafe { &raw mut (*known).no_room }, 1);
+        add(unsafe { &raw mut (*known).rcvbuf_errors }, 1);
     }
 }
 
 #[inline(always)]
 fn tell(last: &Last) {
     last.socket.set(0);
-    count_outside(Counter::NoRoom, 1);
+    count_outside(Counter::SocketFull, 1);
     undelivered(last.slot.get(), last.token.get(), last.captured.get());
 }
 
@@ -141,7 +141,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
     let scratch = scratch.get();
     if scratch.walk.record.datagram != token {
         // Another run took the slot after a preemption, so it holds another datagram.
-        count_outside(Counter::NoRoomUnseen, 1);
+        count_outside(Counter::SocketFullUnseen, 1);
         return 0;
     }
     if captured != 0 {
@@ -158,7 +158,7 @@ pub extern "C" fn undelivered(slot: u32, token: u32, captured: u32) -> u32 {
         if let Some(record) = scratch.records.get_mut(index as usize)
             && (record.kind == kind::DATA || record.kind == kind::DATA_FRAG)
         {
-            record.flags |= flag::NO_ROOM;
+            record.flags |= flag::SOCKET_FULL;
             write(slot, record);
         }
         index += 1;
