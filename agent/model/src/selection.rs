@@ -3,12 +3,14 @@
 //! A selection is matched against topics as they appear. It affects measurement only in that
 //! requested topics are measured; the watchlist has its own patterns.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use regex::bytes::{Regex, RegexBuilder};
 use ros2probe_wire::DomainId;
 
 use super::glob;
+use super::names::DdsName;
 use super::naming::Naming;
 use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
@@ -32,6 +34,8 @@ pub enum Choice {
     All,
     /// One topic by its ROS name, even if hidden, or by its DDS name.
     Name(String),
+    /// Topics by their DDS names, of which there may be thousands.
+    Names(BTreeSet<DdsName>),
     /// `*` within a token, `**` across tokens; covers hidden topics if it names a hidden token.
     Glob(String),
     /// Every topic with a match in its name.
@@ -127,6 +131,7 @@ impl Choice {
     fn covers(&self, name: &str, dds_name: &str, is_ros: bool, hidden: bool) -> bool {
         match self {
             Self::Name(wanted) => wanted == name || wanted == dds_name,
+            Self::Names(wanted) => wanted.contains(dds_name),
             _ if !is_ros => false,
             Self::All => hidden,
             Self::Glob(glob) => (hidden || glob.contains("/_")) && glob::covers(glob, name),
@@ -166,6 +171,15 @@ impl Selection {
     pub fn all() -> Self {
         Self {
             include: vec![Choice::All],
+            ..Self::default()
+        }
+    }
+
+    /// Selects topics by their DDS names.
+    #[must_use]
+    pub fn of_names(names: impl IntoIterator<Item = DdsName>) -> Self {
+        Self {
+            include: vec![Choice::Names(names.into_iter().collect())],
             ..Self::default()
         }
     }
@@ -295,6 +309,9 @@ mod tests {
             };
             assert!(!covers(&everything, dds_name), "{dds_name}");
             assert!(covers(&Selection::named([dds_name]).unwrap(), dds_name));
+            let names = || ["rt/points", dds_name].map(DdsName::from);
+            assert!(covers(&Selection::of_names(names()), dds_name));
+            assert!(!covers(&Selection::of_names(names()), "rt/add"));
         }
         assert!(!covers(
             &Selection::named(["/add"]).unwrap(),

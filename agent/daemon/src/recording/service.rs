@@ -258,12 +258,11 @@ impl Recordings {
         domain_id: u32,
     ) -> Result<(), Error> {
         let state = self.latest.state();
+        let selection = subscription.selection();
         let covered = state.known().topics.iter().filter(|topic| {
             let (kind, hidden) = (topic.kind, topic.hidden);
             topic.domain_id == DomainId(domain_id)
-                && subscription
-                    .selection()
-                    .covers(kind, &topic.name, &topic.dds_name, hidden)
+                && selection.covers(kind, &topic.name, &topic.dds_name, hidden)
         });
         let covered = covered.take(self.caps.caps().topics);
         recorder.declare(covered.filter_map(|topic| {

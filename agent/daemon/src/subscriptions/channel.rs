@@ -2,6 +2,7 @@
 //!
 //! Each end holds the lock only for one push or pop. The queue does not select topics.
 
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -11,8 +12,9 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
-use super::{Depth, Item, Overflow, Request, Selection};
+use super::{Choice, Depth, Item, Overflow, Request, Selection};
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
+use ros2probe_model::names::DdsName;
 use ros2probe_model::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
@@ -26,7 +28,7 @@ const LOOK: Duration = Duration::from_millis(50);
 #[derive(Debug)]
 pub(super) struct Channel {
     id: u64,
-    selection: Arc<Selection>,
+    wanted: Mutex<Wanted>,
     request: ChannelOptions,
     queue: Mutex<Queue>,
     /// Bytes in the queue, readable without the lock.
@@ -36,6 +38,14 @@ pub(super) struct Channel {
     changed: Condvar,
     in_force: AtomicBool,
     known: Notify,
+}
+
+/// Topics of the reader.
+#[derive(Debug)]
+struct Wanted {
+    selection: Arc<Selection>,
+    /// Topics whose retained samples are due once the selection is in force.
+    fresh: Option<Arc<Selection>>,
 }
 
 #[derive(Debug)]
@@ -85,9 +95,13 @@ impl Drop for QueuedBytes {
 
 impl Channel {
     pub(super) fn new(id: u64, request: Request) -> Self {
+        let selection = Arc::new(request.topics);
         Self {
             id,
-            selection: Arc::new(request.topics),
+            wanted: Mutex::new(Wanted {
+                fresh: Some(Arc::clone(&selection)),
+                selection,
+            }),
             request: ChannelOptions {
                 domain_id: request.domain_id,
                 depth: request.depth,
@@ -116,21 +130,37 @@ impl Channel {
         self.request.depth
     }
 
-    pub(super) fn selection(&self) -> &Selection {
-        &self.selection
+    pub(super) fn selection(&self) -> Arc<Selection> {
+        Arc::clone(&self.wanted().selection)
+    }
+
+    /// Replaces the selection by names. The retained samples of those in `fresh` are due.
+    pub(super) fn select(&self, names: BTreeSet<DdsName>, mut fresh: BTreeSet<DdsName>) {
+        let mut wanted = self.wanted();
+        let due = wanted.fresh.take();
+        for choice in due.iter().flat_map(|due| &due.include) {
+            if let Choice::Names(due) = choice {
+                fresh.extend(due.intersection(&names).cloned());
+            }
+        }
+        wanted.fresh = Some(Arc::new(Selection::of_names(fresh)));
+        wanted.selection = Arc::new(Selection::of_names(names));
     }
 
     pub(super) fn request(&self) -> SampleRequest {
         SampleRequest {
             id: self.id,
-            selection: Arc::clone(&self.selection),
+            selection: self.selection(),
             domain_id: self.request.domain_id.map(DomainId),
             depth: self.request.depth,
         }
     }
 
-    pub(super) fn is_in_force(&self) -> bool {
-        self.in_force.load(Ordering::Acquire)
+    /// Removes the topics whose retained samples are due, if `in_force` is the latest selection.
+    pub(super) fn take_fresh(&self, in_force: &Arc<Selection>) -> Option<Arc<Selection>> {
+        let mut wanted = self.wanted();
+        let is_latest = Arc::ptr_eq(&wanted.selection, in_force);
+        is_latest.then(|| wanted.fresh.take()).flatten()
     }
 
     pub(super) fn set_in_force(&self) {
@@ -328,6 +358,10 @@ impl Channel {
             Item::Clock(_) | Item::End(_) => {}
         }
         true
+    }
+
+    fn wanted(&self) -> MutexGuard<'_, Wanted> {
+        self.wanted.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn lock(&self) -> MutexGuard<'_, Queue> {

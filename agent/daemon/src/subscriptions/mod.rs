@@ -11,6 +11,7 @@ pub mod line;
 pub mod line_reader;
 mod retained;
 
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -26,6 +27,7 @@ use crate::snapshot_cell::SnapshotCell;
 use channel::Channel;
 use retained::Retained;
 use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
+use ros2probe_model::names::DdsName;
 use ros2probe_model::selection::SampleRequest;
 
 pub use ros2probe_model::dispatch::{Missed, MissedReason, Topic};
@@ -177,8 +179,13 @@ impl Subscriptions {
             self.refused.fetch_add(1, Ordering::Relaxed);
             return Err(Refused::TooMany(self.caps.subscriptions));
         }
-        let selections = channels.iter().map(|channel| channel.selection());
-        let selections = || selections.clone().chain([&request.topics]);
+        let selections: Vec<_> = channels.iter().map(|channel| channel.selection()).collect();
+        let selections = || {
+            selections
+                .iter()
+                .map(AsRef::as_ref)
+                .chain([&request.topics])
+        };
         let regexes: usize = selections().map(Selection::regexes).sum();
         if regexes > MAX_REGEXES || check_globs(selections().flat_map(Selection::globs)).is_err() {
             self.refused.fetch_add(1, Ordering::Relaxed);
@@ -242,18 +249,17 @@ impl Subscriptions {
         drop(changing);
     }
 
-    /// For the capture thread: marks these requests as in force in model and kernel. New readers
-    /// first receive their retained samples.
+    /// For the capture thread: marks these requests as in force in model and kernel. Readers first
+    /// receive the retained samples of topics that are new to them.
     pub fn in_force(&self, sample_requests: &[SampleRequest]) {
         for channel in self.channels.load().iter() {
-            let is_new = !channel.is_in_force();
-            if !is_new
-                || !sample_requests
-                    .iter()
-                    .any(|request| request.id == channel.id())
-            {
+            let mut requests = sample_requests.iter();
+            let Some(request) = requests.find(|request| request.id == channel.id()) else {
                 continue;
-            }
+            };
+            let Some(fresh) = channel.take_fresh(&request.selection) else {
+                continue;
+            };
             if channel.depth() == Depth::Payloads {
                 let known = self.latest.state();
                 let topics = || known.known().topics.iter();
@@ -261,7 +267,11 @@ impl Subscriptions {
                     let mut publishers = topics().flat_map(|topic| &topic.publishers);
                     publishers.any(|publisher| publisher.guid == writer)
                 };
-                let samples = self.retained().for_reader(&channel.request(), is_there);
+                let fresh = SampleRequest {
+                    selection: fresh,
+                    ..request.clone()
+                };
+                let samples = self.retained().for_reader(&fresh, is_there);
                 for sample in samples {
                     self.given.fetch_add(1, Ordering::Relaxed);
                     channel.sample(&sample, None, &self.stop);
@@ -416,8 +426,17 @@ impl Subscription {
 
     /// Selection of topics.
     #[must_use]
-    pub fn selection(&self) -> &Selection {
+    pub fn selection(&self) -> Arc<Selection> {
         self.channel.selection()
+    }
+
+    /// Replaces the selection by exact names. The retained samples of those in `fresh` follow.
+    pub fn select(&self, names: BTreeSet<DdsName>, fresh: BTreeSet<DdsName>) {
+        let changing = self.all.changing();
+        self.channel.select(names, fresh);
+        self.all.change(self.all.channels.load().to_vec());
+        drop(changing);
+        self.all.latest.bell().ring();
     }
 }
 

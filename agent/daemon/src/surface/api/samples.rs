@@ -169,7 +169,7 @@ async fn samples(
     };
     let most = context.limits.caps().topics;
     let first = Line::Open(Open {
-        topics: topics(known.known(), subscription.selection(), domain_id, most),
+        topics: topics(known.known(), &subscription.selection(), domain_id, most),
     });
     let stream = Stream {
         subscription,
