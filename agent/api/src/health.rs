@@ -66,10 +66,51 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub unfiltered_reason: Option<Cow<'static, str>>,
+    /// The listener for viewers; null if it is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub foxglove: Option<Foxglove>,
     /// Process id of the agent, in its own PID namespace.
     pub process_id: u32,
     /// Seconds since the agent's process started; null if unknown.
     pub uptime_seconds: Option<f64>,
+}
+
+/// The listener for viewers over the Foxglove protocol, and the viewers.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Foxglove {
+    /// Address that viewers open on the agent's host.
+    #[cfg_attr(feature = "openapi", schema(example = "ws://localhost:8765/"))]
+    pub address: String,
+    /// Why the agent does not listen there; null if it does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub reason: Option<String>,
+    /// Rights of viewers without a token: `read`, `watch` or `all`; null if every viewer needs a
+    /// token. Messages need `all`.
+    pub access: Option<Cow<'static, str>>,
+    /// Connected viewers, the longest connected first.
+    pub clients: Vec<FoxgloveClient>,
+}
+
+/// A connected viewer.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct FoxgloveClient {
+    /// IP address and port of the viewer; null if unknown.
+    #[cfg_attr(feature = "openapi", schema(example = "127.0.0.1:50412"))]
+    pub address: Option<String>,
+    /// Rights of the viewer: `read`, `watch` or `all`.
+    pub access: Cow<'static, str>,
+    /// Channels that the viewer subscribes to.
+    pub subscriptions: usize,
+    /// Messages sent to the viewer, statistics included.
+    pub sent_messages: u64,
+    /// Messages dropped because the viewer reads too slowly.
+    pub dropped_messages: u64,
 }
 
 /// An ability that depends on privileges, the kernel or the configuration.

@@ -29,6 +29,7 @@ use crate::subscriptions::{Caps, Subscriptions};
 use crate::supervise::{Responder, Supervisor, Surfaces, Worker};
 use crate::surface::api::reload::Reloads;
 use crate::surface::api::{self, reload};
+use crate::surface::foxglove;
 use crate::surface::http::Server;
 use crate::surface::otlp::{self, Exporter, Host, SpanQueue, SpanSink};
 use crate::surface::{Exposition, Format, MetricSources};
@@ -55,6 +56,8 @@ pub struct Options {
     pub metrics: Option<Listen>,
     /// API listener instead of the configured one.
     pub api: Option<Listen>,
+    /// Listener for viewers instead of the configured one.
+    pub foxglove: Option<Listen>,
     /// Rights of loopback clients instead of the configured ones.
     pub api_loopback: Option<Access>,
 }
@@ -172,6 +175,7 @@ impl Components<'_> {
             snapshots: Arc::new(snapshots),
             live: Arc::new(api::Live::new(config.history)),
             library,
+            viewers: sources.viewers,
             page: Arc::new(api::Page::new(self.addresses)),
             reloader,
             stop: self.stop,
@@ -205,6 +209,7 @@ pub fn run(options: Options) -> Result<()> {
         announce(privilege::become_own_user());
     }
     control::open_socket(&mut control, &config.api)?;
+    let viewers = foxglove::Server::open(&config.foxglove, &config.api, &sources.viewers)?;
     let mut state = KeptState::open(&source, &config, &watches);
     let recordings = memory::recordings(&config.recordings.directory, state.directory());
     let worker = worker(&mut source)?;
@@ -213,7 +218,7 @@ pub fn run(options: Options) -> Result<()> {
     let exporter = export.map(|export| Exporter::start(export, &sources, Arc::clone(&spans)));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
-    report_listeners(server.as_ref(), &control, &watches);
+    report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
     state.restore(&mut observer, &source);
@@ -253,6 +258,7 @@ pub fn run(options: Options) -> Result<()> {
     let surfaces = Surfaces {
         metrics: server,
         control,
+        viewers,
         context: agent.context,
         powerless,
     };
@@ -276,6 +282,12 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         config.metrics.listen = listen.0;
     } else if options.report {
         config.metrics.listen = None;
+    }
+    match options.foxglove {
+        Some(listen) => config.foxglove.listen = listen.0,
+        // A report ends before a viewer could connect.
+        None if options.report => config.foxglove.listen = None,
+        None => {}
     }
     control::choose(
         &mut config.api,
@@ -454,13 +466,21 @@ fn give_up() -> Result<Unprivileged> {
     Ok(powerless)
 }
 
-fn report_listeners(server: Option<&Server>, control: &api::Server, watches: &Watches) {
+fn report_listeners(
+    server: Option<&Server>,
+    control: &api::Server,
+    viewers: Option<&foxglove::Server>,
+    watches: &Watches,
+) {
     if let Some(address) = server.and_then(|server| server.local_addr().ok()) {
         let watches = watches.in_force().entries().len();
         tracing::info!(%address, watches, "serving metrics");
     }
     for door in control.doors() {
         tracing::info!(address = door, "serving the control API");
+    }
+    if let Some(address) = viewers.and_then(foxglove::Server::address) {
+        tracing::info!(%address, "serving viewers over the Foxglove protocol");
     }
 }
 

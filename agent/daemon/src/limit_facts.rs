@@ -180,9 +180,11 @@ impl LimitFigures {
                     given_up + facts.crowded_out,
                 )
             }
-            Limit::Watches | Limit::Recordings | Limit::ApiClients | Limit::MetricsClients => {
-                self.own(limit)
-            }
+            Limit::Watches
+            | Limit::Recordings
+            | Limit::ApiClients
+            | Limit::MetricsClients
+            | Limit::FoxgloveClients => self.own(limit),
         }
     }
 

@@ -17,6 +17,7 @@ use crate::snapshot_cell::SnapshotCell;
 use crate::surface::MetricSources;
 use crate::surface::api;
 use crate::surface::api::reload::{NotReloaded, Reloads};
+use crate::surface::foxglove;
 use crate::surface::http::Server;
 use crate::surface::otlp::Exporter;
 use crate::watches::Watches;
@@ -56,6 +57,7 @@ pub(crate) struct Supervisor {
 pub(crate) struct Surfaces {
     pub(crate) metrics: Option<Server>,
     pub(crate) control: api::Server,
+    pub(crate) viewers: Option<foxglove::Server>,
     pub(crate) context: api::Context,
     /// Proof that the serving thread has no privilege.
     pub(crate) powerless: Unprivileged,
@@ -294,7 +296,12 @@ impl Surfaces {
                 serving.spawn(metrics.serve(stop.clone()));
             }
             self.control.serve(&self.context, &mut serving)?;
-            drop(self.context);
+            match self.viewers {
+                Some(viewers) => {
+                    serving.spawn(viewers.serve(self.context));
+                }
+                None => drop(self.context),
+            }
             tokio::select! {
                 () = stop.cancelled() => {}
                 Some(ended) = serving.join_next() => {

@@ -23,6 +23,7 @@ use ros2probe_capture::shm::port::Port;
 use ros2probe_capture::shm::segment::{Buffer, Message};
 use ros2probe_capture::uprobe::library;
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
+use ros2probe_daemon::surface::foxglove::protocol;
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe_model::input::Input;
@@ -58,6 +59,19 @@ pub fn capture(bytes: &[u8]) {
         }
     }
     assert!(matches!(reader.next_packet(), Ok(None)));
+}
+
+/// Reads a message of a viewer. An accepted message has no more ids than its text has room for.
+pub fn viewer(bytes: &[u8]) {
+    let Ok(text) = std::str::from_utf8(bytes) else {
+        return;
+    };
+    match protocol::parse(text) {
+        Ok(protocol::Request::Subscribe(wanted)) => assert!(wanted.len() <= text.len() / 8),
+        Ok(protocol::Request::Unsubscribe(ids)) => assert!(ids.len() <= text.len()),
+        Ok(protocol::Request::Unsupported(op)) => assert!(op.len() <= text.len()),
+        Ok(_) | Err(protocol::Malformed) => {}
+    }
 }
 
 /// Reads a block of the packet ring, through reassembly and walk.

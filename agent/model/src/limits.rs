@@ -33,6 +33,8 @@ pub enum Limit {
     ApiClients,
     /// Connections to the metrics listener.
     MetricsClients,
+    /// Connections to the listener for viewers.
+    FoxgloveClients,
 }
 
 /// Description of a limit.
@@ -82,6 +84,8 @@ pub struct Limits {
     pub api_clients: usize,
     /// Connections to the metrics listener.
     pub metrics_clients: usize,
+    /// Connections to the listener for viewers.
+    pub foxglove_clients: usize,
 }
 
 const PARTICIPANTS: Row = Row {
@@ -204,10 +208,19 @@ const METRICS_CLIENTS: Row = Row {
     metric: "",
     bytes: 32 << 10,
 };
+const FOXGLOVE_CLIENTS: Row = Row {
+    key: "foxglove_clients",
+    default: 16,
+    range: (1, 1_000),
+    what: "Viewers connected over the Foxglove protocol",
+    reached: "the next one is answered 503 and closed",
+    metric: "ros2probe_foxglove_clients",
+    bytes: 512 << 10,
+};
 
 impl Limit {
     /// All limits, in the order of their documentation.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Participants,
         Self::Endpoints,
         Self::Topics,
@@ -220,6 +233,7 @@ impl Limit {
         Self::Recordings,
         Self::ApiClients,
         Self::MetricsClients,
+        Self::FoxgloveClients,
     ];
 
     /// Returns the description.
@@ -238,6 +252,7 @@ impl Limit {
             Self::Recordings => RECORDINGS,
             Self::ApiClients => API_CLIENTS,
             Self::MetricsClients => METRICS_CLIENTS,
+            Self::FoxgloveClients => FOXGLOVE_CLIENTS,
         }
     }
 
@@ -284,6 +299,7 @@ impl Limits {
             recordings: value(Limit::Recordings),
             api_clients: value(Limit::ApiClients),
             metrics_clients: value(Limit::MetricsClients),
+            foxglove_clients: value(Limit::FoxgloveClients),
         }
     }
 
@@ -303,12 +319,14 @@ impl Limits {
             Limit::Recordings => self.recordings,
             Limit::ApiClients => self.api_clients,
             Limit::MetricsClients => self.metrics_clients,
+            Limit::FoxgloveClients => self.foxglove_clients,
         }
     }
 
     /// Memory in addition to the limits, in bytes: the idle agent with its rings and the kernel's
-    /// maps (14 MiB), stored events, two views, and the history of measured topics.
-    pub const BESIDE: usize = 29 << 20;
+    /// maps (14 MiB), stored events and two views. The history of measured topics and the channels
+    /// of viewers are included.
+    pub const BESIDE: usize = 33 << 20;
 
     /// Returns the memory in bytes that all limits together allow.
     #[must_use]

@@ -3,6 +3,7 @@
 //! - [`harness`] starts agents and DDS peers in network namespaces.
 //! - [`local_agent`] starts an agent on a capture without any privilege.
 //! - [`forged`] sends RTPS that no real participant would.
+//! - [`viewer`] is a client of the Foxglove WebSocket protocol.
 //! - [`model`] writes the same for a model in virtual time.
 //!
 //! If a tool is missing, these fail and name the package to install.
@@ -26,6 +27,7 @@ pub mod pseudo_terminal;
 pub mod rotel;
 pub mod sample_robot;
 pub mod truth;
+pub mod viewer;
 
 use std::path::{Path, PathBuf};
 

@@ -56,8 +56,14 @@ impl LocalAgent {
 
     /// Starts as [`Self::start`] does, on another capture.
     pub fn replay(rp: &mut Command, capture: &Path, arguments: &[&str]) -> Self {
+        // Agents of other tests use the default port.
+        if !arguments.contains(&"--foxglove") {
+            rp.args(["run", "--foxglove", "off"]);
+        } else {
+            rp.arg("run");
+        }
         let mut child = rp
-            .args(["run", "--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
+            .args(["--metrics", "127.0.0.1:0", "--api", "127.0.0.1:0"])
             // Each test treats this host as its own.
             .args(["--api-loopback", "all", "--replay"])
             .arg(capture)
@@ -87,7 +93,8 @@ impl LocalAgent {
         agent
     }
 
-    fn wait_for_address(&mut self, text: &str) -> SocketAddr {
+    /// Waits for the line of a listener and returns its address.
+    pub fn wait_for_address(&mut self, text: &str) -> SocketAddr {
         let line = self.wait_for_log(text);
         let address = line.split("address=").nth(1);
         let address = address.and_then(|rest| rest.split(' ').next());

@@ -9,6 +9,7 @@ mod doctor;
 mod echo;
 mod events;
 mod follow;
+mod foxglove;
 mod interrupt;
 mod node;
 mod notes;
@@ -84,6 +85,8 @@ pub(crate) enum Question {
     Top(top::Top),
     /// Print the address of the page that shows the robot in a browser
     Page(page::Page),
+    /// Print the address that Foxglove, Lichtblick and PlotJuggler open, with a token
+    Foxglove(foxglove::Foxglove),
 }
 
 impl Question {
@@ -101,6 +104,7 @@ impl Question {
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
             Self::Page(page) => page.ask(),
+            Self::Foxglove(foxglove) => foxglove.ask(),
         }
     }
 
@@ -113,7 +117,8 @@ impl Question {
             | Self::Service(_)
             | Self::Action(_)
             | Self::Doctor(_)
-            | Self::Page(_) => Some(interrupt::INTERRUPTED),
+            | Self::Page(_)
+            | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
             // `top` restores the terminal first.
             Self::Top(_) => None,
         }

@@ -69,7 +69,7 @@ impl Page {
 }
 
 /// Host name and port of an address.
-fn parts(host: &str) -> (&str, &str) {
+pub(super) fn parts(host: &str) -> (&str, &str) {
     match host.rsplit_once(':') {
         Some((name, port)) if !name.ends_with(':') && port.parse::<u16>().is_ok() => (name, port),
         _ => (host, PORT),
@@ -77,7 +77,7 @@ fn parts(host: &str) -> (&str, &str) {
 }
 
 /// Returns whether the name is that of this host.
-fn is_near(name: &str) -> bool {
+pub(super) fn is_near(name: &str) -> bool {
     let address = name.trim_matches(['[', ']']).parse::<IpAddr>();
     name == "localhost" || address.is_ok_and(|address| address.is_loopback())
 }

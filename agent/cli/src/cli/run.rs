@@ -40,6 +40,10 @@ pub(crate) struct Run {
     /// configured one
     #[arg(long, value_name = "ADDR|off", value_parser = listen)]
     pub(crate) api: Option<Listen>,
+    /// Address and port of the listener for Foxglove and other viewers, or `off`, instead of the
+    /// configured one
+    #[arg(long, value_name = "ADDR|off", value_parser = listen)]
+    pub(crate) foxglove: Option<Listen>,
     /// Rights of loopback clients of the control API without a token, instead of the configured
     /// ones
     #[arg(
@@ -61,6 +65,7 @@ impl From<Run> for Options {
             watch: run.watch,
             metrics: run.metrics,
             api: run.api,
+            foxglove: run.foxglove,
             api_loopback: run.api_loopback,
         }
     }

@@ -10,7 +10,7 @@ use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use super::privileges::is_installed;
-use ros2probe_api::health::{Health, Limit};
+use ros2probe_api::health::{Foxglove, Health, Limit};
 use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
@@ -35,6 +35,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings.extend(limits(health));
     findings.extend(evictions(health));
     findings.push(watches(answers));
+    findings.extend(health.foxglove.as_ref().map(foxglove));
     if health.source != "replay" {
         findings.push(kept(health));
     }
@@ -311,6 +312,58 @@ fn watches(answers: &Answers) -> Finding {
             report(Severity::Note, sentence).remedy("rp topic list    # check the name")
         }
     }
+}
+
+/// Finding for the listener for viewers: its address, who may connect, and who does.
+fn foxglove(listener: &Foxglove) -> Finding {
+    let Foxglove {
+        address,
+        reason,
+        access,
+        clients,
+    } = listener;
+    if let Some(reason) = reason {
+        let sentence = format!("Foxglove viewers cannot connect to {address}: {reason}");
+        return Finding::new(AREA, "foxglove", Severity::Warning, sentence)
+            .seen(reason, format!("{FROM} foxglove"))
+            .remedy("sudo ss -ltnp    # lists the programs that listen")
+            .configure("foxglove: {listen: 127.0.0.1:PORT}    # another one, or off");
+    }
+    let rights = match access.as_deref() {
+        None => "every viewer needs a token",
+        Some("all") => "all local users receive messages",
+        Some(_) => "messages need a token (rp foxglove)",
+    };
+    let connected = match clients.as_slice() {
+        [] => "none is connected".to_owned(),
+        [only] => format!(
+            "one is connected, with {} subscriptions",
+            only.subscriptions
+        ),
+        several => format!("{} are connected", several.len()),
+    };
+    let sentence = format!("Foxglove viewers may open {address}: {rights}; {connected}");
+    let slow = clients.iter().filter(|client| client.dropped_messages > 0);
+    let slow: Vec<_> = slow
+        .map(|client| {
+            let place = client.address.as_deref().unwrap_or("unknown");
+            format!("{place}: {} messages dropped", client.dropped_messages)
+        })
+        .collect();
+    let finding = match slow.is_empty() {
+        true => Finding::new(AREA, "foxglove", Severity::Ok, sentence),
+        false => {
+            let sentence = format!("{sentence}; some read too slowly and lose messages");
+            Finding::new(AREA, "foxglove", Severity::Note, sentence).seen(
+                slow.join(", "),
+                format!("{FROM} foxglove clients dropped_messages"),
+            )
+        }
+    };
+    finding.seen(
+        clients.len().to_string(),
+        format!("{FROM} foxglove clients"),
+    )
 }
 
 fn kept(health: &Health) -> Finding {

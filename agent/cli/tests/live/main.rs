@@ -21,6 +21,7 @@ mod events;
 mod farewell;
 mod faults;
 mod fidelity;
+mod foxglove;
 mod host;
 mod hostile;
 mod late_start;

@@ -175,13 +175,13 @@ fn dropped(page: &Scrape) -> f64 {
 }
 
 /// The byte that the peers write at this position of the points.
-fn pattern(place: usize) -> u8 {
+pub(crate) fn pattern(place: usize) -> u8 {
     let [low, ..] = (place * 7 + (place >> 8) * 13 + (place >> 16)).to_le_bytes();
     low
 }
 
 /// The number in a point cloud, every byte of which is as it was sent.
-fn check(payload: &[u8], pattern: &[u8]) -> Result<u64> {
+pub(crate) fn check(payload: &[u8], pattern: &[u8]) -> Result<u64> {
     ensure!(payload.starts_with(&[0, 1, 0, 0]), "{:?}", payload.get(..4));
     let (_, data) = payload.split_at(DATA);
     let (number, rest) = data.split_first_chunk().context("no data")?;

@@ -196,8 +196,8 @@ fn the_agent_has_no_socket_of_the_network_but_its_listeners() -> Result<()> {
     let listeners = of_table("tcp")?;
     let addresses = listeners.iter().map(|row| (&*row[1], &*row[3]));
     let addresses: BTreeSet<_> = addresses.collect();
-    // 127.0.0.1:17400 for metrics, and 17401 for control.
-    let expected = ["0100007F:43F8", "0100007F:43F9"];
+    // 127.0.0.1:17400 for metrics, 17401 for control, and 8765 for viewers.
+    let expected = ["0100007F:43F8", "0100007F:43F9", "0100007F:223D"];
     assert_eq!(addresses, expected.map(|each| (each, LISTENING)).into());
     for table in ["tcp6", "udp", "udp6", "udplite", "raw", "raw6", "icmp"] {
         assert_eq!(of_table(table)?, Vec::<Vec<String>>::new(), "{table}");

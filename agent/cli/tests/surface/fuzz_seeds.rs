@@ -84,6 +84,11 @@ fn bags_survive() {
 }
 
 #[test]
+fn messages_of_viewers_survive() {
+    run("fuzz/seeds/viewer", entry::viewer);
+}
+
+#[test]
 fn libraries_survive() {
     run("fuzz/seeds/library", entry::library);
 }

@@ -27,6 +27,7 @@ use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask, metric};
 use ros2probe_testing::model::domain::VirtualDomain;
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS, SPDP};
 use ros2probe_testing::model::host::{BOB, CapturePoint, Host};
+use ros2probe_testing::viewer;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use tokio_util::sync::CancellationToken;
 
@@ -450,6 +451,36 @@ fn clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves() {
         let cap = metric(&page, &format!("ros2probe_limit{{limit=\"{key}\"}}"));
         assert_eq!(cap, Some(2.0));
     }
+}
+
+#[test]
+fn viewers_beyond_the_cap_are_refused_until_one_has_gone() {
+    let directory = tempfile::tempdir().unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    std::fs::write(&configuration, "limits: {foxglove_clients: 2}\n").unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let arguments = ["--foxglove", "127.0.0.1:0", "--config", configuration];
+    let mut agent = LocalAgent::start(&mut rp(), &arguments);
+    let address = agent.wait_for_address("serving viewers");
+    let connect = || {
+        let stream = TcpStream::connect(address).unwrap();
+        viewer::open(stream, "/", &viewer::SUBPROTOCOLS, &[]).unwrap()
+    };
+    let (_one, two) = (connect().unwrap(), connect().unwrap());
+    let refused = connect().err().unwrap();
+    assert_eq!(refused.status, 503, "{refused:?}");
+    assert!(
+        refused.body.contains("limits.foxglove_clients"),
+        "{refused:?}"
+    );
+    drop(two);
+    let deadline = Instant::now() + PATIENCE;
+    while connect().is_err() {
+        assert!(Instant::now() < deadline, "no place was given back");
+    }
+    let page = agent.get("/metrics").body;
+    let series = "ros2probe_limit_reached_total{limit=\"foxglove_clients\"}";
+    assert!(metric(&page, series).unwrap() >= 1.0);
 }
 
 /// A capture of this many UDP datagrams, with only the first IP fragment of each.

@@ -21,6 +21,7 @@ mod doctor;
 mod documents;
 mod doors;
 mod events;
+mod foxglove;
 mod fuzz_seeds;
 mod http;
 mod limits;

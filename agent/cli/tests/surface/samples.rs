@@ -67,7 +67,7 @@ fn request(id: u64, depth: Depth) -> SampleRequest {
 }
 
 /// Replays a capture with a watch for all topics and, with a depth, an interest in all samples.
-fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcome>) {
+pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<SampleOutcome>) {
     let mut observer = Observer::new(Settings::default());
     let everything = vec![Watch::named("/**").unwrap()];
     observer.input(Input::Watchlist(Arc::new(

@@ -13,14 +13,14 @@ use super::document::Node;
 use super::mistake::{Mistakes, Position};
 use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
-    ApiShape, CaptureShape, ConfigShape, MetricsShape, OtlpShape, RecordingsShape, WatchEntryShape,
-    WatchShape,
+    ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
+    WatchEntryShape, WatchShape,
 };
 use super::watch::{ExpectationValues, Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
-    ApiSettings, CaptureSettings, Config, Endpoint, Limits, MetricsSettings, OtlpSettings,
-    RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice, SourceChoice,
-    StateChoice,
+    ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Limits, MetricsSettings,
+    OtlpSettings, RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice,
+    SourceChoice, StateChoice,
 };
 
 /// Most configured snapshots; each needs memory and a thread.
@@ -127,12 +127,15 @@ impl Reader {
 
     fn config(&mut self, shape: ConfigShape) -> Config {
         let limits = Limits::from(shape.limits.unwrap_or_default());
+        let api = self.api(shape.api.unwrap_or_default());
+        let has_token = api.token_file.is_some();
         Config {
             watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
             limits,
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(shape.metrics.unwrap_or_default()),
-            api: self.api(shape.api.unwrap_or_default()),
+            api,
+            foxglove: self.foxglove(shape.foxglove.unwrap_or_default(), has_token),
             history: Duration::from_secs(shape.page.unwrap_or_default().history_s.into()),
             otlp: otlp(shape.otlp.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
@@ -253,17 +256,8 @@ impl Reader {
 
     /// An address beyond this host requires a token, because clients can change watches.
     fn api(&mut self, shape: ApiShape) -> ApiSettings {
-        let listen: Option<SocketAddr> = shape.listen.parse().ok();
-        let open = listen.filter(|address| !address.ip().is_loopback());
-        if let (Some(address), None) = (open, &shape.token_file) {
-            let message = format!(
-                "is {address}, which other hosts can reach: set `token_file`, or use \
-                 127.0.0.1"
-            );
-            self.wrong("api.listen", message);
-        }
+        let listen = self.listen("api.listen", &shape.listen, shape.token_file.is_some());
         ApiSettings {
-            // Text other than an address is `off`; the check of texts has refused the rest.
             listen,
             socket: match shape.socket.as_str() {
                 "auto" => SocketChoice::Auto,
@@ -274,6 +268,33 @@ impl Reader {
             token_file: shape.token_file.map(PathBuf::from),
             page: shape.page,
         }
+    }
+
+    /// An address beyond this host requires a token, because clients receive all messages.
+    fn foxglove(&mut self, shape: FoxgloveShape, has_token: bool) -> FoxgloveSettings {
+        let listen = self.listen("foxglove.listen", &shape.listen, has_token);
+        let default = Config::default().foxglove.origins;
+        FoxgloveSettings {
+            listen,
+            origins: shape.origins.unwrap_or(default),
+        }
+    }
+
+    /// Returns the address; text other than an address is `off`, as the check of texts ensures.
+    fn listen(&mut self, key: &str, text: &str, has_token: bool) -> Option<SocketAddr> {
+        let listen: Option<SocketAddr> = text.parse().ok();
+        let open = listen.filter(|address| !address.ip().is_loopback());
+        if let (Some(address), false) = (open, has_token) {
+            let token = match key {
+                "api.listen" => "token_file",
+                _ => "api.token_file",
+            };
+            let message = format!(
+                "is {address}, which other hosts can reach: set `{token}`, or use 127.0.0.1"
+            );
+            self.wrong(key, message);
+        }
+        listen
     }
 
     fn capture(&mut self, shape: CaptureShape) -> CaptureSettings {
@@ -383,10 +404,18 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "api.token_file" if !text.starts_with('/') => Err(
             "must be an absolute path, as in `/run/credentials/ros2probe.service/token`".to_owned(),
         ),
-        key @ ("metrics.listen" | "api.listen")
+        "foxglove.origins[]" if !is_origin(text) => Err(
+            "must be an origin, as in `https://app.foxglove.dev` or `file://`, without a path"
+                .to_owned(),
+        ),
+        key @ ("metrics.listen" | "api.listen" | "foxglove.listen")
             if text != "off" && text.parse::<SocketAddr>().is_err() =>
         {
-            let port = if key == "api.listen" { 17401 } else { 17400 };
+            let port = match key {
+                "api.listen" => 17401,
+                "foxglove.listen" => 8765,
+                _ => 17400,
+            };
             Err(format!(
                 "is `{text}`, must be an IP address and port, as in `127.0.0.1:{port}` or \
                  `[::1]:{port}`, or `off`"
@@ -405,6 +434,18 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
             Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
         }
         _ => Ok(()),
+    }
+}
+
+/// Returns whether the text is an origin as browsers send it: a scheme and, except for files, a host.
+fn is_origin(text: &str) -> bool {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "-._:[]".contains(c);
+    match text.split_once("://") {
+        Some(("file", rest)) => rest.is_empty(),
+        Some((scheme, host)) => {
+            !scheme.is_empty() && !host.is_empty() && host.chars().all(is_plain)
+        }
+        None => false,
     }
 }
 

@@ -48,6 +48,8 @@ pub struct Config {
     pub metrics: MetricsSettings,
     /// The control API.
     pub api: ApiSettings,
+    /// The WebSocket server for Foxglove and other viewers.
+    pub foxglove: FoxgloveSettings,
     /// Time for which figures of measured topics are kept for charts; zero = none.
     pub history: Duration,
     /// Exports to an OpenTelemetry receiver.
@@ -142,6 +144,15 @@ pub struct ApiSettings {
     pub token_file: Option<PathBuf>,
     /// Whether the page is served at `listen`.
     pub page: PageChoice,
+}
+
+/// The WebSocket server for viewers. Its rights and token are those of the control API.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FoxgloveSettings {
+    /// Address to listen on; `None` = off.
+    pub listen: Option<SocketAddr>,
+    /// Origins of web pages that may connect without a token, besides those of this host.
+    pub origins: Vec<String>,
 }
 
 /// Unix socket of the control API.
@@ -349,6 +360,7 @@ impl Config {
                 self.metrics.web_config != new.metrics.web_config,
             ),
             ("api", self.api != new.api),
+            ("foxglove", self.foxglove != new.foxglove),
             ("page", self.history != new.history),
             ("otlp", self.otlp != new.otlp),
             ("recordings", self.recordings != new.recordings),
@@ -405,6 +417,10 @@ impl Default for Config {
                 token_file: None,
                 page: PageChoice::default(),
             },
+            foxglove: FoxgloveSettings {
+                listen: defaults::FOXGLOVE.parse().ok(),
+                origins: defaults::ORIGINS.map(str::to_owned).into(),
+            },
             history: Duration::from_secs(defaults::HISTORY_S.into()),
             otlp: OtlpSettings::default(),
             recordings: RecordingSettings::default(),
@@ -437,6 +453,9 @@ mod defaults {
     pub(super) const SHM_READING_CPU_PERCENT: f64 = 25.0;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";
     pub(super) const API: &str = "127.0.0.1:17401";
+    pub(super) const FOXGLOVE: &str = "127.0.0.1:8765";
+    /// The web application, and the desktop applications, whose pages are files.
+    pub(super) const ORIGINS: [&str; 2] = ["https://app.foxglove.dev", "file://"];
     pub(super) const HISTORY_S: u32 = 600;
 
     pub(super) const fn topic_grace_s() -> u64 {

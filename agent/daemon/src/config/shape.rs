@@ -32,6 +32,8 @@ pub(super) struct ConfigShape {
     pub(super) metrics: Option<MetricsShape>,
     /// The control API, for example to add and remove watches at run time.
     pub(super) api: Option<ApiShape>,
+    /// The WebSocket server for Foxglove, Lichtblick and PlotJuggler.
+    pub(super) foxglove: Option<FoxgloveShape>,
     /// Content of the web page.
     pub(super) page: Option<PageShape>,
     /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. The standard
@@ -214,6 +216,20 @@ pub(super) struct ApiShape {
     pub(super) page: PageChoice,
 }
 
+/// The WebSocket server for viewers. Clients have the rights of `api.loopback`, or all with the token
+/// of `api.token_file` or of `rp foxglove` in the address (`?token=`).
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct FoxgloveShape {
+    /// IP address and port to listen on, or `off`. Any address but a loopback one needs
+    /// `api.token_file`.
+    pub(super) listen: String,
+    /// Origins of web pages that may connect without a token, as in `https://app.foxglove.dev`;
+    /// `file://` for desktop applications. Pages of this host always may.
+    pub(super) origins: Option<Vec<String>>,
+}
+
 /// The web page; `api.page` disables it.
 #[derive(Debug, Deserialize, JsonSchema)]
 #[schemars(inline)]
@@ -238,6 +254,15 @@ impl Default for PageShape {
     fn default() -> Self {
         Self {
             history_s: defaults::HISTORY_S,
+        }
+    }
+}
+
+impl Default for FoxgloveShape {
+    fn default() -> Self {
+        Self {
+            listen: defaults::FOXGLOVE.to_owned(),
+            origins: None,
         }
     }
 }

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::catalogue as metric;
+use super::foxglove::Viewers;
 use super::metric_sink::{Label, MetricSink};
 use super::otlp::{Exports, Outcome, Reason};
 use super::process::Process;
@@ -236,6 +237,17 @@ pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Re
     })?;
     sink.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)?;
     sink.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
+}
+
+/// Writes the metrics of viewers.
+pub(super) fn viewers(sink: &mut MetricSink<'_>, viewers: &Viewers) -> fmt::Result {
+    let totals = viewers.totals();
+    sink.single(&metric::FOXGLOVE_CLIENTS, totals.clients)?;
+    sink.single(&metric::FOXGLOVE_SUBSCRIPTIONS, totals.subscriptions)?;
+    sink.single(&metric::FOXGLOVE_REFUSED, totals.refused)?;
+    sink.single(&metric::FOXGLOVE_SENT, totals.sent_messages)?;
+    sink.single(&metric::FOXGLOVE_SENT_BYTES, totals.sent_bytes)?;
+    sink.single(&metric::FOXGLOVE_DROPPED, totals.dropped_messages)
 }
 
 /// Writes the number of events, and of events and log lines that were dropped.

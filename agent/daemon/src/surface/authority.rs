@@ -22,7 +22,7 @@ pub(super) fn own(headers: &HeaderMap) -> Result<(), &str> {
 }
 
 /// Returns whether the text is `localhost` or a loopback address, with or without a port.
-fn is_own(host: &str) -> bool {
+pub(super) fn is_own(host: &str) -> bool {
     if let Some(rest) = host.strip_prefix('[') {
         let Some((address, port)) = rest.split_once(']') else {
             return false;

@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use super::agent_metrics;
 use super::delivery_metrics::{self, Deliveries};
 use super::diagnosis_metrics;
+use super::foxglove::Viewers;
 use super::metric_sink::MetricSink;
 use super::otlp::Exports;
 use super::ros2_metrics::{self, TopicRows};
@@ -36,6 +37,8 @@ pub struct MetricSources {
     pub recordings: Arc<RecordingFigures>,
     /// Counters of exports.
     pub exports: Arc<Exports>,
+    /// Viewers.
+    pub viewers: Arc<Viewers>,
     /// Lines of the log that standard error did not accept.
     pub lost_lines: Arc<AtomicU64>,
 }
@@ -53,6 +56,7 @@ impl MetricSources {
             settings: Arc::new(SettingsCell::new(settings)),
             recordings: Arc::default(),
             exports: Arc::default(),
+            viewers: Arc::default(),
             lost_lines: Arc::default(),
         }
     }
@@ -85,6 +89,7 @@ pub(super) fn collect(
     agent_metrics::surface(sink, &state, sources.settings.reload(), previous, now)?;
     agent_metrics::kept(sink, &state)?;
     agent_metrics::subscriptions(sink, &state)?;
+    agent_metrics::viewers(sink, &sources.viewers)?;
     agent_metrics::events(
         sink,
         &sources.events,

@@ -12,6 +12,7 @@ mod connection;
 mod delivery_metrics;
 mod diagnosis_metrics;
 pub mod exposition;
+pub mod foxglove;
 pub mod http;
 mod large_responses;
 mod limited_listener;

@@ -108,7 +108,8 @@ async fn answer<M: Clone + Send + Sync + 'static>(
         .max_headers(MAX_FIELDS)
         // [`ConnectionState`] has its own timeouts.
         .header_read_timeout(None::<Duration>)
-        .serve_connection(TokioIo::new(io), service);
+        .serve_connection(TokioIo::new(io), service)
+        .with_upgrades();
     let mut connection = std::pin::pin!(connection);
     tokio::select! {
         // Disconnects of clients are not logged.

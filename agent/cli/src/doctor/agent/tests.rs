@@ -135,6 +135,40 @@ fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more()
 }
 
 #[test]
+fn viewers_are_shown_with_their_rights_and_a_busy_port_with_a_remedy() {
+    let with = |foxglove: &str| {
+        let health = WELL.replacen('{', &format!(r#"{{"foxglove":{foxglove},"#), 1);
+        let findings = check(&answers(&health, WATCHED), "here", "1.0.0");
+        let found = findings.into_iter().find(|each| each.check == "foxglove");
+        found.unwrap()
+    };
+    let shown = with(r#"{"address":"ws://localhost:8765/","access":"watch"}"#);
+    assert_eq!(shown.severity, Severity::Ok);
+    assert_eq!(
+        shown.sentence,
+        "Foxglove viewers may open ws://localhost:8765/: messages need a token (rp foxglove); \
+         none is connected"
+    );
+    let slow = with(
+        r#"{"address":"ws://10.0.0.1:8765/","access":null,"clients":[
+            {"address":"10.0.0.2:40000","access":"all","subscriptions":3,"dropped_messages":7}]}"#,
+    );
+    assert_eq!(slow.severity, Severity::Note);
+    for part in [
+        "every viewer needs a token",
+        "with 3 subscriptions",
+        "too slowly",
+    ] {
+        assert!(slow.sentence.contains(part), "{}", slow.sentence);
+    }
+    let busy = with(r#"{"address":"ws://localhost:8765/","reason":"Address already in use"}"#);
+    assert_eq!(busy.severity, Severity::Warning);
+    assert!(busy.sentence.ends_with("Address already in use"));
+    let off = check(&answers(WELL, WATCHED), "here", "1.0.0");
+    assert!(off.iter().all(|each| each.check != "foxglove"));
+}
+
+#[test]
 fn nothing_watched_is_a_note_with_the_command() {
     let findings = check(&answers(WELL, "{}"), "here", "1.0.0");
     assert_eq!(severity(&findings, "watches"), Some(Severity::Note));

@@ -471,6 +471,36 @@ pub const FIXED: &[[&str; 4]] = &[
         "arrays_of_arrays_have_one_room_together",
     ],
     [
+        "MAX_CHANNELS",
+        "agent/daemon/src/surface/foxglove/channels.rs",
+        "agent/daemon/src/surface/foxglove/tests.rs",
+        "topics_beyond_the_cap_have_no_channel",
+    ],
+    [
+        "SCHEMA_BYTES",
+        "agent/daemon/src/surface/foxglove/channels.rs",
+        "agent/daemon/src/surface/foxglove/channels.rs",
+        "definitions_beyond_the_bytes_are_left_out_until_others_are_unused",
+    ],
+    [
+        "MAX_MESSAGE",
+        "agent/daemon/src/surface/foxglove/client.rs",
+        "agent/cli/tests/surface/foxglove.rs",
+        "clients_that_break_the_protocol_are_closed_with_a_code_and_leave_nothing",
+    ],
+    [
+        "MAX_SUBSCRIPTIONS",
+        "agent/daemon/src/surface/foxglove/client.rs",
+        "agent/cli/tests/surface/foxglove.rs",
+        "clients_that_break_the_protocol_are_closed_with_a_code_and_leave_nothing",
+    ],
+    [
+        "QUEUE_BYTES",
+        "agent/daemon/src/surface/foxglove/client.rs",
+        "agent/daemon/src/surface/foxglove/tests.rs",
+        "a_viewer_that_does_not_read_loses_the_oldest_and_receives_their_number",
+    ],
+    [
         "MAX_TOKENS",
         "agent/daemon/src/surface/api/page/tokens.rs",
         "agent/daemon/src/surface/api/page/tokens.rs",
@@ -563,5 +593,9 @@ pub const KEYS: &[[&str; 2]] = &[
     [
         "metrics_clients",
         "clients_beyond_the_cap_are_refused_at_once_and_served_after_one_leaves",
+    ],
+    [
+        "foxglove_clients",
+        "viewers_beyond_the_cap_are_refused_until_one_has_gone",
     ],
 ];

@@ -12,6 +12,7 @@ use utoipa_axum::routes;
 use super::Context;
 use crate::agent_facts::{Ability, AgentFacts};
 use crate::privilege;
+use crate::surface::foxglove::{ViewerListener, Viewers};
 use crate::surface::otlp::Host;
 use crate::surface::process::Process;
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
@@ -96,8 +97,35 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         capabilities: held.into_iter().collect(),
         threads: threads.collect(),
         unfiltered_reason: agent.sandbox.reason().map(Into::into),
+        foxglove: foxglove(&context.viewers),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
+    })
+}
+
+/// Returns the listener for viewers; `None` if it is off.
+fn foxglove(viewers: &Viewers) -> Option<health::Foxglove> {
+    let (address, access, reason) = match viewers.listener() {
+        ViewerListener::Off => return None,
+        ViewerListener::At(address, access) => (address, access, None),
+        ViewerListener::Failed(address, reason) => (address, None, Some(reason)),
+    };
+    let clients = viewers.connected().into_iter();
+    let clients = clients.map(|viewer| health::FoxgloveClient {
+        address: viewer.address.map(|address| address.to_string()),
+        access: viewer.access.name().into(),
+        subscriptions: viewer.subscriptions,
+        sent_messages: viewer.sent_messages,
+        dropped_messages: viewer.dropped_messages,
+    });
+    Some(health::Foxglove {
+        address: match address.ip() {
+            ip if ip.is_loopback() && ip.is_ipv4() => format!("ws://localhost:{}/", address.port()),
+            _ => format!("ws://{address}/"),
+        },
+        reason,
+        access: access.map(|access| access.name().into()),
+        clients: clients.collect(),
     })
 }
 

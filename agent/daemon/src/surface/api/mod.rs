@@ -33,7 +33,7 @@ mod recordings;
 pub mod reload;
 mod samples;
 mod scope;
-mod security;
+pub(in crate::surface) mod security;
 mod server;
 mod services;
 mod snapshots;
@@ -53,6 +53,7 @@ use axum::response::{IntoResponse as _, Response};
 use tokio_util::sync::CancellationToken;
 use utoipa_axum::router::OpenApiRouter;
 
+use super::foxglove::Viewers;
 use super::large_responses::LargeResponses;
 use crate::config::{Access, Limit};
 use crate::events::EventLog;
@@ -98,6 +99,8 @@ pub struct Context {
     pub live: Arc<Live>,
     /// Message definitions.
     pub library: Arc<Library>,
+    /// The viewers.
+    pub viewers: Arc<Viewers>,
     /// The web page.
     pub page: Arc<Page>,
     /// Reloads the configuration.
@@ -112,6 +115,11 @@ impl Context {
         self.latest.refresh(TIMEOUT).await;
         self.latest.state()
     }
+}
+
+/// Returns the name of this host.
+pub(super) fn host() -> Option<String> {
+    health::HOST.clone()
 }
 
 /// Returns the routes of all nouns with their part of the document.

@@ -36,7 +36,7 @@ const SEC_FETCH_MODE: HeaderName = HeaderName::from_static("sec-fetch-mode");
 
 /// A token that clients must send.
 #[derive(Clone)]
-pub(super) struct Token(Arc<[u8]>);
+pub(in crate::surface) struct Token(Arc<[u8]>);
 
 /// Why the token cannot be loaded.
 #[derive(Debug, thiserror::Error)]
@@ -62,7 +62,7 @@ pub enum TokenError {
 
 /// The access rules of one of the API's listeners.
 #[derive(Debug)]
-pub(super) struct Door {
+pub(in crate::surface) struct Door {
     kind: Kind,
     granted: Granted,
     page: page::Shared,
@@ -72,7 +72,7 @@ pub(super) struct Door {
 
 /// The rights that a listener grants to a request.
 #[derive(Clone, Debug)]
-pub(super) struct Granted {
+pub(in crate::surface) struct Granted {
     access: Access,
     /// The agent's unix socket, which grants all rights.
     socket: Option<Arc<Path>>,
@@ -87,7 +87,7 @@ pub(super) struct Needs {
 
 /// The clients that can connect.
 #[derive(Debug)]
-pub(super) enum Kind {
+pub(in crate::surface) enum Kind {
     /// Processes with permission to open the unix socket.
     Socket,
     /// Processes on this host, with the token if one is configured.
@@ -105,7 +105,7 @@ struct Bucket {
 
 impl Token {
     /// Loads the token from a file.
-    pub(super) fn load(path: &Path) -> Result<Self, TokenError> {
+    pub(in crate::surface) fn load(path: &Path) -> Result<Self, TokenError> {
         let mut bytes = Vec::new();
         let limit = *TOKEN_BYTES.end() as u64 + 2;
         let read =
@@ -135,7 +135,7 @@ impl std::fmt::Debug for Token {
 }
 
 impl Door {
-    pub(super) fn new(kind: Kind, granted: Granted) -> Self {
+    pub(in crate::surface) fn new(kind: Kind, granted: Granted) -> Self {
         let bucket = || {
             Mutex::new(Bucket {
                 left: BURST,
@@ -152,7 +152,7 @@ impl Door {
     }
 
     /// Returns the door with the tokens of web pages.
-    pub(super) fn with(self, page: page::Shared) -> Self {
+    pub(in crate::surface) fn with(self, page: page::Shared) -> Self {
         Self { page, ..self }
     }
 
@@ -184,6 +184,49 @@ impl Door {
             false => own_pages(headers),
         });
         self.pass(admitted, now)
+    }
+
+    /// Checks the handshake of a viewer and returns its rights. Viewers send a token in the URL. The
+    /// holder of a token may show any web page; without one, the page must be on this host, or among
+    /// `origins`.
+    pub(in crate::surface) fn let_in_viewer(
+        &self,
+        headers: &HeaderMap,
+        token: Option<&[u8]>,
+        origins: &[String],
+        now: Instant,
+    ) -> Result<Granted, Problem> {
+        self.pass(self.admit_viewer(headers, token, origins), now)
+    }
+
+    fn admit_viewer(
+        &self,
+        headers: &HeaderMap,
+        offered: Option<&[u8]>,
+        origins: &[String],
+    ) -> Result<Granted, Problem> {
+        let token = match &self.kind {
+            Kind::Socket => return Ok(self.granted.clone()),
+            Kind::Loopback(token) => {
+                own_host(headers)?;
+                token.as_ref()
+            }
+            Kind::Network(token) => Some(token),
+        };
+        if let Some(offered) = offered.or_else(|| bearer(headers)) {
+            let is_right =
+                self.page.tokens.know(offered) || token.is_some_and(|token| token.is(offered));
+            return match is_right {
+                true => Ok(self.granted.everything()),
+                false => Err(Problem::new(Code::Unauthorized, "the token is wrong")),
+            };
+        }
+        if token.is_some() {
+            let detail = "add `?token=TOKEN` to the address; `rp foxglove` prints it";
+            return Err(Problem::new(Code::Unauthorized, detail));
+        }
+        viewers_pages(headers, origins)?;
+        Ok(self.granted.clone())
     }
 
     /// Applies the rate limit. Authorized and other clients have separate limits, so the latter
@@ -224,7 +267,7 @@ impl Door {
 
 impl Kind {
     /// Returns the rights of clients; `loopback` for those identified only by this host.
-    pub(super) const fn access(&self, loopback: Access) -> Access {
+    pub(in crate::surface) const fn access(&self, loopback: Access) -> Access {
         match self {
             Self::Loopback(None) => loopback,
             Self::Socket | Self::Loopback(Some(_)) | Self::Network(_) => Access::All,
@@ -233,11 +276,11 @@ impl Kind {
 }
 
 impl Granted {
-    pub(super) const fn new(access: Access, socket: Option<Arc<Path>>) -> Self {
+    pub(in crate::surface) const fn new(access: Access, socket: Option<Arc<Path>>) -> Self {
         Self { access, socket }
     }
 
-    pub(super) const fn access(&self) -> Access {
+    pub(in crate::surface) const fn access(&self) -> Access {
         self.access
     }
 
@@ -366,6 +409,30 @@ fn own_pages(headers: &HeaderMap) -> Result<(), Problem> {
         return Err(Problem::new(Code::ForeignOrigin, detail));
     }
     Ok(())
+}
+
+/// Checks that the web page of a viewer, if it is one, is on this host or among `origins`. A page
+/// elsewhere cannot have an origin of this host.
+fn viewers_pages(headers: &HeaderMap, origins: &[String]) -> Result<(), Problem> {
+    let mut pages = headers.get_all(ORIGIN).iter();
+    let foreign = pages.find(|page| {
+        let page = page.to_str().unwrap_or_default();
+        let authority = page
+            .split_once("://")
+            .map_or("", |(_, authority)| authority);
+        !authority::is_own(authority) && !origins.iter().any(|origin| origin == page)
+    });
+    match foreign {
+        None => Ok(()),
+        Some(page) => {
+            let detail = format!(
+                "the web page {} may not connect without a token: add `?token=TOKEN` to the \
+                 address, as `rp foxglove` prints it, or the page to `foxglove.origins`",
+                String::from_utf8_lossy(page.as_bytes())
+            );
+            Err(Problem::new(Code::ForeignOrigin, detail))
+        }
+    }
 }
 
 fn authorized(headers: &HeaderMap, token: &Token) -> Result<(), Problem> {

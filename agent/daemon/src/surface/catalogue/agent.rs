@@ -268,6 +268,45 @@ pub(in crate::surface) const SAMPLES_RETAINED: Metric = Metric::gauge(
     "Bytes of last messages kept for later recordings (watches with retain: last), at most 4 MiB.",
 )
 .unit("bytes");
+pub(in crate::surface) const FOXGLOVE_CLIENTS: Metric = Metric::gauge(
+    "ros2probe_foxglove_clients",
+    &[],
+    "Viewers connected over the Foxglove protocol.",
+)
+.experimental();
+pub(in crate::surface) const FOXGLOVE_SUBSCRIPTIONS: Metric = Metric::gauge(
+    "ros2probe_foxglove_subscriptions",
+    &[],
+    "Channels that these viewers subscribe to.",
+)
+.experimental();
+pub(in crate::surface) const FOXGLOVE_REFUSED: Metric = Metric::counter(
+    "ros2probe_foxglove_refused_total",
+    &[],
+    "Viewers that were refused: without a right, from a web page elsewhere, or without the \
+     protocol.",
+)
+.experimental();
+pub(in crate::surface) const FOXGLOVE_SENT: Metric = Metric::counter(
+    "ros2probe_foxglove_sent_messages_total",
+    &[],
+    "Messages sent to viewers, statistics included.",
+)
+.experimental();
+pub(in crate::surface) const FOXGLOVE_SENT_BYTES: Metric = Metric::counter(
+    "ros2probe_foxglove_sent_bytes_total",
+    &[],
+    "Bytes of those messages.",
+)
+.unit("bytes")
+.experimental();
+pub(in crate::surface) const FOXGLOVE_DROPPED: Metric = Metric::counter(
+    "ros2probe_foxglove_dropped_messages_total",
+    &[],
+    "Messages dropped because a viewer reads too slowly; each is in \
+     ros2probe_missed_messages_total, too.",
+)
+.experimental();
 pub(in crate::surface) const RECORDINGS: Metric = Metric::gauge(
     "ros2probe_recordings",
     &[],

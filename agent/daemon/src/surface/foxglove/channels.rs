@@ -1,0 +1,329 @@
+//! Channels of the viewers: one for the messages of each topic and type, one for the statistics of
+//! each measured topic. They follow the snapshots once a second while a viewer is connected.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use ros2probe_message::Library;
+use ros2probe_model::names::{DdsName, TypeName};
+use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_wire::DomainId;
+use tokio::task::spawn_blocking;
+
+use super::graph::Graph;
+use super::names::DomainNames;
+use super::protocol::Advertised;
+use super::statistics;
+
+/// Largest number of channels; further topics are left out.
+pub(super) const MAX_CHANNELS: usize = 4096;
+/// Largest total size of definitions in bytes; channels beyond it have no schema.
+const SCHEMA_BYTES: usize = 2 << 20;
+
+/// Channels by id.
+pub(super) type Channels = BTreeMap<u32, Arc<Channel>>;
+
+/// Content of a channel, which identifies it.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Content {
+    /// Messages of a topic, of one type.
+    Messages {
+        domain_id: DomainId,
+        dds_name: DdsName,
+        message_type: TypeName,
+    },
+    /// Figures of a topic.
+    Statistics {
+        domain_id: DomainId,
+        dds_name: DdsName,
+    },
+}
+
+/// A channel. It never changes; another definition is another channel.
+#[derive(Debug)]
+pub(super) struct Channel {
+    id: u32,
+    topic: String,
+    pub(super) content: Content,
+    schema: Option<Schema>,
+}
+
+/// Encoding and text of a definition.
+#[derive(Clone, Debug)]
+struct Schema {
+    encoding: &'static str,
+    text: Arc<str>,
+}
+
+/// The channels and the graph at one moment.
+#[derive(Debug)]
+pub(super) struct Table {
+    pub(super) channels: Arc<Channels>,
+    /// Present while a viewer shows it.
+    pub(super) graph: Option<Arc<Graph>>,
+}
+
+/// Follows the snapshots.
+#[derive(Debug)]
+pub(super) struct Registry {
+    library: Arc<Library>,
+    channels: Arc<Channels>,
+    ids: BTreeMap<Content, u32>,
+    /// Number of channels so far; no id is used twice.
+    count: u32,
+    names: DomainNames,
+    schemas: Schemas,
+}
+
+/// Type and announced hash.
+type Definition = (TypeName, Option<String>);
+
+/// Definitions of the channels' types; `None` if none was found.
+#[derive(Debug)]
+struct Schemas {
+    known: BTreeMap<Definition, Option<Schema>>,
+    bytes: usize,
+    limit: usize,
+}
+
+impl Channel {
+    /// Returns the id.
+    pub(super) const fn id(&self) -> u32 {
+        self.id
+    }
+
+    /// Returns the form of an `advertise` message.
+    pub(super) fn advertised(&self) -> Advertised<'_> {
+        let (encoding, schema_name) = match &self.content {
+            Content::Messages { message_type, .. } => ("cdr", message_type.as_str()),
+            Content::Statistics { .. } => ("json", statistics::SCHEMA_NAME),
+        };
+        Advertised {
+            id: self.id,
+            topic: &self.topic,
+            encoding,
+            schema_name,
+            schema: self.schema.as_ref().map_or("", |schema| &schema.text),
+            schema_encoding: self.schema.as_ref().map(|schema| schema.encoding),
+        }
+    }
+
+    /// Returns its size in an `advertise` message, approximately.
+    pub(super) fn size(&self) -> usize {
+        let schema = self.schema.as_ref().map_or(0, |schema| schema.text.len());
+        256 + self.topic.len() + schema
+    }
+}
+
+impl Registry {
+    /// Creates a registry without channels.
+    pub(super) fn new(library: Arc<Library>) -> Self {
+        Self {
+            library,
+            channels: Arc::default(),
+            ids: BTreeMap::new(),
+            count: 0,
+            names: DomainNames::default(),
+            schemas: Schemas::new(SCHEMA_BYTES),
+        }
+    }
+
+    /// Forgets all channels. Their ids are not used again.
+    pub(super) fn clear(&mut self) {
+        self.channels = Arc::default();
+        self.ids.clear();
+        self.schemas.forget_unused();
+    }
+
+    /// Follows a snapshot.
+    pub(super) async fn update(&mut self, snapshot: &Snapshot, with_graph: bool) -> Table {
+        self.names.update(snapshot);
+        let wanted = wanted(snapshot);
+        if wanted.len() != self.ids.len() || !wanted.keys().eq(self.ids.keys()) {
+            self.look_up(&wanted).await;
+            self.change(&wanted);
+        }
+        let graph = with_graph.then(|| Arc::new(Graph::of(snapshot, &self.names)));
+        Table {
+            channels: Arc::clone(&self.channels),
+            graph,
+        }
+    }
+
+    /// Finds the definitions of new types. Files are read on another thread.
+    async fn look_up(&mut self, wanted: &BTreeMap<Content, &TopicFacts>) {
+        let new = wanted
+            .iter()
+            .filter(|(content, _)| !self.ids.contains_key(*content));
+        let definitions = new.filter_map(|(content, topic)| definition(content, topic));
+        let unknown: BTreeSet<_> = definitions
+            .filter(|definition| !self.schemas.known.contains_key(definition))
+            .collect();
+        if unknown.is_empty() {
+            return;
+        }
+        let library = Arc::clone(&self.library);
+        let found = spawn_blocking(move || {
+            let found = unknown.into_iter().map(|definition| {
+                let schema = library.find(&definition.0, definition.1.as_deref());
+                let schema = schema.ok().map(|found| {
+                    let (encoding, text) = found.schema_text();
+                    Schema {
+                        encoding,
+                        text: text.into(),
+                    }
+                });
+                (definition, schema)
+            });
+            found.collect::<Vec<_>>()
+        });
+        // Without threads, these channels have no schema.
+        for (definition, schema) in found.await.unwrap_or_default() {
+            self.schemas.keep(definition, schema);
+        }
+    }
+
+    /// Replaces the channels. Those that stay keep their ids.
+    fn change(&mut self, wanted: &BTreeMap<Content, &TopicFacts>) {
+        let mut channels = Channels::new();
+        let mut ids = BTreeMap::new();
+        for (content, topic) in wanted {
+            let known = self.ids.get(content);
+            let known = known.and_then(|id| self.channels.get(id).map(Arc::clone));
+            let channel = known.unwrap_or_else(|| {
+                self.count = self.count.wrapping_add(1);
+                Arc::new(self.channel(self.count, content, topic))
+            });
+            ids.insert(content.clone(), channel.id);
+            channels.insert(channel.id, channel);
+        }
+        self.ids = ids;
+        self.channels = Arc::new(channels);
+        self.schemas.forget_unused();
+    }
+
+    fn channel(&self, id: u32, content: &Content, topic: &TopicFacts) -> Channel {
+        let name = self.names.shown(topic.domain_id, &topic.name);
+        let (topic, schema) = match content {
+            Content::Messages { .. } => {
+                let definition = definition(content, topic);
+                let known = definition.and_then(|definition| self.schemas.known.get(&definition));
+                (name, known.cloned().flatten())
+            }
+            Content::Statistics { .. } => {
+                let schema = Schema {
+                    encoding: "jsonschema",
+                    text: statistics::schema(),
+                };
+                (format!("{}{name}", statistics::PREFIX), Some(schema))
+            }
+        };
+        Channel {
+            id,
+            topic,
+            content: content.clone(),
+            schema,
+        }
+    }
+}
+
+impl Schemas {
+    const fn new(limit: usize) -> Self {
+        Self {
+            known: BTreeMap::new(),
+            bytes: 0,
+            limit,
+        }
+    }
+
+    /// Keeps a definition if it fits.
+    fn keep(&mut self, definition: Definition, schema: Option<Schema>) {
+        let size = |schema: &Schema| schema.text.len();
+        let schema = schema.filter(|schema| self.bytes + size(schema) <= self.limit);
+        self.bytes += schema.as_ref().map_or(0, size);
+        self.known.insert(definition, schema);
+    }
+
+    /// Drops definitions without a channel.
+    fn forget_unused(&mut self) {
+        self.known.retain(|_, schema| {
+            let text = schema.as_ref().map(|schema| &schema.text);
+            text.is_some_and(|text| Arc::strong_count(text) > 1)
+        });
+        let schemas = self.known.values().flatten();
+        self.bytes = schemas.map(|schema| schema.text.len()).sum();
+    }
+}
+
+/// Returns the channels for a snapshot: first those of messages, then those of statistics.
+fn wanted(snapshot: &Snapshot) -> BTreeMap<Content, &TopicFacts> {
+    let topics = snapshot.topics.iter();
+    let topics =
+        topics.filter(|topic| topic.kind.is_ros_topic() && !topic.hidden && !topic.vanished);
+    let messages = topics.clone().flat_map(|topic| {
+        let types = topic.message_types.iter();
+        types.map(move |message_type| {
+            let content = Content::Messages {
+                domain_id: topic.domain_id,
+                dds_name: topic.dds_name.clone(),
+                message_type: message_type.clone(),
+            };
+            (content, topic)
+        })
+    });
+    let measured = topics.filter(|topic| topic.measurement.is_some());
+    let statistics = measured.map(|topic| {
+        let content = Content::Statistics {
+            domain_id: topic.domain_id,
+            dds_name: topic.dds_name.clone(),
+        };
+        (content, topic)
+    });
+    messages.chain(statistics).take(MAX_CHANNELS).collect()
+}
+
+/// Returns type and hash of a channel's messages, as the first endpoint of that type announces it.
+fn definition(content: &Content, topic: &TopicFacts) -> Option<Definition> {
+    let Content::Messages { message_type, .. } = content else {
+        return None;
+    };
+    let mut endpoints = topic.publishers.iter().chain(&topic.subscriptions);
+    let of_type = endpoints.find(|endpoint| endpoint.message_type == *message_type);
+    let hash = of_type.and_then(|endpoint| endpoint.type_hash.as_ref());
+    Some((message_type.clone(), hash.map(ToString::to_string)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn definitions_beyond_the_bytes_are_left_out_until_others_are_unused() {
+        let mut schemas = Schemas::new(10);
+        let definition = |name: &str| (TypeName::from(name), None);
+        let schema = |size: usize| {
+            Some(Schema {
+                encoding: "ros2msg",
+                text: "x".repeat(size).into(),
+            })
+        };
+        schemas.keep(definition("a/msg/A"), schema(6));
+        schemas.keep(definition("a/msg/B"), schema(6));
+        schemas.keep(definition("a/msg/C"), schema(4));
+        let is_kept = |schemas: &Schemas, name| schemas.known[&definition(name)].is_some();
+        assert!(is_kept(&schemas, "a/msg/A") && is_kept(&schemas, "a/msg/C"));
+        assert!(!is_kept(&schemas, "a/msg/B"));
+        assert_eq!(schemas.bytes, 10);
+        let used = schemas.known[&definition("a/msg/C")].clone();
+        schemas.forget_unused();
+        assert_eq!((schemas.bytes, schemas.known.len()), (4, 1));
+        schemas.keep(definition("a/msg/B"), schema(6));
+        assert!(is_kept(&schemas, "a/msg/B"));
+        drop(used);
+        assert_eq!(SCHEMA_BYTES, Registry::new(library()).schemas.limit);
+    }
+
+    fn library() -> Arc<Library> {
+        Arc::new(Library::new(ros2probe_message::Sources::default()))
+    }
+}

@@ -1,0 +1,655 @@
+//! One viewer: its channels, its subscriptions and its messages.
+//!
+//! One task reads and writes, so a viewer that does not read is not read either, and nothing piles
+//! up for it. Its messages wait in the queue of one [`Subscription`], which drops the oldest of the
+//! topic with most bytes. A message is sent in fragments, so each viewer needs memory for two.
+
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::{Bytes, BytesMut};
+use futures_util::{SinkExt as _, StreamExt as _};
+use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
+use ros2probe_model::names::{DdsName, TopicName};
+use ros2probe_wire::Timestamp;
+use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::sync::watch;
+use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data, OpCode};
+use tokio_tungstenite::tungstenite::protocol::frame::{CloseFrame, Frame};
+use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
+use tokio_tungstenite::tungstenite::{Error, Message as Incoming};
+
+use super::Shared;
+use super::channels::{Channel, Channels, Content, Table};
+use super::figures::Viewer;
+use super::graph::Graph;
+use super::protocol::{self, Level, Message, Metadata, Request, Subscribe, data_head, parse};
+use super::statistics::{self, Previous};
+use crate::config::Access;
+use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription};
+
+/// Largest message of a client, in bytes.
+const MAX_MESSAGE: usize = 256 << 10;
+/// Largest number of subscriptions of one client, including those that one message requests.
+const MAX_SUBSCRIPTIONS: usize = 4096;
+/// Capacity of a client's queue in bytes; `limits.payload_bytes` bounds all queues together.
+const QUEUE_BYTES: usize = 16 << 20;
+/// Size of a fragment of a message to a client, and of an `advertise` message, in bytes.
+const FRAGMENT: usize = 64 << 10;
+/// Messages that are sent before the client is read again.
+const BATCH: usize = 64;
+/// Interval of statuses, and number of them between two pings.
+const TICK: Duration = Duration::from_secs(1);
+const PING_TICKS: u32 = 20;
+/// Pings without an answer after which a client is gone.
+const MAX_UNANSWERED: u32 = 3;
+/// Seconds without a further loss after which the status of losses is removed.
+const QUIET_TICKS: u32 = 10;
+/// Topics that the status of losses names.
+const NAMED: usize = 3;
+/// Topics whose losses are counted apart.
+const COUNTED: usize = 64;
+/// Longest time, and largest number of bytes, until a client reads why it is closed.
+const FAREWELL: Duration = Duration::from_secs(1);
+const FAREWELL_BYTES: u64 = 1 << 20;
+
+/// Losses that a status reports to the client.
+const LOSSES: [(MissedReason, &str, &str); 2] = [
+    (
+        MissedReason::QueueFull,
+        "queue_full",
+        "dropped because this client reads too slowly",
+    ),
+    (
+        MissedReason::NotCaptured,
+        "not_captured",
+        "not captured because the agent reads too slowly",
+    ),
+];
+
+/// One viewer on a connection.
+pub(super) struct Client<S> {
+    socket: WebSocketStream<S>,
+    shared: Arc<Shared>,
+    access: Access,
+    viewer: Viewer,
+    tables: watch::Receiver<Option<Arc<Table>>>,
+    channels: Arc<Channels>,
+    subscribed: BTreeMap<u32, Subscribed>,
+    /// Ids of the subscriptions by content.
+    ids: BTreeMap<Content, u32>,
+    /// Messages of all subscribed topics.
+    messages: Option<Subscription>,
+    graph: Option<Arc<Graph>>,
+    losses: [Losses; LOSSES.len()],
+    unanswered: u32,
+}
+
+/// A subscription of the client.
+struct Subscribed {
+    channel: Arc<Channel>,
+    previous: Previous,
+}
+
+/// Lost messages of one reason, since its status was last removed.
+#[derive(Default)]
+struct Losses {
+    topics: BTreeMap<TopicName, u64>,
+    messages: u64,
+    is_news: bool,
+    quiet: u32,
+}
+
+/// Why a connection ends.
+enum End {
+    /// The client is gone.
+    Gone,
+    /// The server closes it.
+    Closed(CloseCode, &'static str),
+}
+
+impl From<Error> for End {
+    fn from(error: Error) -> Self {
+        match error {
+            Error::Capacity(_) => Self::Closed(CloseCode::Size, "the message is too large"),
+            Error::Utf8(_) => Self::Closed(CloseCode::Invalid, "the text is not UTF-8"),
+            Error::Protocol(_) => Self::Closed(CloseCode::Protocol, "the frame breaks RFC 6455"),
+            _ => Self::Gone,
+        }
+    }
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
+    /// Creates a client on a stream after the handshake.
+    pub(super) async fn new(
+        stream: S,
+        shared: Arc<Shared>,
+        access: Access,
+        viewer: Viewer,
+    ) -> Self {
+        let config = WebSocketConfig::default()
+            .read_buffer_size(4 << 10)
+            .write_buffer_size(FRAGMENT)
+            .max_message_size(Some(MAX_MESSAGE))
+            .max_frame_size(Some(MAX_MESSAGE));
+        let socket = WebSocketStream::from_raw_socket(stream, Role::Server, Some(config)).await;
+        let mut tables = shared.tables.subscribe();
+        tables.mark_unchanged();
+        shared.news.notify_one();
+        Self {
+            socket,
+            shared,
+            access,
+            viewer,
+            tables,
+            channels: Arc::default(),
+            subscribed: BTreeMap::new(),
+            ids: BTreeMap::new(),
+            messages: None,
+            graph: None,
+            losses: Default::default(),
+            unanswered: 0,
+        }
+    }
+
+    /// Serves the client until one side ends the connection.
+    pub(super) async fn run(mut self) {
+        let stop = self.shared.stop.clone();
+        let end = tokio::select! {
+            end = self.serve() => end,
+            () = stop.cancelled() => Err(End::Closed(CloseCode::Away, "the agent ends")),
+        };
+        if let Err(End::Closed(code, reason)) = end {
+            tracing::debug!(%code, reason, "closed a viewer");
+            // Ends the interest in its topics first.
+            self.messages = None;
+            let _ = timeout(FAREWELL, self.say_farewell(code, reason)).await;
+        }
+    }
+
+    async fn serve(&mut self) -> Result<(), End> {
+        self.introduce().await?;
+        let mut ticks = ticks();
+        let mut count = 0_u32;
+        loop {
+            tokio::select! {
+                biased;
+                incoming = self.socket.next() => match incoming {
+                    Some(incoming) => self.take(incoming?).await?,
+                    None => return Err(End::Gone),
+                },
+                changed = self.tables.changed() => {
+                    changed.map_err(|_| End::Gone)?;
+                    self.show().await?;
+                }
+                _ = ticks.tick() => {
+                    count = count.wrapping_add(1);
+                    self.report_losses().await?;
+                    if count.is_multiple_of(PING_TICKS) {
+                        self.ping().await?;
+                    }
+                }
+                item = next(&mut self.messages) => {
+                    let mut item = item;
+                    for _ in 0..BATCH {
+                        self.pass(item).await?;
+                        match self.messages.as_mut().and_then(Subscription::try_next) {
+                            Some(next) => item = Some(next),
+                            None => break,
+                        }
+                    }
+                }
+            }
+            self.socket.flush().await?;
+        }
+    }
+
+    /// Sends the facts about the server.
+    async fn introduce(&mut self) -> Result<(), End> {
+        let shared = Arc::clone(&self.shared);
+        let capabilities: &[_] = match shared.is_replay {
+            true => &["connectionGraph", "time"],
+            false => &["connectionGraph"],
+        };
+        self.send(&Message::ServerInfo {
+            name: &shared.name,
+            capabilities,
+            supported_encodings: [],
+            metadata: Metadata {
+                ros2probe: env!("CARGO_PKG_VERSION"),
+                mode: "read-only: no publishing, services or parameters",
+            },
+            session_id: &shared.session,
+        })
+        .await?;
+        self.socket.flush().await?;
+        Ok(())
+    }
+
+    /// Processes a message of the client.
+    async fn take(&mut self, incoming: Incoming) -> Result<(), End> {
+        self.unanswered = 0;
+        let text = match incoming {
+            Incoming::Text(text) => text,
+            Incoming::Binary(_) => return self.unsupported("binary messages").await,
+            // A close is answered by the next read, which then ends.
+            Incoming::Ping(_) | Incoming::Pong(_) | Incoming::Close(_) | Incoming::Frame(_) => {
+                return Ok(());
+            }
+        };
+        match parse(&text) {
+            Ok(Request::Subscribe(wanted)) => self.subscribe(&wanted).await,
+            Ok(Request::Unsubscribe(ids)) => self.unsubscribe(&ids).await,
+            Ok(Request::SubscribeGraph) => {
+                if self.graph.is_none() {
+                    self.graph = Some(Arc::default());
+                    self.shared.change_graphs(1);
+                }
+                Ok(())
+            }
+            Ok(Request::UnsubscribeGraph) => {
+                self.leave_graph();
+                Ok(())
+            }
+            Ok(Request::Unsupported(op)) => self.unsupported(&format!("`{op}`")).await,
+            Err(protocol::Malformed) => Err(End::Closed(
+                CloseCode::Invalid,
+                "the text is not an operation of the protocol",
+            )),
+        }
+    }
+
+    async fn unsupported(&mut self, what: &str) -> Result<(), End> {
+        let message = format!("{what} have no effect: this server is read-only");
+        self.status(Level::Warning, "unsupported", &message).await
+    }
+
+    async fn subscribe(&mut self, wanted: &[Subscribe]) -> Result<(), End> {
+        if self.subscribed.len() + wanted.len() > MAX_SUBSCRIPTIONS {
+            let reason = "more than 4096 subscriptions";
+            return Err(End::Closed(CloseCode::Policy, reason));
+        }
+        let (mut refused, mut ignored) = (0_usize, 0_usize);
+        let mut fresh = BTreeSet::new();
+        for Subscribe { id, channel } in wanted {
+            let Some(channel) = self.channels.get(channel) else {
+                ignored += 1;
+                continue;
+            };
+            let content = &channel.content;
+            if matches!(content, Content::Messages { .. }) && self.access < Access::All {
+                refused += 1;
+                continue;
+            }
+            let (Entry::Vacant(place), Entry::Vacant(its_id)) =
+                (self.subscribed.entry(*id), self.ids.entry(content.clone()))
+            else {
+                ignored += 1;
+                continue;
+            };
+            its_id.insert(*id);
+            place.insert(Subscribed {
+                channel: Arc::clone(channel),
+                previous: Previous::default(),
+            });
+            if let Content::Messages { dds_name, .. } = content {
+                fresh.insert(dds_name.clone());
+            }
+        }
+        if !fresh.is_empty() {
+            self.select(fresh).await?;
+        }
+        self.viewer.set_subscriptions(self.subscribed.len());
+        if refused > 0 {
+            let message = format!(
+                "{refused} topics are not sent: messages need a token. `rp foxglove` prints the \
+                 address with a token; `api.loopback: all` grants messages to every local user"
+            );
+            self.status(Level::Error, "token", &message).await?;
+        }
+        if ignored > 0 {
+            let message = format!(
+                "{ignored} subscriptions were ignored: their channel is gone, or channel or id are \
+                 in use"
+            );
+            self.status(Level::Warning, "ignored", &message).await?;
+        }
+        Ok(())
+    }
+
+    async fn unsubscribe(&mut self, ids: &[u32]) -> Result<(), End> {
+        let mut unknown = 0_usize;
+        for id in ids {
+            match self.subscribed.remove(id) {
+                Some(gone) => {
+                    self.ids.remove(&gone.channel.content);
+                }
+                None => unknown += 1,
+            }
+        }
+        self.select(BTreeSet::new()).await?;
+        self.viewer.set_subscriptions(self.subscribed.len());
+        if unknown > 0 {
+            let message = format!("{unknown} subscriptions to end were unknown");
+            self.status(Level::Warning, "unknown", &message).await?;
+        }
+        Ok(())
+    }
+
+    /// Requests the messages of all subscribed topics, and the retained ones of those in `fresh`.
+    async fn select(&mut self, fresh: BTreeSet<DdsName>) -> Result<(), End> {
+        let names = self.ids.keys().filter_map(|content| match content {
+            Content::Messages { dds_name, .. } => Some(dds_name.clone()),
+            Content::Statistics { .. } => None,
+        });
+        let names: BTreeSet<_> = names.collect();
+        if names.is_empty() {
+            self.messages = None;
+            return Ok(());
+        }
+        if let Some(messages) = &self.messages {
+            messages.select(names, fresh);
+            return Ok(());
+        }
+        let opened = self
+            .shared
+            .subscriptions
+            .open(crate::subscriptions::Request {
+                topics: Selection::of_names(names),
+                domain_id: None,
+                depth: Depth::Payloads,
+                queue_bytes: QUEUE_BYTES,
+                // A viewer must not delay a replay.
+                overflow: Overflow::DropOldest,
+                label: "foxglove".to_owned(),
+            });
+        match opened {
+            Ok(opened) => self.messages = Some(opened),
+            Err(refused) => {
+                let is_message = |content: &Content| matches!(content, Content::Messages { .. });
+                self.ids.retain(|content, _| !is_message(content));
+                let subscribed = &mut self.subscribed;
+                subscribed.retain(|_, subscribed| !is_message(&subscribed.channel.content));
+                let message = format!("no messages are sent: {refused}");
+                self.status(Level::Error, "subscriptions", &message).await?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Shows the new channels, graph and statistics.
+    async fn show(&mut self) -> Result<(), End> {
+        let table = self.tables.borrow_and_update().clone();
+        let Some(table) = table else {
+            return Ok(());
+        };
+        if !Arc::ptr_eq(&self.channels, &table.channels) {
+            self.change_channels(Arc::clone(&table.channels)).await?;
+        }
+        if let (Some(shown), Some(graph)) = (&self.graph, &table.graph) {
+            let shown = Arc::clone(shown);
+            if let Some(update) = graph.update(&shown) {
+                self.send(&update).await?;
+            }
+            self.graph = Some(Arc::clone(graph));
+        }
+        self.show_statistics().await
+    }
+
+    async fn change_channels(&mut self, channels: Arc<Channels>) -> Result<(), End> {
+        let before = std::mem::replace(&mut self.channels, Arc::clone(&channels));
+        let gone = before.keys().filter(|id| !channels.contains_key(id));
+        let gone: Vec<_> = gone.copied().collect();
+        if !gone.is_empty() {
+            self.subscribed
+                .retain(|_, subscribed| channels.contains_key(&subscribed.channel.id()));
+            self.ids.retain(|_, id| self.subscribed.contains_key(id));
+            self.select(BTreeSet::new()).await?;
+            self.viewer.set_subscriptions(self.subscribed.len());
+            for channel_ids in gone.chunks(FRAGMENT / 16) {
+                self.send(&Message::Unadvertise { channel_ids }).await?;
+            }
+        }
+        let new = channels.iter().filter(|(id, _)| !before.contains_key(id));
+        let (mut some, mut size) = (Vec::new(), 0);
+        for (_, channel) in new {
+            some.push(channel.advertised());
+            size += channel.size();
+            if size >= FRAGMENT {
+                let channels = std::mem::take(&mut some);
+                self.send(&Message::Advertise {
+                    channels: &channels,
+                })
+                .await?;
+                size = 0;
+            }
+        }
+        // Even without channels, a client waits for this message.
+        if !some.is_empty() || channels.is_empty() {
+            self.send(&Message::Advertise { channels: &some }).await?;
+        }
+        Ok(())
+    }
+
+    /// Sends the figures of the subscribed topics.
+    async fn show_statistics(&mut self) -> Result<(), End> {
+        let is_statistics = |content: &Content| matches!(content, Content::Statistics { .. });
+        if !self.ids.keys().any(is_statistics) {
+            return Ok(());
+        }
+        let state = self.shared.latest.state();
+        let snapshot = state.known();
+        for topic in &snapshot.topics {
+            let content = Content::Statistics {
+                domain_id: topic.domain_id,
+                dds_name: topic.dds_name.clone(),
+            };
+            let (Some(measured), Some(id)) = (&topic.measurement, self.ids.get(&content)) else {
+                continue;
+            };
+            let id = *id;
+            let Some(subscribed) = self.subscribed.get_mut(&id) else {
+                continue;
+            };
+            let message = statistics::message(topic, measured, &mut subscribed.previous);
+            self.send_data(id, snapshot.at, &message.into()).await?;
+        }
+        Ok(())
+    }
+
+    /// Passes an item of the subscription on.
+    async fn pass(&mut self, item: Option<Item>) -> Result<(), End> {
+        match item {
+            Some(Item::Sample(sample)) => self.pass_sample(&sample).await,
+            Some(Item::Missed(missed)) => {
+                self.count(&missed);
+                Ok(())
+            }
+            Some(Item::Clock(now)) if self.shared.is_replay => {
+                self.frame(protocol::time(now).into(), Data::Binary, true)
+                    .await
+            }
+            Some(Item::Clock(_)) => Ok(()),
+            Some(Item::End(reason)) => {
+                self.messages = None;
+                let message = format!("no further messages: {reason}");
+                self.status(Level::Info, "end", &message).await
+            }
+            None => {
+                self.messages = None;
+                Ok(())
+            }
+        }
+    }
+
+    async fn pass_sample(&mut self, sample: &Sample) -> Result<(), End> {
+        let topic = &sample.topic;
+        let content = Content::Messages {
+            domain_id: topic.domain_id,
+            dds_name: topic.dds_name.clone(),
+            message_type: topic.message_type.clone(),
+        };
+        match (self.ids.get(&content), &sample.payload) {
+            (Some(id), Some(payload)) => {
+                let id = *id;
+                self.send_data(id, sample.time, payload).await
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn count(&mut self, missed: &Missed) {
+        if missed.reason == MissedReason::QueueFull {
+            self.viewer.dropped(missed.samples);
+        }
+        let mut losses = LOSSES.iter().zip(&mut self.losses);
+        let losses = losses.find(|((reason, ..), _)| *reason == missed.reason);
+        if let Some((_, losses)) = losses {
+            losses.add(missed);
+        }
+    }
+
+    /// Reports new losses, and removes the status of old ones.
+    async fn report_losses(&mut self) -> Result<(), End> {
+        for (place, (_, id, what)) in LOSSES.iter().enumerate() {
+            let Some(losses) = self.losses.get_mut(place) else {
+                continue;
+            };
+            if losses.messages == 0 {
+                continue;
+            }
+            if std::mem::take(&mut losses.is_news) {
+                losses.quiet = 0;
+                let message = losses.text(what);
+                self.status(Level::Warning, id, &message).await?;
+            } else if losses.quiet < QUIET_TICKS {
+                losses.quiet += 1;
+            } else {
+                *losses = Losses::default();
+                self.send(&Message::RemoveStatus { status_ids: [id] })
+                    .await?;
+            }
+        }
+        Ok(())
+    }
+
+    async fn ping(&mut self) -> Result<(), End> {
+        if self.unanswered >= MAX_UNANSWERED {
+            return Err(End::Closed(CloseCode::Away, "no answer to pings"));
+        }
+        self.unanswered += 1;
+        self.socket.feed(Incoming::Ping(Bytes::new())).await?;
+        Ok(())
+    }
+
+    async fn status(&mut self, level: Level, id: &str, message: &str) -> Result<(), End> {
+        self.send(&Message::Status { level, message, id }).await
+    }
+
+    async fn send(&mut self, message: &Message<'_>) -> Result<(), End> {
+        // Serializing plain numbers and strings into memory cannot fail.
+        let text = serde_json::to_vec(message).unwrap_or_default();
+        self.fragments(text.into(), Data::Text).await
+    }
+
+    async fn send_data(&mut self, id: u32, time: Timestamp, payload: &Bytes) -> Result<(), End> {
+        let head = data_head(id, time);
+        let first = payload.len().min(FRAGMENT - head.len());
+        let mut message = BytesMut::with_capacity(head.len() + first);
+        message.extend_from_slice(&head);
+        message.extend_from_slice(payload.get(..first).unwrap_or_default());
+        let rest = payload.slice(first..);
+        self.frame(message.freeze(), Data::Binary, rest.is_empty())
+            .await?;
+        if !rest.is_empty() {
+            self.fragments(rest, Data::Continue).await?;
+        }
+        self.viewer.sent(payload.len());
+        Ok(())
+    }
+
+    /// Sends data as one or several frames, of which the first has this opcode.
+    async fn fragments(&mut self, mut rest: Bytes, first: Data) -> Result<(), End> {
+        let mut data = first;
+        loop {
+            let part = rest.split_to(rest.len().min(FRAGMENT));
+            self.frame(part, data, rest.is_empty()).await?;
+            if rest.is_empty() {
+                return Ok(());
+            }
+            data = Data::Continue;
+        }
+    }
+
+    async fn frame(&mut self, part: Bytes, data: Data, is_last: bool) -> Result<(), End> {
+        let frame = Frame::message(part, OpCode::Data(data), is_last);
+        self.socket.feed(Incoming::Frame(frame)).await?;
+        Ok(())
+    }
+
+    /// Sends the reason of the end, and reads until the client closes. Closing with unread data
+    /// would reset the connection and might lose the reason.
+    async fn say_farewell(&mut self, code: CloseCode, reason: &'static str) -> Result<(), Error> {
+        let reason = reason.into();
+        self.socket.close(Some(CloseFrame { code, reason })).await?;
+        let stream = self.socket.get_mut();
+        stream.shutdown().await?;
+        tokio::io::copy(&mut stream.take(FAREWELL_BYTES), &mut tokio::io::sink()).await?;
+        Ok(())
+    }
+
+    fn leave_graph(&mut self) {
+        if self.graph.take().is_some() {
+            self.shared.change_graphs(-1);
+        }
+    }
+}
+
+impl<S> Drop for Client<S> {
+    fn drop(&mut self) {
+        if self.graph.is_some() {
+            self.shared.change_graphs(-1);
+        }
+    }
+}
+
+impl Losses {
+    fn add(&mut self, missed: &Missed) {
+        self.messages += missed.samples;
+        self.is_news = true;
+        let name = &missed.topic.name;
+        if self.topics.len() < COUNTED || self.topics.contains_key(name) {
+            *self.topics.entry(name.clone()).or_default() += missed.samples;
+        }
+    }
+
+    /// Returns a sentence with the topics that lost most.
+    fn text(&self, what: &str) -> String {
+        let mut topics: Vec<_> = self.topics.iter().collect();
+        topics.sort_by_key(|(_, messages)| std::cmp::Reverse(**messages));
+        let named = topics.iter().take(NAMED);
+        let named: Vec<_> = named
+            .map(|(name, messages)| format!("{messages} of {name}"))
+            .collect();
+        let named = named.join(", ");
+        format!("{} messages were {what}: {named}", self.messages)
+    }
+}
+
+/// Waits for the next item; forever without a subscription.
+async fn next(messages: &mut Option<Subscription>) -> Option<Item> {
+    match messages {
+        Some(messages) => messages.next().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn ticks() -> Interval {
+    let mut ticks = interval(TICK);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    ticks
+}

@@ -1,0 +1,166 @@
+//! Figures of a topic as a channel: a flat JSON object of numbers each second, so that viewers plot
+//! each as a series.
+
+use std::sync::{Arc, LazyLock};
+
+use ros2probe_model::histogram::Histogram;
+use ros2probe_model::snapshot::{Measurement, TopicFacts};
+use serde_json::{Map, Value, json};
+
+/// Name of the schema.
+pub(super) const SCHEMA_NAME: &str = "ros2probe/TopicStatistics";
+/// Prefix of the channels' topics.
+pub(super) const PREFIX: &str = "/rp/topics";
+
+/// Times of a topic's messages.
+#[derive(Clone, Copy, Debug)]
+struct Times {
+    latency: Histogram,
+    header_latency: Histogram,
+    interarrival: Histogram,
+}
+
+/// A topic at the end of a second.
+struct Second<'a> {
+    topic: &'a TopicFacts,
+    measured: &'a Measurement,
+    /// Times of the messages of this second; `None` in the first.
+    times: Option<Times>,
+}
+
+/// The times of a topic at the end of the previous second.
+#[derive(Debug, Default)]
+pub(super) struct Previous(Option<Times>);
+
+/// Name, description and value of a figure; a figure without a value is left out.
+type Figure = (&'static str, &'static str, fn(&Second<'_>) -> Option<f64>);
+
+/// All figures, named as in the API.
+const FIGURES: [Figure; 13] = [
+    (
+        "rate_hertz",
+        "Messages per second over the last window.",
+        |second| Some(second.measured.rate_hz),
+    ),
+    (
+        "bandwidth_bytes_per_second",
+        "Payload bytes per second over the same window.",
+        |second| Some(second.measured.bandwidth),
+    ),
+    (
+        "messages",
+        "Messages received whole, without duplicates.",
+        |second| Some(number(second.measured.messages)),
+    ),
+    ("bytes", "Payload bytes of these messages.", |second| {
+        Some(number(second.measured.bytes))
+    }),
+    (
+        "lost_messages",
+        "Messages that were sent but never received whole.",
+        |second| Some(number(second.measured.lost)),
+    ),
+    (
+        "loss_ratio",
+        "Lost messages divided by sent messages, since the start.",
+        |second| {
+            let sent = second.measured.messages + second.measured.lost;
+            (sent > 0).then(|| number(second.measured.lost) / number(sent))
+        },
+    ),
+    (
+        "recovered_messages",
+        "Messages that arrived late and closed a gap.",
+        |second| Some(number(second.measured.recovered)),
+    ),
+    (
+        "latency_p50_seconds",
+        "Median time from the writer's timestamp to the capture, of the last second.",
+        |second| quantile(&second.times?.latency, 0.5),
+    ),
+    (
+        "latency_p99_seconds",
+        "99th percentile of the same time.",
+        |second| quantile(&second.times?.latency, 0.99),
+    ),
+    (
+        "header_latency_p50_seconds",
+        "Median time from the message's Header.stamp to the capture, of the last second.",
+        |second| quantile(&second.times?.header_latency, 0.5),
+    ),
+    (
+        "interarrival_p99_seconds",
+        "99th percentile of the time between messages of one writer, of the last second.",
+        |second| quantile(&second.times?.interarrival, 0.99),
+    ),
+    ("publishers", "Live writers.", |second| {
+        Some(count(second.topic.publishers.len()))
+    }),
+    ("subscriptions", "Live readers.", |second| {
+        Some(count(second.topic.subscriptions.len()))
+    }),
+];
+
+/// Returns the JSON schema of the channels' messages.
+pub(super) fn schema() -> Arc<str> {
+    static SCHEMA: LazyLock<Arc<str>> = LazyLock::new(|| {
+        let figures = FIGURES.iter().map(|(name, description, _)| {
+            let schema = json!({"type": "number", "description": description});
+            ((*name).to_owned(), schema)
+        });
+        let schema = json!({
+            "title": SCHEMA_NAME,
+            "type": "object",
+            "properties": figures.collect::<Map<String, Value>>(),
+        });
+        schema.to_string().into()
+    });
+    Arc::clone(&SCHEMA)
+}
+
+/// Returns the message of a measured topic at the end of a second.
+pub(super) fn message(
+    topic: &TopicFacts,
+    measured: &Measurement,
+    previous: &mut Previous,
+) -> Vec<u8> {
+    let now = Times {
+        latency: measured.source_latency,
+        header_latency: measured.header_latency,
+        interarrival: measured.interarrival,
+    };
+    let before = previous.0.replace(now);
+    let times = before.map(|before| Times {
+        latency: now.latency.since(&before.latency),
+        header_latency: now.header_latency.since(&before.header_latency),
+        interarrival: now.interarrival.since(&before.interarrival),
+    });
+    let second = Second {
+        topic,
+        measured,
+        times,
+    };
+    let figures = FIGURES.iter().filter_map(|(name, _, read)| {
+        let value = read(&second).filter(|value| value.is_finite())?;
+        Some(((*name).to_owned(), json!(value)))
+    });
+    Value::Object(figures.collect()).to_string().into_bytes()
+}
+
+/// Returns an estimate; `None` without values, or above all bounds.
+fn quantile(values: &Histogram, part: f64) -> Option<f64> {
+    let value = values.quantile(part);
+    (values.count() > 0 && value < f64::MAX).then_some(value)
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "counts far below 2^52, and viewers plot them"
+)]
+fn number(count: u64) -> f64 {
+    count as f64
+}
+
+fn count(length: usize) -> f64 {
+    number(length as u64)
+}

@@ -1,0 +1,363 @@
+//! One viewer on a stream in memory, and the channels of snapshots.
+
+use std::collections::BTreeMap;
+
+use futures_util::{SinkExt as _, StreamExt as _};
+use ros2probe_message::Sources;
+use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome, Topic};
+use ros2probe_model::snapshot::Snapshot;
+use ros2probe_testing::sample_robot;
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use serde_json::{Value, json};
+use tokio::io::{DuplexStream, duplex};
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::Role;
+
+use super::channels::MAX_CHANNELS;
+use super::*;
+use crate::agent_facts::AgentFacts;
+use crate::config::{Retain, Watch};
+use crate::subscriptions::Caps;
+
+const MEGABYTE: usize = 1 << 20;
+
+fn library() -> Arc<Library> {
+    Arc::new(Library::new(Sources::default()))
+}
+
+/// A robot with these topics.
+fn robot(names: &[&str]) -> Snapshot {
+    sample_robot::snapshot(names.iter().copied())
+}
+
+/// Channels of a table: topic and id.
+fn ids(table: &Table) -> BTreeMap<String, u32> {
+    let channels = table.channels.values();
+    let advertised = channels.map(|channel| channel.advertised());
+    advertised
+        .map(|channel| (channel.topic.to_owned(), channel.id))
+        .collect()
+}
+
+#[tokio::test]
+async fn channels_keep_their_ids_and_no_id_is_used_twice() {
+    let mut registry = Registry::new(library());
+    let first = ids(&registry.update(&robot(&["/a", "/b"]), false).await);
+    let expected = ["/a", "/b", "/rp/topics/a", "/rp/topics/b"];
+    assert_eq!(first.keys().collect::<Vec<_>>(), expected);
+    let same = registry.update(&robot(&["/a", "/b"]), false).await;
+    assert!(Arc::ptr_eq(
+        &same.channels,
+        &registry.update(&robot(&["/a", "/b"]), false).await.channels
+    ));
+    let second = ids(&registry.update(&robot(&["/b", "/c"]), false).await);
+    assert_eq!(second["/b"], first["/b"]);
+    let third = ids(&registry.update(&robot(&["/a"]), false).await);
+    let all: Vec<_> = [&first, &second, &third]
+        .into_iter()
+        .flat_map(|ids| ids.iter().map(|(topic, id)| (*id, topic.clone())))
+        .collect();
+    let of_id: BTreeMap<_, _> = all.iter().cloned().collect();
+    assert!(all.iter().all(|(id, topic)| of_id[id] == *topic), "{all:?}");
+    assert_ne!(third["/a"], first["/a"]);
+}
+
+#[tokio::test]
+async fn names_of_several_domains_and_several_types_are_channels_of_their_own() {
+    let mut registry = Registry::new(library());
+    let mut snapshot = robot(&["/a"]);
+    let mut other = robot(&["/a"]).topics.remove(0);
+    other.domain_id = DomainId(5);
+    other.message_types = vec!["std_msgs/msg/String".into(), "unknown/msg/Type".into()];
+    snapshot.topics.push(other);
+    let table = registry.update(&snapshot, true).await;
+    let shown = table.channels.values().map(|channel| channel.advertised());
+    let shown: Vec<_> = shown
+        .filter(|channel| channel.encoding == "cdr" && channel.topic.starts_with("/domain_5"))
+        .map(|channel| (channel.topic, channel.schema_name, channel.schema.len() > 5))
+        .collect();
+    let expected = [
+        ("/domain_5/a", "std_msgs/msg/String", true),
+        ("/domain_5/a", "unknown/msg/Type", false),
+    ];
+    assert_eq!(shown, expected);
+    // The plain name stays with the domain that had it first.
+    snapshot.topics.remove(0);
+    let before = ids(&table);
+    let after = ids(&registry.update(&snapshot, false).await);
+    assert_eq!(after["/domain_5/a"], before["/domain_5/a"]);
+}
+
+#[tokio::test]
+async fn topics_beyond_the_cap_have_no_channel() {
+    let mut registry = Registry::new(library());
+    let names: Vec<_> = (0..=MAX_CHANNELS)
+        .map(|number| format!("/t{number}"))
+        .collect();
+    let names: Vec<_> = names.iter().map(String::as_str).collect();
+    let mut snapshot = robot(&names[..1]);
+    let template = snapshot.topics[0].clone();
+    snapshot.topics = names
+        .iter()
+        .map(|name| {
+            let mut topic = template.clone();
+            topic.name = (*name).into();
+            topic.dds_name = format!("rt{name}").into();
+            topic
+        })
+        .collect();
+    let table = registry.update(&snapshot, false).await;
+    assert_eq!(table.channels.len(), MAX_CHANNELS);
+}
+
+/// Shared state of a live agent with one topic.
+fn shared(bytes: usize) -> Arc<Shared> {
+    let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
+    latest.publish(
+        robot(&["/points", "/chatter"]),
+        AgentFacts::new(SourceKind::Wire, Instant::now()),
+    );
+    let caps = Caps {
+        subscriptions: 4,
+        bytes,
+    };
+    let stop = CancellationToken::new();
+    let subscriptions = Subscriptions::new(Arc::clone(&latest), caps, stop.clone());
+    Arc::new(Shared {
+        latest,
+        subscriptions: Arc::new(subscriptions),
+        viewers: Arc::default(),
+        tables: watch::Sender::new(None),
+        news: Notify::new(),
+        graphs: AtomicUsize::new(0),
+        is_replay: false,
+        name: "test".to_owned(),
+        session: "1".to_owned(),
+        stop,
+    })
+}
+
+/// A viewer in memory, and its agent.
+struct Scene {
+    shared: Arc<Shared>,
+    socket: WebSocketStream<DuplexStream>,
+}
+
+impl Scene {
+    async fn new(bytes: usize) -> Self {
+        let shared = shared(bytes);
+        let (ours, theirs) = duplex(64 << 10);
+        let viewer = shared.viewers.join(None, Access::All);
+        let client = Client::new(ours, Arc::clone(&shared), Access::All, viewer).await;
+        tokio::spawn(client.run());
+        tokio::spawn(follow(Arc::clone(&shared), library()));
+        let socket = WebSocketStream::from_raw_socket(theirs, Role::Client, None).await;
+        Self { shared, socket }
+    }
+
+    async fn json(&mut self) -> Value {
+        loop {
+            if let Message::Text(text) = self.socket.next().await.unwrap().unwrap() {
+                return serde_json::from_str(&text).unwrap();
+            }
+        }
+    }
+
+    /// Subscribes to topics, and returns once the capture thread would know.
+    async fn subscribe(&mut self, topics: &[&str]) {
+        assert_eq!(self.json().await["op"], "serverInfo");
+        let advertised = self.json().await;
+        let channels = advertised["channels"].as_array().unwrap();
+        let wanted = topics.iter().enumerate().map(|(id, topic)| {
+            let channel = channels.iter().find(|channel| channel["topic"] == *topic);
+            json!({"id": id, "channelId": channel.unwrap()["id"]})
+        });
+        let wanted: Vec<_> = wanted.collect();
+        self.send(&json!({"op": "subscribe", "subscriptions": wanted}))
+            .await;
+        while !self.shared.subscriptions.is_open() {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    async fn send(&mut self, message: &Value) {
+        let text = message.to_string();
+        self.socket.send(Message::Text(text.into())).await.unwrap();
+    }
+
+    fn deliver(&self, topic: &str, number: u64, size: usize) {
+        let to = [1].into();
+        let outcome = SampleOutcome::Sample(sample(topic, number, size));
+        self.shared
+            .subscriptions
+            .deliver(vec![Dispatch { to, outcome }], None);
+    }
+}
+
+fn sample(topic: &str, number: u64, size: usize) -> Arc<Sample> {
+    let robot = robot(&[topic]);
+    let facts = &robot.topics[0];
+    Arc::new(Sample {
+        topic: Arc::new(Topic {
+            domain_id: facts.domain_id,
+            name: facts.name.clone(),
+            dds_name: facts.dds_name.clone(),
+            message_type: facts.message_types[0].clone(),
+            offered: None,
+        }),
+        time: Timestamp(number),
+        writer: Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, 1, 3])),
+        sequence_number: SequenceNumber(number),
+        source_timestamp: None,
+        header_stamp: None,
+        size: u32::try_from(size).unwrap(),
+        sampled: false,
+        payload: Some(vec![u8::try_from(number % 251).unwrap(); size].into()),
+    })
+}
+
+#[tokio::test]
+async fn a_viewer_that_does_not_read_loses_the_oldest_and_receives_their_number() {
+    const MESSAGES: u64 = 40;
+    let mut scene = Scene::new(64 * MEGABYTE).await;
+    scene.subscribe(&["/points", "/chatter"]).await;
+    for number in 1..=MESSAGES {
+        scene.deliver("/points", number, MEGABYTE);
+        scene.deliver("/chatter", number, 100);
+    }
+    assert!(scene.shared.subscriptions.facts().queued_bytes <= 17 * MEGABYTE);
+    let (mut points, mut chatter, mut dropped) = (Vec::new(), Vec::new(), 0);
+    while chatter.last() != Some(&MESSAGES) || points.last() != Some(&MESSAGES) || dropped == 0 {
+        match scene.socket.next().await.unwrap().unwrap() {
+            Message::Binary(data) => {
+                let number = u64::from_le_bytes(data[5..13].try_into().unwrap());
+                let payload = &data[13..];
+                let expected = u8::try_from(number % 251).unwrap();
+                assert!(payload.iter().all(|byte| *byte == expected), "{number}");
+                match payload.len() {
+                    MEGABYTE => points.push(number),
+                    100 => chatter.push(number),
+                    size => panic!("{size} bytes"),
+                }
+            }
+            Message::Text(text) => {
+                let status: Value = serde_json::from_str(&text).unwrap();
+                if status["op"] == "status" {
+                    let message = status["message"].as_str().unwrap();
+                    assert!(message.contains("reads too slowly"), "{message}");
+                    assert!(message.ends_with("of /points"), "{message}");
+                    dropped = message.split(' ').next().unwrap().parse().unwrap();
+                }
+            }
+            _ => {}
+        }
+    }
+    // The small topic loses nothing beside the large one.
+    assert_eq!(chatter, (1..=MESSAGES).collect::<Vec<_>>());
+    assert_eq!(points.len() as u64 + dropped, MESSAGES);
+    assert!((14..=17).contains(&points.len()), "{points:?}");
+    let viewer = &scene.shared.viewers.connected()[0];
+    assert_eq!(viewer.dropped_messages, dropped);
+    assert_eq!(scene.shared.viewers.totals().dropped_messages, dropped);
+}
+
+#[tokio::test]
+async fn interest_follows_the_subscriptions_and_ends_with_the_viewer() {
+    let mut scene = Scene::new(MEGABYTE).await;
+    scene.subscribe(&["/chatter"]).await;
+    let topics = |shared: &Shared| {
+        let requests = shared.subscriptions.take_changed();
+        let requests = requests.iter().flat_map(|requests| requests.iter());
+        requests
+            .map(|request| format!("{:?}", request.selection.include))
+            .collect::<Vec<_>>()
+    };
+    assert_eq!(topics(&scene.shared), [r#"[Names({"rt/chatter"})]"#]);
+    scene.deliver("/points", 1, 10);
+    scene.deliver("/chatter", 2, 10);
+    let data = loop {
+        if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
+            break data;
+        }
+    };
+    assert_eq!(data[..13], [1, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0]);
+    scene
+        .send(&json!({"op": "unsubscribe", "subscriptionIds": [0]}))
+        .await;
+    while scene.shared.subscriptions.is_open() {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(topics(&scene.shared), [""; 0]);
+    let shared = Arc::clone(&scene.shared);
+    drop(scene);
+    while shared.viewers.is_any() {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn the_last_message_of_a_latched_topic_comes_at_once_and_again_after_a_new_subscription() {
+    let mut scene = Scene::new(MEGABYTE).await;
+    let retaining = Watch {
+        retain: Retain::Last,
+        ..Watch::named("/points").unwrap()
+    };
+    let subscriptions = Arc::clone(&scene.shared.subscriptions);
+    subscriptions.retain(&[Arc::new(retaining)]);
+    let requests = subscriptions.take_changed().unwrap();
+    let mut kept = Sample::clone(&sample("/points", 7, 20));
+    let topic = &robot(&["/points"]).topics[0];
+    let publisher = &topic.publishers[0];
+    kept.writer = publisher.guid;
+    let mut qos = (*publisher.qos).clone();
+    qos.durability = ros2probe_wire::qos::Durability::TRANSIENT_LOCAL;
+    kept.topic = Arc::new(Topic {
+        offered: Some(Arc::new(ros2probe_model::dispatch::Offered {
+            type_hash: None,
+            qos: Arc::new(qos),
+        })),
+        ..Topic::clone(&kept.topic)
+    });
+    let to = [requests[0].id].into();
+    let outcome = SampleOutcome::Sample(Arc::new(kept));
+    subscriptions.deliver(vec![Dispatch { to, outcome }], None);
+    scene.subscribe(&["/chatter", "/points"]).await;
+    for round in 0..2 {
+        // As the capture thread does.
+        let requests = loop {
+            match subscriptions.take_changed() {
+                Some(requests) if requests.len() == 2 => break requests,
+                _ => tokio::task::yield_now().await,
+            }
+        };
+        subscriptions.in_force(&requests);
+        subscriptions.in_force(&requests);
+        let data = loop {
+            if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
+                break data;
+            }
+        };
+        assert_eq!((data[5], data.len()), (7, 33), "{round}");
+        // Another topic is no reason to send it again.
+        scene.deliver("/chatter", 9, 10);
+        let data = loop {
+            if let Message::Binary(data) = scene.socket.next().await.unwrap().unwrap() {
+                break data;
+            }
+        };
+        assert_eq!((data[5], data.len()), (9, 23), "{round}");
+        if round == 0 {
+            let table = scene.shared.tables.borrow().clone().unwrap();
+            let id = ids(&table)["/points"];
+            scene
+                .send(&json!({"op": "unsubscribe", "subscriptionIds": [1]}))
+                .await;
+            let again = json!({"op": "subscribe", "subscriptions": [{"id": 5, "channelId": id}]});
+            scene.send(&again).await;
+            while scene.shared.viewers.totals().subscriptions != 2 {
+                tokio::task::yield_now().await;
+            }
+        }
+    }
+}
