@@ -4,7 +4,7 @@
 //! references. Each reader keeps its own position; overwritten events are counted and reported to
 //! it.
 //!
-//! Bursts are limited: of one name, at most [`MOST`] events per second are kept, and the others are
+//! Bursts are limited: of one name, at most `MOST` events per second are kept, and the others are
 //! counted. Seconds of robot events are those of the source's clock, so a capture gives the same
 //! events at any speed.
 //!

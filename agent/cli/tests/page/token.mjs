@@ -1,5 +1,5 @@
-// Where loopback lacks the rights, the page asks for a token once: in the address that `rp page`
-// prints, or pasted. The page removes it from the address at once and keeps it in its tab only.
+// Where loopback lacks the rights, the page needs a token once: in the address that `rp page` prints,
+// or pasted. The page removes it from the address at once and keeps it in its tab only.
 // Arguments: address of an agent whose loopback grants `read`, address of one that requires a token.
 
 import assert from 'node:assert/strict';
