@@ -4,22 +4,22 @@
 //! up for it. Its messages wait in the queue of one [`Subscription`], which drops the oldest of the
 //! topic with most bytes. A message is sent in fragments, so each viewer needs memory for two.
 
+mod sending;
+
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bytes::{Bytes, BytesMut};
+use bytes::Bytes;
 use futures_util::{SinkExt as _, StreamExt as _};
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::names::{DdsName, TopicName};
-use ros2probe_wire::Timestamp;
-use tokio::io::{AsyncRead, AsyncReadExt as _, AsyncWrite, AsyncWriteExt as _};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 use tokio_tungstenite::WebSocketStream;
-use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data, OpCode};
-use tokio_tungstenite::tungstenite::protocol::frame::{CloseFrame, Frame};
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{CloseCode, Data};
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 use tokio_tungstenite::tungstenite::{Error, Message as Incoming};
 
@@ -27,7 +27,7 @@ use super::Shared;
 use super::channels::{Channel, Channels, Content, Table};
 use super::figures::Viewer;
 use super::graph::Graph;
-use super::protocol::{self, Level, Message, Metadata, Request, Subscribe, data_head, parse};
+use super::protocol::{self, Level, Message, Metadata, Request, Subscribe, parse};
 use super::statistics::{self, Previous};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription};
@@ -53,9 +53,9 @@ const QUIET_TICKS: u32 = 10;
 const NAMED: usize = 3;
 /// Topics whose losses are counted apart.
 const COUNTED: usize = 64;
-/// Longest time, and largest number of bytes, until a client reads why it is closed.
+
+/// Longest time until a client reads why it is closed.
 const FAREWELL: Duration = Duration::from_secs(1);
-const FAREWELL_BYTES: u64 = 1 << 20;
 
 /// Losses that a status reports to the client.
 const LOSSES: [(MissedReason, &str, &str); 2] = [
@@ -543,62 +543,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
         self.unanswered += 1;
         self.socket.feed(Incoming::Ping(Bytes::new())).await?;
-        Ok(())
-    }
-
-    async fn status(&mut self, level: Level, id: &str, message: &str) -> Result<(), End> {
-        self.send(&Message::Status { level, message, id }).await
-    }
-
-    async fn send(&mut self, message: &Message<'_>) -> Result<(), End> {
-        // Serializing plain numbers and strings into memory cannot fail.
-        let text = serde_json::to_vec(message).unwrap_or_default();
-        self.fragments(text.into(), Data::Text).await
-    }
-
-    async fn send_data(&mut self, id: u32, time: Timestamp, payload: &Bytes) -> Result<(), End> {
-        let head = data_head(id, time);
-        let first = payload.len().min(FRAGMENT - head.len());
-        let mut message = BytesMut::with_capacity(head.len() + first);
-        message.extend_from_slice(&head);
-        message.extend_from_slice(payload.get(..first).unwrap_or_default());
-        let rest = payload.slice(first..);
-        self.frame(message.freeze(), Data::Binary, rest.is_empty())
-            .await?;
-        if !rest.is_empty() {
-            self.fragments(rest, Data::Continue).await?;
-        }
-        self.viewer.sent(payload.len());
-        Ok(())
-    }
-
-    /// Sends data as one or several frames, of which the first has this opcode.
-    async fn fragments(&mut self, mut rest: Bytes, first: Data) -> Result<(), End> {
-        let mut data = first;
-        loop {
-            let part = rest.split_to(rest.len().min(FRAGMENT));
-            self.frame(part, data, rest.is_empty()).await?;
-            if rest.is_empty() {
-                return Ok(());
-            }
-            data = Data::Continue;
-        }
-    }
-
-    async fn frame(&mut self, part: Bytes, data: Data, is_last: bool) -> Result<(), End> {
-        let frame = Frame::message(part, OpCode::Data(data), is_last);
-        self.socket.feed(Incoming::Frame(frame)).await?;
-        Ok(())
-    }
-
-    /// Sends the reason of the end, and reads until the client closes. Closing with unread data
-    /// would reset the connection and might lose the reason.
-    async fn say_farewell(&mut self, code: CloseCode, reason: &'static str) -> Result<(), Error> {
-        let reason = reason.into();
-        self.socket.close(Some(CloseFrame { code, reason })).await?;
-        let stream = self.socket.get_mut();
-        stream.shutdown().await?;
-        tokio::io::copy(&mut stream.take(FAREWELL_BYTES), &mut tokio::io::sink()).await?;
         Ok(())
     }
 
