@@ -112,7 +112,7 @@ page() {
     if ! cmp -s "$tests/package-lock.json" "$place/package-lock.json" ||
         [ ! -d "$place/node_modules/playwright-core" ]; then
         command -v npm >/dev/null || packages npm
-        say "installing $(sed -nE 's/^ *"([a-z-]+)": "([0-9.]+)",?$/\1 \2/p' $tests/package.json |
+        say "installing $(sed -nE 's/^ *"([@a-z/-]+)": "([0-9.]+)",?$/\1 \2/p' $tests/package.json |
             paste -sd ' ') from npm into target/tools/page"
         mkdir -p "$place"
         cp "$tests/package.json" "$tests/package-lock.json" "$place"

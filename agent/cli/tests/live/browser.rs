@@ -3,8 +3,8 @@
 //! `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
 
 mod crowd;
-mod player;
-mod robot;
+pub(crate) mod player;
+pub(crate) mod robot;
 
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};

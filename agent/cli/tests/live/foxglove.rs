@@ -17,6 +17,8 @@ use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::viewer::{News, PATIENCE, SUBPROTOCOLS, Viewer, open};
 use tempfile::TempDir;
 
+use crate::browser::player::watch;
+use crate::browser::robot::{Place, Robot};
 use crate::samples::{check, pattern};
 
 const TOPIC: &str = "/points";
@@ -171,6 +173,18 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
         let is_gone = |viewer: &Viewer, _: &News| viewer.channel(TOPIC).is_none().then_some(());
         viewer.wait_for("end of the channel", is_gone)?;
     }
+    Ok(())
+}
+
+#[test]
+fn the_public_client_understands_every_channel_of_the_demo_s_robot() -> Result<()> {
+    let place = Place::new()?;
+    let agent = place.agent("watch: [/**]\n")?;
+    let _robot = Robot::start(&place.host)?;
+    watch(&place.inside(), "viewer", &["ws://127.0.0.1:8765"])?;
+    agent.scrape_until("no viewer", |page| {
+        page.sum("ros2probe_subscriptions", &[]) == 0.0
+    })?;
     Ok(())
 }
 
