@@ -44,14 +44,14 @@ pub enum Diagnosis<'a> {
         /// GUID of the writer.
         writer: String,
         /// The nearest mismatch: an endpoint with other QoS (`qos`), of another `type`, or in
-        /// another `partition`; `nobody` (no endpoint) if the topic has no reader.
+        /// another `partition`; `nobody` if the topic has no reader.
         reason: Cow<'static, str>,
     },
     /// A reader without a matching writer.
     UnfedSubscriber {
         /// GUID of the reader.
         reader: String,
-        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` (no endpoint) if the topic
+        /// The nearest mismatch: `qos`, `type` or `partition`; `nobody` if the topic
         /// has no writer.
         reason: Cow<'static, str>,
     },

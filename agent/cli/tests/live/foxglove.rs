@@ -12,7 +12,7 @@ use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_socke
 use ros2probe_testing::harness::capture::{self, Capture};
 use ros2probe_testing::harness::dissection::{Content, Dissection};
 use ros2probe_testing::harness::network::{Link, Namespace};
-use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::viewer::{News, PATIENCE, SUBPROTOCOLS, Viewer, open};
 use tempfile::TempDir;
@@ -59,14 +59,6 @@ fn connect(host: &Namespace) -> Result<Viewer> {
     open(stream, "/", &SUBPROTOCOLS, &[])?.map_err(|refused| anyhow::anyhow!("{refused:?}"))
 }
 
-fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
-    let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
-    let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
-    publisher.wait_matched()?;
-    subscriber.wait_matched()?;
-    Ok((publisher, subscriber))
-}
-
 /// Subscribes and waits until the agent has the interest.
 fn subscribe(scene: &Scene<'_>, viewer: &mut Viewer) -> Result<u32> {
     viewer.wait_for_topics(&[TOPIC])?;
@@ -111,12 +103,12 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
     let pattern: Vec<u8> = (8..size).map(pattern).collect();
     publisher.go()?;
     let mut received = BTreeMap::new();
-    let mut told = 0;
+    let mut reported = 0;
     let deadline = Instant::now() + 3 * PATIENCE;
-    while received.len() as u64 + told < stream.count {
+    while received.len() as u64 + reported < stream.count {
         ensure!(
             Instant::now() < deadline,
-            "{:?}, {told} told",
+            "{:?}, {reported} reported",
             received.keys()
         );
         match viewer.next_within(PATIENCE)? {
@@ -134,7 +126,7 @@ fn payloads_are_as_sent(stack: Stack, size: usize) -> Result<()> {
             }
             Some(News::Status(status)) if status.message.contains("too slowly") => {
                 let count = status.message.split(' ').next().unwrap_or_default();
-                told = count.parse()?;
+                reported = count.parse()?;
             }
             Some(News::Channels | News::Data(_)) => {}
             news => bail!("{news:?} after {:?}", received.keys()),
@@ -244,8 +236,8 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
     }
     scene.wait_for("nine interests", "ros2probe_subscriptions", 9.0)?;
     let mut numbers = BTreeSet::new();
-    let mut told = 0;
-    while numbers.len() as u64 + told != MESSAGES {
+    let mut reported = 0;
+    while numbers.len() as u64 + reported != MESSAGES {
         match slow.next_within(PATIENCE)? {
             Some(News::Data(data)) => ensure!(numbers.insert(number(&data.payload)?)),
             Some(News::Status(status)) => {
@@ -253,7 +245,7 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
                     status.level == 1 && status.message.ends_with("of /points"),
                     "{status:?}"
                 );
-                told = status
+                reported = status
                     .message
                     .split(' ')
                     .next()
@@ -261,10 +253,14 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
                     .parse()?;
             }
             Some(News::Channels) => {}
-            news => bail!("{news:?} after {} and {told} told", numbers.len()),
+            news => bail!("{news:?} after {} and {reported} reported", numbers.len()),
         }
     }
-    ensure!(told > 0, "nothing was dropped: {} arrived", numbers.len());
+    ensure!(
+        reported > 0,
+        "nothing was dropped: {} arrived",
+        numbers.len()
+    );
     ensure!(
         numbers.contains(&(MESSAGES - 1)),
         "the last message is kept: {numbers:?}"
@@ -279,7 +275,7 @@ fn a_viewer_that_is_slow_or_dies_costs_only_itself() -> Result<()> {
     ensure!(page.sum("ros2_topic_lost_messages_total", &label) == 0.0);
     let dropped = page.sum("ros2probe_foxglove_dropped_messages_total", &[]);
     // The one that died may have lost some, too.
-    ensure!(dropped >= told as f64, "{dropped} of {told}");
+    ensure!(dropped >= reported as f64, "{dropped} of {reported}");
     drop((kept, slow));
     scene.wait_for("no viewer", "ros2probe_foxglove_clients", 0.0)?;
     let page = scene.wait_for("no interest", "ros2probe_subscriptions", 0.0)?;

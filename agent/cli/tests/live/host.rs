@@ -12,7 +12,7 @@ use ros2probe_testing::forged::{Sender, Talker, introduce, talk};
 use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::cgroup;
 use ros2probe_testing::harness::network::{Link, Namespace};
-use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, robot};
+use ros2probe_testing::harness::peer::{Stack, Stream, pair, robot};
 use ros2probe_testing::harness::process::Process;
 use tempfile::TempDir;
 
@@ -458,15 +458,6 @@ fn write_start(directory: &TempDir, capabilities: &str) -> Result<()> {
         std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
     }
     Ok(())
-}
-
-/// A publisher that holds its samples, and a subscriber matched with it.
-fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
-    let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
-    let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
-    publisher.wait_matched()?;
-    subscriber.wait_matched()?;
-    Ok((publisher, subscriber))
 }
 
 fn count(page: &Scrape, what: &str, topic: &str) -> u64 {

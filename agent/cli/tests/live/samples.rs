@@ -18,7 +18,7 @@ use ros2probe_api::samples::{Line, Missed, Sample};
 use ros2probe_testing::harness;
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
-use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream, pair};
 use ros2probe_testing::harness::shared_memory::SharedMemory;
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::wait_until;
@@ -295,14 +295,6 @@ impl<'a> Observed<'a> {
         };
         Ok(client::Agent::reach_stream(&target)?)
     }
-}
-
-fn pair(from: &Namespace, to: &Namespace, stack: Stack, stream: &Stream) -> Result<(Peer, Peer)> {
-    let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
-    let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
-    publisher.wait_matched()?;
-    subscriber.wait_matched()?;
-    Ok((publisher, subscriber))
 }
 
 /// Ten clients at once: one never reads, one is killed. The others receive everything, the interest

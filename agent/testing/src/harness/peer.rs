@@ -116,6 +116,20 @@ impl Stream {
     }
 }
 
+/// Starts a publisher that holds its samples, and a subscriber matched with it.
+pub fn pair(
+    from: &Namespace,
+    to: &Namespace,
+    stack: Stack,
+    stream: &Stream,
+) -> Result<(Peer, Peer)> {
+    let mut subscriber = Peer::start(to, stack, Role::Subscriber, stream, &["/listener"])?;
+    let mut publisher = Peer::start(from, stack, Role::Publisher, stream, &["/sensor"])?;
+    publisher.wait_matched()?;
+    subscriber.wait_matched()?;
+    Ok((publisher, subscriber))
+}
+
 impl Peer {
     /// Starts a peer and waits until its endpoints exist. A publisher waits for [`Peer::go`] before
     /// it sends.

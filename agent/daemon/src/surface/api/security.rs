@@ -199,19 +199,27 @@ impl Door {
         self.pass(self.admit_viewer(headers, token, origins), now)
     }
 
+    /// Returns the token that a request needs, if any; `None` on the unix socket, whose file mode
+    /// decides. Fails if the request names another host than loopback.
+    fn token(&self, headers: &HeaderMap) -> Result<Option<Option<&Token>>, Problem> {
+        Ok(match &self.kind {
+            Kind::Socket => None,
+            Kind::Loopback(token) => {
+                own_host(headers)?;
+                Some(token.as_ref())
+            }
+            Kind::Network(token) => Some(Some(token)),
+        })
+    }
+
     fn admit_viewer(
         &self,
         headers: &HeaderMap,
         offered: Option<&[u8]>,
         origins: &[String],
     ) -> Result<Granted, Problem> {
-        let token = match &self.kind {
-            Kind::Socket => return Ok(self.granted.clone()),
-            Kind::Loopback(token) => {
-                own_host(headers)?;
-                token.as_ref()
-            }
-            Kind::Network(token) => Some(token),
+        let Some(token) = self.token(headers)? else {
+            return Ok(self.granted.clone());
         };
         if let Some(offered) = offered.or_else(|| bearer(headers)) {
             let is_right =
@@ -246,13 +254,8 @@ impl Door {
     }
 
     fn admit(&self, headers: &HeaderMap) -> Result<Granted, Problem> {
-        let token = match &self.kind {
-            Kind::Socket => return Ok(self.granted.clone()),
-            Kind::Loopback(token) => {
-                own_host(headers)?;
-                token.as_ref()
-            }
-            Kind::Network(token) => Some(token),
+        let Some(token) = self.token(headers)? else {
+            return Ok(self.granted.clone());
         };
         own_pages(headers)?;
         if bearer(headers).is_some_and(|offered| self.page.tokens.know(offered)) {
