@@ -22,12 +22,22 @@ pub struct Snapshot {
     pub topics: Vec<String>,
     /// Domain id of the topics.
     pub domain_id: u32,
-    /// Seconds of messages that are kept.
+    /// Seconds of messages before a trigger.
     pub seconds: u64,
+    /// Seconds of messages after a trigger.
+    pub seconds_after: u64,
     /// Largest amount of memory for the messages, in bytes.
     pub max_bytes: usize,
-    /// Whether a bag is written when an expectation is violated.
+    /// Whether `trigger` has `expectation`.
     pub on_violation: bool,
+    /// Names of the events that write a bag.
+    pub trigger: Vec<String>,
+    /// Minimum seconds between two triggered bags.
+    pub min_interval_s: u64,
+    /// Maximum number of triggered bags.
+    pub max_count: usize,
+    /// Maximum bytes of all its bags.
+    pub max_total_bytes: u64,
     /// Number of messages in memory.
     pub messages: u64,
     /// Memory that the messages use, in bytes.
@@ -38,6 +48,10 @@ pub struct Snapshot {
     pub written: u64,
     /// Number of bags that could not be written.
     pub failed: u64,
+    /// Number of events that met a trigger and began no bag.
+    pub suppressed: u64,
+    /// Number of old triggered bags removed for new ones.
+    pub removed: u64,
 }
 
 /// The bag that was written from a snapshot.

@@ -14,6 +14,7 @@
 mod record;
 mod self_monitor;
 mod table;
+mod trigger;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt;
@@ -30,6 +31,7 @@ pub use record::{AgentEvent, Record, Value};
 use ros2probe_model::event::{Class, Taken};
 pub use self_monitor::{DropMonitor, SourceMonitor};
 pub use table::{Definition, EVENTS, Severity, markdown};
+pub use trigger::Trigger;
 
 /// Most events kept.
 const KEPT: usize = 4096;

@@ -30,18 +30,20 @@ export function Recordings() {
         recording=${each} again=${again} />`)
       : data.directory && html`<p class="empty">No recording yet.</p>`)}
     <section aria-labelledby="snapshots"><h2 id="snapshots">Snapshots</h2>
-    <p class="dim">The agent keeps the last seconds of these topics in memory and writes them as a
-      bag on request, or when an expectation is violated.</p>
+    <p class="dim">The agent keeps the last seconds of these topics in memory. It writes them as a bag
+      on request, and with the seconds that follow on an event.</p>
     <${Failed} problem=${snapshots.problem} what="No snapshots" />
     ${snapshots.data && (snapshots.data.snapshots.length
       ? html`<div class="scroll" tabindex="0" role="group" aria-labelledby="snapshots"><table>
         <thead><tr><th scope="col">Snapshot</th><th scope="col">Topics</th>
-        <th scope="col" class="number">Seconds</th><th scope="col" class="number">In memory</th>
+        <th scope="col">Events</th><th scope="col" class="number">Seconds</th><th scope="col" class="number">In memory</th>
         <th scope="col" class="number">Written</th><th scope="col">Write</th></tr></thead>
         <tbody>${snapshots.data.snapshots.map((/** @type {any} */ each) => html`<tr key=${each.name}>
           <th scope="row"><${Name} text=${each.name} /></th>
           <td><${Name} text=${each.topics.join(', ')} /></td>
-          <td class="number">${count(each.seconds)}</td>
+          <td>${each.trigger.length ? each.trigger.join(', ') : 'none'}</td>
+          <td class="number">${count(each.seconds)}${each.seconds_after > 0
+            ? ` + ${count(each.seconds_after)}` : ''}</td>
           <td class="number">${several(each.messages, 'message')}, ${bytes(each.bytes)} of ${bytes(
             each.max_bytes)}</td>
           <td class="number">${count(each.written)}${each.failed > 0

@@ -131,6 +131,8 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "watch: [{topic: /a, trace: 1.5}]",
         "recordings: {snapshots: [{name: a b, topics: [/a]}]}",
         "recordings: {snapshots: [{name: ../a, topics: [/a]}]}",
+        "recordings: {snapshots: [{name: a, topics: [/a], trigger: expectation}]}",
+        "recordings: {snapshots: [{name: a, topics: [/a], max_count: 0}]}",
     ] {
         assert!(
             !validator.is_valid(&serde_yaml::from_str(yaml).unwrap()),

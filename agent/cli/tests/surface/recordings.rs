@@ -279,8 +279,7 @@ fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
     let events = local_agent::request(agent.api, "GET", "/events?after=0&follow=false", "").body;
     assert!(events.contains("ros2probe.snapshot.taken"), "{events}");
 
-    // A request writes the messages since then. Names of the same second would collide.
-    std::thread::sleep(Duration::from_millis(1100));
+    // A request writes the messages in memory, even in the same second.
     let (status, written) = ask(agent.api, "POST", "/snapshots/incident", "");
     assert_eq!(status, 201, "{written}");
     let path = Path::new(written["directory"].as_str().unwrap());
@@ -289,6 +288,53 @@ fn the_seconds_before_an_expectation_was_violated_are_in_a_bag() {
     let (_, list) = ask(agent.api, "GET", "/snapshots", "");
     assert_eq!(list["snapshots"][0]["written"], 2, "{list}");
     assert_eq!(list["snapshots"][0]["failed"], 0, "{list}");
+}
+
+/// The capture is replayed as fast as it can be read: the time of the event decides, not its delay.
+#[test]
+fn the_seconds_around_an_event_are_in_a_bag_that_names_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("gap.pcap");
+    let mut capture = Capture::new(ETHERNET);
+    let source = writer(ALICE, 0);
+    capture.participant(START, 0, ALICE);
+    capture.writer(START + 1, 0, source, "rt/whole", 1);
+    capture.reader(START + 2, 0, reader(ALICE, 1), "rt/whole", 1);
+    for number in (1..=300).filter(|number| !(150..155).contains(number)) {
+        capture.sample(START + number * SECOND / 10, 0, source, number);
+    }
+    capture.write(&path);
+    let more = "  snapshots:\n    - {name: incident, topics: [/whole], seconds: 3, \
+                seconds_after: 2, trigger: [message_lost]}\nwatch: [/whole]\n";
+    let agent = agent_on(&path, directory.path(), "max", more);
+    agent.wait_for_metric(
+        r#"ros2probe_snapshots_written_total{snapshot="incident"}"#,
+        |count| count >= 1.0,
+    );
+    let bags = std::fs::read_dir(directory.path().join("bags")).unwrap();
+    let bags: Vec<_> = bags.map(|bag| bag.unwrap().path()).collect();
+    let [bag] = bags.as_slice() else {
+        panic!("{bags:?}");
+    };
+    let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap();
+    let metadata: serde_yaml::Value = serde_yaml::from_str(&metadata).unwrap();
+    let metadata = &metadata["rosbag2_bagfile_information"];
+    let trigger = metadata["custom_data"]["ros2probe_trigger"].as_str();
+    let trigger: Value = serde_json::from_str(trigger.unwrap()).unwrap();
+    assert_eq!(trigger["event"], "ros2.message.lost", "{trigger}");
+    assert_eq!(trigger["attributes"]["count"], 5, "{trigger}");
+    let event: jiff::Timestamp = trigger["time"].as_str().unwrap().parse().unwrap();
+    let event = u64::try_from(event.as_nanosecond()).unwrap() - START;
+    // Message n was sent after n tenths of a second.
+    let tenths = |nanoseconds: u64| u32::try_from(nanoseconds * 10 / SECOND).unwrap();
+    let first = tenths((event - 3 * SECOND).next_multiple_of(SECOND / 10));
+    let numbers = first..=tenths(event + 2 * SECOND);
+    let numbers = numbers.filter(|number| !(150..155).contains(number));
+    assert_eq!(
+        messages(bag)["/whole"],
+        numbers.collect::<Vec<_>>(),
+        "{event}"
+    );
 }
 
 #[test]

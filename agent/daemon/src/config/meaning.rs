@@ -14,7 +14,7 @@ use super::mistake::{Mistakes, Position};
 use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
-    WatchEntryShape, WatchShape,
+    SnapshotShape, WatchEntryShape, WatchShape,
 };
 use super::watch::{ExpectationValues, Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
@@ -22,9 +22,12 @@ use super::{
     OtlpSettings, RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice,
     SourceChoice, StateChoice,
 };
+use crate::events::Trigger;
 
 /// Most configured snapshots; each needs memory and a thread.
 const MAX_SNAPSHOTS: usize = 8;
+/// Shortest default interval between triggered bags of a snapshot, in seconds.
+const SNAPSHOT_INTERVAL_S: u64 = 10;
 
 /// Parses and checks a configuration.
 pub(super) fn parse(bytes: &[u8]) -> Result<Config, Mistakes> {
@@ -169,14 +172,11 @@ impl Reader {
                     "is empty: list at least one topic",
                 );
             }
-            snapshots.push(SnapshotSettings {
-                name: shape.name,
-                topics: shape.topics,
-                domain_id: shape.domain,
-                span: Duration::from_secs(shape.seconds),
-                max_bytes: shape.max_bytes,
-                on_violation: shape.on_violation,
-            });
+            if shape.trigger.is_some() && shape.on_violation.is_some() {
+                let message = "is the earlier form of `trigger`: remove it";
+                self.wrong(&format!("{key}.on_violation"), message);
+            }
+            snapshots.push(snapshot(shape));
         }
         RecordingSettings {
             directory: state(&shape.directory),
@@ -364,6 +364,31 @@ impl Reader {
     }
 }
 
+fn snapshot(shape: SnapshotShape) -> SnapshotSettings {
+    let triggers = shape.trigger.unwrap_or_else(|| {
+        let expectation = shape.on_violation.unwrap_or(true);
+        Vec::from_iter(expectation.then(|| "expectation".to_owned()))
+    });
+    let (before, after) = (shape.seconds, shape.seconds_after);
+    let min_interval = (before + after).max(SNAPSHOT_INTERVAL_S);
+    SnapshotSettings {
+        name: shape.name,
+        topics: shape.topics,
+        domain_id: shape.domain,
+        before: Duration::from_secs(before),
+        after: Duration::from_secs(after),
+        max_bytes: shape.max_bytes,
+        // Unknown names were reported with their position.
+        triggers: triggers
+            .iter()
+            .filter_map(|name| Trigger::parse(name))
+            .collect(),
+        min_interval: Duration::from_secs(shape.min_interval_s.unwrap_or(min_interval)),
+        max_count: shape.max_count,
+        max_total_bytes: shape.max_total_bytes,
+    }
+}
+
 /// Checks the text at a key with restricted values.
 pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
     match without_indices(key).as_str() {
@@ -391,6 +416,14 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         }
         "recordings.snapshots[].name" if !is_plain(text) => {
             Err("must be 1 to 64 letters, digits, `_` or `-`: it names directories".to_owned())
+        }
+        "recordings.snapshots[].trigger[]" if Trigger::parse(text).is_none() => {
+            let short = Trigger::names().filter(|name| !name.contains('.'));
+            let short: Vec<_> = short.collect();
+            Err(format!(
+                "must be one of {}, or the name of an event, as in `ros2.node.lost`",
+                short.join(", ")
+            ))
         }
         "recordings.directory" if !matches!(text, "auto" | "off") && !text.starts_with('/') => {
             Err("must be an absolute path, as in `/data/bags`, `auto` or `off`".to_owned())

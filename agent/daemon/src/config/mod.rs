@@ -20,6 +20,7 @@ use std::time::Duration;
 use schemars::JsonSchema;
 use serde::Deserialize;
 
+use crate::events::Trigger;
 pub use limits::markdown as limits_markdown;
 pub use mistake::{Mistake, Mistakes, Position};
 pub use otlp_endpoint::otlp_endpoint;
@@ -220,12 +221,20 @@ pub struct SnapshotSettings {
     pub topics: Vec<String>,
     /// Domain of the topics.
     pub domain_id: u32,
-    /// Time span to keep.
-    pub span: Duration,
+    /// Time span before a trigger.
+    pub before: Duration,
+    /// Time span after a trigger.
+    pub after: Duration,
     /// Maximum memory in bytes.
     pub max_bytes: usize,
-    /// Whether it is written when an expectation is violated.
-    pub on_violation: bool,
+    /// Events that write a bag.
+    pub triggers: Vec<Trigger>,
+    /// Minimum time between two triggered bags.
+    pub min_interval: Duration,
+    /// Maximum number of triggered bags.
+    pub max_count: usize,
+    /// Maximum bytes of all its bags.
+    pub max_total_bytes: u64,
 }
 
 /// Exports to an OpenTelemetry receiver; `None` = the standard variable, or a default.
@@ -457,6 +466,8 @@ mod defaults {
     /// The web application, and the desktop applications, whose pages are files.
     pub(super) const ORIGINS: [&str; 2] = ["https://app.foxglove.dev", "file://"];
     pub(super) const HISTORY_S: u32 = 600;
+    pub(super) const SNAPSHOT_COUNT: usize = 20;
+    pub(super) const SNAPSHOT_TOTAL_BYTES: u64 = 1 << 30;
 
     pub(super) const fn topic_grace_s() -> u64 {
         600
@@ -470,8 +481,12 @@ mod defaults {
         16 << 20
     }
 
-    pub(super) const fn on_violation() -> bool {
-        true
+    pub(super) const fn snapshot_count() -> usize {
+        SNAPSHOT_COUNT
+    }
+
+    pub(super) const fn snapshot_total_bytes() -> u64 {
+        SNAPSHOT_TOTAL_BYTES
     }
 
     pub(super) fn state_directory() -> String {

@@ -317,17 +317,35 @@ pub(super) struct SnapshotShape {
     #[schemars(range(min = 0, max = 232))]
     #[serde(default)]
     pub(super) domain: u32,
-    /// Seconds to keep.
+    /// Seconds before a trigger.
     #[schemars(range(min = 1, max = 600))]
     #[serde(default = "defaults::snapshot_seconds")]
     pub(super) seconds: u64,
+    /// Seconds after a trigger; they are written as they come, and need no memory.
+    #[schemars(range(min = 0, max = 600))]
+    #[serde(default)]
+    pub(super) seconds_after: u64,
     /// Maximum memory in bytes; messages that do not fit are counted.
     #[schemars(range(min = 65_536, max = 4_294_967_296_u64))]
     #[serde(default = "defaults::snapshot_bytes")]
     pub(super) max_bytes: usize,
-    /// Whether to write it when an expectation of a watch is violated.
-    #[serde(default = "defaults::on_violation")]
-    pub(super) on_violation: bool,
+    /// Events that write a bag: `expectation`, `message_lost`, `participant_lost`, a kind of finding
+    /// such as `qos_incompatible`, or an event's name. Default: `[expectation]`.
+    #[schemars(length(max = 32))]
+    pub(super) trigger: Option<Vec<String>>,
+    /// Minimum seconds between two triggered bags. Default: `seconds` and `seconds_after`, at least 10.
+    #[schemars(range(min = 0, max = 86_400))]
+    pub(super) min_interval_s: Option<u64>,
+    /// Maximum number of triggered bags; the oldest is removed first.
+    #[schemars(range(min = 1, max = 1000))]
+    #[serde(default = "defaults::snapshot_count")]
+    pub(super) max_count: usize,
+    /// Maximum bytes of all its bags: the oldest triggered bag is removed first.
+    #[schemars(range(min = 65_536))]
+    #[serde(default = "defaults::snapshot_total_bytes")]
+    pub(super) max_total_bytes: u64,
+    /// Earlier form of `trigger`: `false` means `[]`, and `true` means `[expectation]`.
+    pub(super) on_violation: Option<bool>,
 }
 
 impl Default for RecordingsShape {

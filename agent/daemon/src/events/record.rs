@@ -96,6 +96,10 @@ pub enum AgentEvent {
     SnapshotTaken {
         /// Name of the snapshot in the configuration.
         snapshot: String,
+        /// Name of the trigger, `request` or `signal`.
+        trigger: &'static str,
+        /// Id of the event that met the trigger, if an event did.
+        trigger_event_id: Option<String>,
         /// Name of the bag.
         recording: String,
         /// Messages in the bag.
@@ -130,7 +134,8 @@ pub struct Record {
 }
 
 /// Value of an attribute.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[serde(untagged)]
 pub enum Value {
     /// Text of bounded length.
     Text(String),
@@ -461,11 +466,15 @@ fn agent(event: &AgentEvent) -> Values {
         ],
         AgentEvent::SnapshotTaken {
             snapshot,
+            trigger,
+            trigger_event_id,
             recording,
             messages,
             reason,
         } => vec![
             ("snapshot", Some(text(snapshot))),
+            ("trigger", Some(text(trigger))),
+            ("trigger_event_id", trigger_event_id.as_deref().map(text)),
             ("recording", Some(text(recording))),
             ("messages", number(*messages)),
             ("reason", reason.as_deref().map(text)),

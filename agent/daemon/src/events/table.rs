@@ -274,8 +274,16 @@ pub(super) const RECORDING_ENDED: Definition = Definition::new(
 pub(super) const SNAPSHOT_TAKEN: Definition = Definition::new(
     "ros2probe.snapshot.taken",
     Severity::Error,
-    &["snapshot", "recording", "messages", "reason"],
-    "The messages before an incident are in a bag; with a reason if writing failed.",
+    &[
+        "snapshot",
+        "trigger",
+        "trigger_event_id",
+        "recording",
+        "messages",
+        "reason",
+    ],
+    "The messages around an incident are in a bag; with a reason if writing failed. `trigger` is \
+     that of the configuration, `request` or `signal`.",
 )
 .relief(Severity::Info);
 pub(super) const WATCH_ADDED: Definition = Definition::new(

@@ -31,6 +31,10 @@ pub struct SnapshotFigures {
     pub written: u64,
     /// Bags that could not be written.
     pub failed: u64,
+    /// Triggers during another bag, or within the minimum interval.
+    pub suppressed: u64,
+    /// Old triggered bags removed for new ones.
+    pub removed: u64,
 }
 
 impl RecordingFigures {

@@ -1,41 +1,31 @@
-//! Snapshots: the last seconds of selected topics in memory, written into a bag on a violated
-//! expectation, a client's request, or SIGUSR1.
+//! Snapshots: the last seconds of selected topics in memory, written into a bag on an event of the
+//! configuration, a client's request, or SIGUSR1. After an event, the following seconds are added.
 //!
-//! Bounded in bytes and seconds; the memory is reported. Repeated failures cannot fill the disk:
-//! there is at most one bag per time span of the snapshot, and a limit on the bytes of all bags.
+//! The memory is bounded in bytes and seconds, and reported. Repeated events cannot fill the disk:
+//! triggered bags have a minimum interval, and their number and bytes are limited. A requested bag
+//! is never removed.
 
-use std::collections::HashSet;
+mod bag;
+mod retention;
+mod task;
+#[cfg(test)]
+mod tests;
+
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::filter::Filter;
-use super::graph::GraphSnapshot;
-use super::recorder::Recorder;
-use super::sample_ring::SampleRing;
-use super::service::{Recordings, Refusal, causes, default_name, refusal};
+use self::task::SnapshotTask;
+use super::service::{Recordings, Refusal};
 use crate::config::SnapshotSettings;
-use crate::events::AgentEvent;
-use crate::events::Value;
-use crate::recording::SnapshotFigures;
-use crate::subscriptions::{Item, Selection, Subscription};
-use ros2probe_api::recordings::FilterOptions;
-use ros2probe_bag::{Options, Writer};
+use crate::subscriptions::Selection;
 
-/// Longest delay of commands and events.
-const POLL_INTERVAL: Duration = Duration::from_millis(100);
-/// Least time between two bags.
-const PAUSE: Duration = Duration::from_secs(10);
-/// Most bytes of all bags of one snapshot.
-const DISK: u64 = 1 << 30;
 /// Most clients that wait for a bag at once.
 const CLIENTS: usize = 8;
-const EXPECTATION: &str = "ros2.topic.expectation_changed";
 
 /// A bag that was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -65,17 +55,6 @@ struct Snapshot {
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
-/// State of a snapshot's thread.
-struct SnapshotTask {
-    settings: SnapshotSettings,
-    recordings: Arc<Recordings>,
-    ring: SampleRing,
-    figures: SnapshotFigures,
-    /// Number of the last examined event.
-    event: u64,
-    written: Option<Instant>,
-}
-
 impl Snapshots {
     /// Starts all snapshots.
     ///
@@ -97,14 +76,7 @@ impl Snapshots {
             let subscription = recordings.open(selection, settings.domain_id, &settings.name)?;
             let (clients, waiting) = sync_channel(CLIENTS);
             let asked = Arc::new(AtomicBool::new(false));
-            let keeper = SnapshotTask {
-                settings: settings.clone(),
-                recordings: Arc::clone(recordings),
-                ring: SampleRing::new(settings.max_bytes, Some(settings.span)),
-                figures: SnapshotFigures::default(),
-                event: recordings.events.last(),
-                written: None,
-            };
+            let keeper = SnapshotTask::new(settings.clone(), Arc::clone(recordings));
             let (stopping, ordered) = (Arc::clone(&stop), Arc::clone(&asked));
             let work = move || keeper.work(subscription, &waiting, &ordered, &stopping);
             let thread = std::thread::Builder::new().name("snapshot".to_owned());
@@ -126,7 +98,7 @@ impl Snapshots {
         self.list.iter().map(|snapshot| &snapshot.settings)
     }
 
-    /// Writes the snapshot of this name, regardless of earlier bags. `None` if it does not exist.
+    /// Writes the messages in memory at once, regardless of earlier bags. `None` if it does not exist.
     pub async fn write(&self, name: &str) -> Option<Result<WrittenBag, String>> {
         let snapshot = self.list.iter().find(|each| each.settings.name == name)?;
         let (answer, written) = oneshot::channel();
@@ -157,179 +129,5 @@ impl Snapshots {
                 );
             }
         }
-    }
-}
-
-impl SnapshotTask {
-    fn work(
-        mut self,
-        mut subscription: Subscription,
-        clients: &Receiver<Answer>,
-        asked: &AtomicBool,
-        stop: &AtomicBool,
-    ) {
-        let mut looked = Instant::now();
-        while !stop.load(Ordering::Relaxed) {
-            match subscription.next_blocking(POLL_INTERVAL) {
-                Some(Item::Sample(sample)) => self.ring.push(sample),
-                Some(Item::Clock(now)) => self.ring.advance(now),
-                Some(Item::Missed(_)) => {}
-                Some(Item::End(_)) => std::thread::sleep(POLL_INTERVAL),
-                None => {}
-            }
-            if looked.elapsed() < POLL_INTERVAL {
-                continue;
-            }
-            looked = Instant::now();
-            self.show();
-            if let Ok(client) = clients.try_recv() {
-                // If the client no longer waits, the bag exists nevertheless.
-                let _ = client.send(self.write());
-            }
-            let violated = self.settings.on_violation && self.is_violated();
-            let asked = asked.swap(false, Ordering::Relaxed);
-            let pause = self.settings.span.max(PAUSE);
-            let rested = self
-                .written
-                .is_none_or(|written| written.elapsed() >= pause);
-            // A topic without any message is not worth a bag.
-            if asked || (violated && rested && !self.ring.is_empty()) {
-                // The event log records the result.
-                let _ = self.write();
-            }
-        }
-    }
-
-    /// Returns whether an expectation was violated since the last call.
-    fn is_violated(&mut self) -> bool {
-        let events = Arc::clone(&self.recordings.events);
-        let mut violated = false;
-        while events.last() > self.event {
-            let batch = events.read(self.event, 256);
-            self.event = batch.last;
-            for record in batch.records {
-                let to = record.attributes.iter().find(|(name, _)| *name == "to");
-                let is_ok = matches!(to, Some((_, Value::Text(to))) if to == "ok");
-                violated |= record.definition.name == EXPECTATION && !is_ok;
-            }
-        }
-        violated
-    }
-
-    fn write(&mut self) -> Result<WrittenBag, String> {
-        self.written = Some(Instant::now());
-        let (name, outcome) = self.bag();
-        match &outcome {
-            Ok(_) => self.figures.written += 1,
-            Err(_) => self.figures.failed += 1,
-        }
-        self.recordings.events.record(AgentEvent::SnapshotTaken {
-            snapshot: self.settings.name.clone(),
-            recording: name,
-            messages: outcome.as_ref().map_or(0, |written| written.messages),
-            reason: outcome.as_ref().err().cloned(),
-        });
-        self.show();
-        outcome
-    }
-
-    /// Writes the samples in memory into a new bag. They stay in memory if that fails.
-    fn bag(&mut self) -> (String, Result<WrittenBag, String>) {
-        let base = format!("{}_{}", self.settings.name, default_name());
-        let mut wanted = base.clone();
-        let directory = self.recordings.directory();
-        let mut copies = 1;
-        while directory.is_some_and(|directory| directory.join(&wanted).exists()) {
-            // Another bag in the same second.
-            copies += 1;
-            wanted = format!("{base}_{copies}");
-        }
-        let (name, directory) = match self.recordings.bag_directory(Some(wanted.clone())) {
-            Ok(place) => place,
-            Err(refusal) => return (wanted, Err(refusal.to_string())),
-        };
-        let used = self.used();
-        if used >= DISK {
-            let reason = format!("bags of this snapshot use {used} of {DISK} bytes: remove some");
-            return (name, Err(reason));
-        }
-        let write = || -> Result<WrittenBag, Refusal> {
-            let filter = Filter::new(FilterOptions {
-                include_hidden_topics: true,
-                all_services: true,
-                ..FilterOptions::everything()
-            })?;
-            let quota = self.recordings.quota(&directory);
-            quota.check().map_err(|error| refusal(&name, error))?;
-            let writer = Writer::create(&directory, Options::default());
-            let writer = writer.map_err(|error| refusal(&name, error))?;
-            let mut sources = self.recordings.sources(self.settings.domain_id);
-            let domain_id = self.settings.domain_id;
-            // The report covers only topics in memory.
-            let names = self.ring.iter().map(|sample| sample.topic.name.to_string());
-            let names: HashSet<String> = names.collect();
-            let mut all = sources.graph;
-            sources.graph = Box::new(move || {
-                let mut graph = all();
-                graph.unknown_writers.clear();
-                graph
-                    .topics
-                    .retain(|topic| topic.domain_id == domain_id && names.contains(&topic.name));
-                graph
-            });
-            let before = GraphSnapshot::default();
-            let mut recorder =
-                Recorder::new(writer, filter, domain_id, before, sources).within(quota);
-            let mut failed = None;
-            for sample in self.ring.iter() {
-                if let Err(error) = recorder.take(&Item::Sample(Arc::clone(sample))) {
-                    failed = Some(error);
-                    break;
-                }
-            }
-            let ended = recorder.finish(failed);
-            if let Some(error) = &ended.error {
-                return Err(Refusal::Storage {
-                    reason: causes(error),
-                });
-            }
-            Ok(WrittenBag {
-                name: name.clone(),
-                directory: directory.clone(),
-                messages: ended.report.messages,
-            })
-        };
-        let outcome = write();
-        match &outcome {
-            Ok(_) => self.ring.clear(),
-            // A bag of this name exists already.
-            Err(Refusal::Exists(_)) => {}
-            // All samples are still in memory: the incomplete bag is useless, and the next one
-            // would be added to it.
-            Err(_) => {
-                let _ = std::fs::remove_dir_all(&directory);
-            }
-        }
-        (name, outcome.map_err(|refusal| refusal.to_string()))
-    }
-
-    /// Bytes of this snapshot's bags on disk.
-    fn used(&self) -> u64 {
-        let prefix = format!("{}_rosbag2_", self.settings.name);
-        let entries = |path: &std::path::Path| std::fs::read_dir(path).into_iter().flatten();
-        let directory = self.recordings.directory();
-        let bags = directory.into_iter().flat_map(entries).flatten();
-        let ours = bags.filter(|bag| bag.file_name().to_string_lossy().starts_with(&prefix));
-        let files = ours.flat_map(|bag| entries(&bag.path()).flatten().collect::<Vec<_>>());
-        let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
-        sizes.sum()
-    }
-
-    fn show(&mut self) {
-        self.figures.messages = self.ring.len() as u64;
-        self.figures.bytes = self.ring.bytes() as u64;
-        self.figures.crowded_out = self.ring.crowded_out();
-        let figures = &self.recordings.figures;
-        figures.snapshot(&self.settings.name, self.figures);
     }
 }

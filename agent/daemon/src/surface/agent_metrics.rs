@@ -277,12 +277,14 @@ pub(super) fn recordings(sink: &mut MetricSink<'_>, figures: &RecordingFigures) 
     }
     let snapshots = figures.snapshots();
     type Read = fn(&SnapshotFigures) -> u64;
-    let families: [(_, Read); 5] = [
+    let families: [(_, Read); 7] = [
         (&metric::SNAPSHOT_MESSAGES, |figures| figures.messages),
         (&metric::SNAPSHOT_BYTES, |figures| figures.bytes),
         (&metric::SNAPSHOT_CROWDED_OUT, |figures| figures.crowded_out),
         (&metric::SNAPSHOTS_WRITTEN, |figures| figures.written),
         (&metric::SNAPSHOTS_FAILED, |figures| figures.failed),
+        (&metric::SNAPSHOTS_SUPPRESSED, |figures| figures.suppressed),
+        (&metric::SNAPSHOTS_REMOVED, |figures| figures.removed),
     ];
     for (metric, read) in families {
         sink.family(metric, |family| {

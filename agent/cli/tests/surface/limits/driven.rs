@@ -369,10 +369,22 @@ pub const FIXED: &[[&str; 4]] = &[
         "what_is_kept_is_bounded",
     ],
     [
-        "DISK",
-        "agent/daemon/src/recording/snapshot.rs",
+        "SNAPSHOT_TOTAL_BYTES",
+        "agent/daemon/src/config/mod.rs",
         "agent/cli/tests/surface/caps.rs",
         "a_snapshot_is_not_written_while_its_bags_take_what_they_may",
+    ],
+    [
+        "SNAPSHOT_COUNT",
+        "agent/daemon/src/config/mod.rs",
+        "agent/daemon/src/recording/snapshot/tests.rs",
+        "a_thousand_triggers_in_a_minute_cost_bounded_disk",
+    ],
+    [
+        "METADATA_BYTES",
+        "agent/daemon/src/recording/snapshot/retention.rs",
+        "agent/daemon/src/recording/snapshot/tests.rs",
+        "a_bag_with_an_oversized_metadata_file_is_kept",
     ],
     [
         "MAX_PORTS",

@@ -81,6 +81,33 @@ metrics: {listen: localhost}
 }
 
 #[test]
+fn triggers_of_a_snapshot_have_known_names_and_an_earlier_form() {
+    let triggers = |keys: &str| {
+        let source = format!("recordings: {{snapshots: [{{name: a, topics: [/a]{keys}}}]}}");
+        let config = parse(source.as_bytes()).unwrap();
+        let snapshot = &config.recordings.snapshots[0];
+        let names = snapshot.triggers.iter().map(Trigger::name);
+        (names.collect::<Vec<_>>(), snapshot.min_interval.as_secs())
+    };
+    assert_eq!(triggers(""), (vec!["expectation"], 10));
+    assert_eq!(triggers(", on_violation: false"), (vec![], 10));
+    assert_eq!(triggers(", trigger: [], seconds_after: 5"), (vec![], 15));
+    let more = ", trigger: [duplicate_node, ros2.node.lost], min_interval_s: 0";
+    let (expected, none) = (vec!["duplicate_node", "ros2.node.lost"], 0);
+    assert_eq!(triggers(more), (expected, none));
+    let snapshots = "recordings:\n  snapshots:\n    - name: a\n      topics: [/a]\n";
+    let report = report(&format!(
+        "{snapshots}      trigger: [violation]\n      on_violation: true\n"
+    ));
+    assert!(
+        report.starts_with(
+            "f:5:17: recordings.snapshots[0].trigger[0]: must be one of expectation, message_lost,"
+        ),
+        "{report}"
+    );
+}
+
+#[test]
 fn values_are_compared_with_each_other() {
     let source = "\
 watch:

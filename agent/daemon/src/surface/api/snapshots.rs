@@ -9,6 +9,7 @@ use utoipa_axum::routes;
 
 use super::Context;
 use super::problem::{Code, Problem, ProblemBody};
+use crate::events::Trigger;
 use crate::recording::SnapshotFigures;
 use ros2probe_api::snapshots::{Snapshot, SnapshotList, WrittenSnapshot};
 
@@ -35,19 +36,29 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
             crowded_out,
             written,
             failed,
+            suppressed,
+            removed,
         } = known.map_or_else(SnapshotFigures::default, |(_, figures)| *figures);
+        let triggers: Vec<_> = settings.triggers.iter().map(Trigger::name).collect();
         Snapshot {
             name: settings.name.clone(),
             topics: settings.topics.clone(),
             domain_id: settings.domain_id,
-            seconds: settings.span.as_secs(),
+            seconds: settings.before.as_secs(),
+            seconds_after: settings.after.as_secs(),
             max_bytes: settings.max_bytes,
-            on_violation: settings.on_violation,
+            on_violation: triggers.contains(&"expectation"),
+            trigger: triggers.into_iter().map(str::to_owned).collect(),
+            min_interval_s: settings.min_interval.as_secs(),
+            max_count: settings.max_count,
+            max_total_bytes: settings.max_total_bytes,
             messages,
             bytes,
             crowded_out,
             written,
             failed,
+            suppressed,
+            removed,
         }
     });
     Json(SnapshotList {
@@ -57,7 +68,8 @@ async fn list(State(context): State<Context>) -> Json<SnapshotList> {
 
 /// Write a snapshot to a bag
 ///
-/// The answer follows once the messages in memory are in a bag. The snapshot then restarts, empty.
+/// The answer follows once the messages in memory are in a bag. They stay in memory, too. The bag is
+/// never removed for others.
 #[utoipa::path(
     post,
     path = "/snapshots/{name}",

@@ -356,6 +356,17 @@ pub(in crate::surface) const SNAPSHOTS_FAILED: Metric = Metric::counter(
     &["snapshot"],
     "Bags of a snapshot that could not be written.",
 );
+pub(in crate::surface) const SNAPSHOTS_SUPPRESSED: Metric = Metric::counter(
+    "ros2probe_snapshots_suppressed_total",
+    &["snapshot"],
+    "Events that met a trigger of a snapshot and began no bag: one was being written, or \
+     min_interval_s had not passed.",
+);
+pub(in crate::surface) const SNAPSHOTS_REMOVED: Metric = Metric::counter(
+    "ros2probe_snapshots_removed_total",
+    &["snapshot"],
+    "Old triggered bags of a snapshot that were removed for new ones.",
+);
 pub(in crate::surface) const EVENTS: Metric = Metric::counter(
     "ros2probe_events_total",
     &["name"],

@@ -1,0 +1,113 @@
+//! Space for the bags of one snapshot on disk. The oldest triggered bags give way to new ones;
+//! bags that a person requested stay.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use ros2probe_bag::metadata::{self, Metadata};
+
+use super::bag::{TRIGGER_DATA, TriggerData};
+use crate::config::SnapshotSettings;
+
+/// Largest metadata.yaml that is read.
+const METADATA_BYTES: u64 = 1 << 20;
+
+/// Space for a new bag.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Space {
+    /// Bytes that the new bag may have.
+    pub(super) bytes: u64,
+    /// Number of bags that were removed for it.
+    pub(super) removed: u64,
+}
+
+struct KeptBag {
+    path: PathBuf,
+    bytes: u64,
+    modified: SystemTime,
+}
+
+/// Removes the oldest triggered bags of the snapshot until the bag at `new` may have `needed` bytes.
+/// At most `others` of them remain beside it.
+pub(super) fn make_space(
+    new: &Path,
+    settings: &SnapshotSettings,
+    others: usize,
+    needed: u64,
+) -> Space {
+    let limit = settings.max_total_bytes;
+    let (mut triggered, mut used) = kept(new, settings);
+    triggered.sort_by_key(|bag| bag.modified);
+    let mut count = triggered.len();
+    let mut removed = 0;
+    // Nothing is removed for a bag that cannot fit.
+    if needed <= limit {
+        for bag in triggered {
+            if count <= others && used.saturating_add(needed) <= limit {
+                break;
+            }
+            match fs::remove_dir_all(&bag.path) {
+                Ok(()) => {
+                    removed += 1;
+                    used = used.saturating_sub(bag.bytes);
+                }
+                Err(error) => {
+                    let bag = bag.path.display();
+                    tracing::warn!(%bag, %error, "failed to remove the oldest bag of a snapshot");
+                }
+            }
+            count -= 1;
+        }
+    }
+    Space {
+        bytes: limit.saturating_sub(used),
+        removed,
+    }
+}
+
+/// The triggered bags of the snapshot beside `new`, and the bytes of all others.
+fn kept(new: &Path, settings: &SnapshotSettings) -> (Vec<KeptBag>, u64) {
+    let directory = new.parent().unwrap_or(new);
+    let prefix = format!("{}_rosbag2_", settings.name);
+    let (mut triggered, mut used) = (Vec::new(), 0_u64);
+    for entry in fs::read_dir(directory).into_iter().flatten().flatten() {
+        let is_ours = entry.file_name().to_string_lossy().starts_with(&prefix);
+        // A link may lead to files that are not the agent's.
+        let is_directory = entry.file_type().is_ok_and(|kind| kind.is_dir());
+        let path = entry.path();
+        if !is_ours || !is_directory || path == new {
+            continue;
+        }
+        let bytes = bytes_of(&path);
+        used = used.saturating_add(bytes);
+        if is_triggered(&path, &settings.name) {
+            let modified = entry.metadata().and_then(|entry| entry.modified());
+            triggered.push(KeptBag {
+                path,
+                bytes,
+                modified: modified.unwrap_or(SystemTime::UNIX_EPOCH),
+            });
+        }
+    }
+    (triggered, used)
+}
+
+fn bytes_of(bag: &Path) -> u64 {
+    let files = fs::read_dir(bag).into_iter().flatten().flatten();
+    let sizes = files.filter_map(|file| Some(file.metadata().ok()?.len()));
+    sizes.fold(0, u64::saturating_add)
+}
+
+/// Returns whether the bag's metadata names an event as its trigger.
+fn is_triggered(bag: &Path, snapshot: &str) -> bool {
+    let file = bag.join(metadata::FILE_NAME);
+    if !fs::metadata(&file).is_ok_and(|file| file.len() <= METADATA_BYTES) {
+        return false;
+    }
+    let text = fs::read_to_string(&file).ok();
+    let metadata = text.and_then(|text| Metadata::read(&text).ok());
+    let data = metadata.and_then(|metadata| metadata.custom_data.get(TRIGGER_DATA).cloned());
+    let data = data.and_then(|data| serde_json::from_str::<TriggerData>(&data).ok());
+    data.is_some_and(|data| data.snapshot == snapshot && data.event_id.is_some())
+}

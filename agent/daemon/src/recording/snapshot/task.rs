@@ -1,0 +1,254 @@
+//! Thread of one snapshot: keeps the last samples, and begins and completes its bags.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use ros2probe_bag::Error;
+use ros2probe_wire::Timestamp;
+
+use super::bag::{Cause, Failed, SnapshotBag};
+use super::{Answer, WrittenBag};
+use crate::config::SnapshotSettings;
+use crate::events::{AgentEvent, Record};
+use crate::recording::SnapshotFigures;
+use crate::recording::sample_ring::SampleRing;
+use crate::recording::service::{Recordings, causes};
+use crate::subscriptions::{Item, Subscription};
+
+/// Longest delay of commands and events.
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// Longest time between an incident and its event, by which the memory reaches further back.
+const EVENT_DELAY: Duration = Duration::from_secs(2);
+/// Longest wait for messages after an event, beyond the configured time, if the source stops.
+const SOURCE_DELAY: Duration = Duration::from_secs(5);
+
+/// State of a snapshot's thread.
+pub(super) struct SnapshotTask {
+    settings: SnapshotSettings,
+    recordings: Arc<Recordings>,
+    ring: SampleRing,
+    figures: SnapshotFigures,
+    /// Time of the source.
+    clock: Timestamp,
+    /// Number of the last examined event.
+    event: u64,
+    /// Time of the last trigger that began a bag.
+    triggered: Option<Timestamp>,
+    /// The bag that receives the messages after its trigger.
+    open: Option<OpenBag>,
+}
+
+struct OpenBag {
+    bag: SnapshotBag,
+    /// Time after which no message belongs to the bag.
+    end: Timestamp,
+    deadline: Instant,
+}
+
+impl SnapshotTask {
+    pub(super) fn new(settings: SnapshotSettings, recordings: Arc<Recordings>) -> Self {
+        let span = settings.before + EVENT_DELAY;
+        Self {
+            ring: SampleRing::new(settings.max_bytes, Some(span)),
+            figures: SnapshotFigures::default(),
+            clock: Timestamp(0),
+            event: recordings.events.last(),
+            triggered: None,
+            open: None,
+            settings,
+            recordings,
+        }
+    }
+
+    /// Works until `stop`, then completes the open bag.
+    pub(super) fn work(
+        mut self,
+        mut subscription: Subscription,
+        clients: &Receiver<Answer>,
+        signalled: &AtomicBool,
+        stop: &AtomicBool,
+    ) {
+        let mut looked = Instant::now();
+        while !stop.load(Ordering::Relaxed) {
+            let item = subscription.next_blocking(POLL_INTERVAL);
+            let is_clock = matches!(item, Some(Item::Clock(_)));
+            if let Some(item) = item {
+                self.take(item);
+            }
+            if is_clock {
+                // A replay may pass many seconds between two polls.
+                self.read_events();
+            }
+            if looked.elapsed() < POLL_INTERVAL {
+                continue;
+            }
+            looked = Instant::now();
+            self.read_events();
+            self.show();
+            if let Ok(client) = clients.try_recv() {
+                // If the client no longer waits, the bag exists nevertheless.
+                let _ = client.send(self.write_memory(Cause::Request));
+            }
+            if signalled.swap(false, Ordering::Relaxed) {
+                // The event log records the result.
+                let _ = self.write_memory(Cause::Signal);
+            }
+        }
+        self.complete(None);
+    }
+
+    pub(super) fn take(&mut self, item: Item) {
+        let now = match &item {
+            Item::Sample(sample) => Some(sample.time),
+            Item::Clock(now) => Some(*now),
+            Item::Missed(_) | Item::End(_) => None,
+        };
+        self.clock = self.clock.max(now.unwrap_or_default());
+        let is_end = matches!(item, Item::End(_));
+        if let Some(open) = &mut self.open {
+            let is_late = now.is_some_and(|now| now > open.end);
+            let taken = if is_late {
+                Ok(())
+            } else {
+                open.bag.take(&item)
+            };
+            if is_late || is_end || taken.is_err() || Instant::now() > open.deadline {
+                self.complete(taken.err());
+            }
+        }
+        match item {
+            Item::Sample(sample) => self.ring.push(sample),
+            Item::Clock(now) => self.ring.advance(now),
+            Item::Missed(_) => {}
+            Item::End(_) => std::thread::sleep(POLL_INTERVAL),
+        }
+    }
+
+    /// Compares new events with the triggers.
+    pub(super) fn read_events(&mut self) {
+        let events = Arc::clone(&self.recordings.events);
+        while events.last() > self.event {
+            let batch = events.read(self.event, 256);
+            self.event = batch.last;
+            for record in batch.records {
+                let domain_id = self.settings.domain_id;
+                let mut triggers = self.settings.triggers.iter();
+                let trigger = triggers.find(|trigger| trigger.matches(&record, domain_id));
+                if let Some(name) = trigger.map(|trigger| trigger.name()) {
+                    self.trigger(name, record);
+                }
+            }
+        }
+    }
+
+    /// Begins a bag, unless one is open or the last one is too recent.
+    fn trigger(&mut self, name: &'static str, record: Record) {
+        let min_interval = self.settings.min_interval;
+        let is_early = |last: Timestamp| self.clock.distance(last) < min_interval;
+        if self.open.is_some() || self.triggered.is_some_and(is_early) {
+            self.figures.suppressed += 1;
+            return;
+        }
+        // A topic without any message is not worth a bag.
+        if self.ring.is_empty() && self.settings.after.is_zero() {
+            return;
+        }
+        self.triggered = Some(self.clock);
+        // Events of the agent have the time of this host, which differs in a replay.
+        let is_of_agent = record.definition.name.starts_with("ros2probe.");
+        let at = if is_of_agent { self.clock } else { record.at };
+        let cause = Cause::Event {
+            trigger: name,
+            id: self.recordings.events.id(record.number),
+            record: Box::new(record),
+        };
+        let since = at - self.settings.before;
+        // The event log records a failure.
+        let Ok(bag) = self.create(cause, since) else {
+            return;
+        };
+        self.open = Some(OpenBag {
+            bag,
+            end: at + self.settings.after,
+            deadline: Instant::now() + self.settings.after + SOURCE_DELAY,
+        });
+        if self.settings.after.is_zero() {
+            self.complete(None);
+        }
+    }
+
+    /// Writes the messages in memory into a bag, and completes it.
+    pub(super) fn write_memory(&mut self, cause: Cause) -> Result<WrittenBag, String> {
+        let since = self.clock - self.settings.before;
+        let bag = self.create(cause, since)?;
+        self.finish(bag, None)
+    }
+
+    /// Creates a bag with the messages in memory since this time.
+    fn create(&mut self, cause: Cause, since: Timestamp) -> Result<SnapshotBag, String> {
+        let samples = self.ring.iter().filter(|sample| sample.time >= since);
+        let samples: Vec<_> = samples.map(Arc::clone).collect();
+        let payloads = samples.iter().filter_map(|sample| sample.payload.as_ref());
+        let needed = payloads.map(|payload| payload.len() as u64).sum();
+        let mut bag = SnapshotBag::create(&self.recordings, &self.settings, cause, needed)
+            .map_err(|failed| self.fail(failed))?;
+        for sample in samples {
+            if let Err(error) = bag.take(&Item::Sample(sample)) {
+                return Err(self.fail(bag.discard(&error)));
+            }
+        }
+        Ok(bag)
+    }
+
+    /// Reports a bag that could not be created. Returns the reason.
+    fn fail(&mut self, failed: Failed) -> String {
+        self.figures.failed += 1;
+        self.figures.removed += failed.removed;
+        let reason = Some(failed.reason.clone());
+        self.report(&failed.cause, failed.name, 0, reason);
+        failed.reason
+    }
+
+    /// Completes the open bag. `error` is the storage error that ended it, if any.
+    pub(super) fn complete(&mut self, error: Option<Error>) {
+        if let Some(open) = self.open.take() {
+            // The event log records the result.
+            let _ = self.finish(open.bag, error);
+        }
+    }
+
+    fn finish(&mut self, bag: SnapshotBag, error: Option<Error>) -> Result<WrittenBag, String> {
+        let ended = bag.finish(error);
+        let reason = ended.error.as_ref().map(causes);
+        match reason {
+            None => self.figures.written += 1,
+            Some(_) => self.figures.failed += 1,
+        }
+        self.figures.removed += ended.removed;
+        let WrittenBag { name, messages, .. } = ended.bag.clone();
+        self.report(&ended.cause, name, messages, reason.clone());
+        reason.map_or(Ok(ended.bag), Err)
+    }
+
+    fn report(&mut self, cause: &Cause, name: String, messages: u64, reason: Option<String>) {
+        self.recordings.events.record(AgentEvent::SnapshotTaken {
+            snapshot: self.settings.name.clone(),
+            trigger: cause.name(),
+            trigger_event_id: cause.event_id().map(str::to_owned),
+            recording: name,
+            messages,
+            reason,
+        });
+        self.show();
+    }
+
+    pub(super) fn show(&mut self) {
+        self.figures.messages = self.ring.len() as u64;
+        self.figures.bytes = self.ring.bytes() as u64;
+        self.figures.crowded_out = self.ring.crowded_out();
+        let figures = &self.recordings.figures;
+        figures.snapshot(&self.settings.name, self.figures);
+    }
+}

@@ -1,0 +1,426 @@
+//! Triggered bags in virtual time: their span, their names, and the disk that they use.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_bag::metadata::{self, Metadata};
+use ros2probe_message::{Library, Sources};
+use ros2probe_model::churn;
+use ros2probe_model::dispatch::Sample;
+use ros2probe_model::event::{Event, EventKind, LossBurst, Taken};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
+use tempfile::TempDir;
+use tokio_util::sync::CancellationToken;
+
+use super::bag::Cause;
+use super::task::SnapshotTask;
+use crate::agent_facts::SourceKind;
+use crate::config::{Limits, RecordingLimits, SnapshotSettings};
+use crate::events::{EventLog, Trigger};
+use crate::limit_facts::LimitFigures;
+use crate::recording::service::{Components, Recordings};
+use crate::recording::{RecordingFigures, SnapshotFigures};
+use crate::snapshot_cell::SnapshotCell;
+use crate::subscriptions::{Caps, Item, Subscriptions, Topic};
+
+const TENTH: u64 = SECOND / 10;
+
+/// A snapshot of one topic with ten messages a second, whose numbers are tenths of seconds.
+struct Robot {
+    directory: TempDir,
+    events: Arc<EventLog>,
+    figures: Arc<RecordingFigures>,
+    task: SnapshotTask,
+    topic: Arc<Topic>,
+    now: u64,
+    payload: usize,
+}
+
+fn settings(triggers: &[&str], before: u64, after: u64) -> SnapshotSettings {
+    SnapshotSettings {
+        name: "incident".to_owned(),
+        topics: vec!["/imu".to_owned()],
+        domain_id: 0,
+        before: Duration::from_secs(before),
+        after: Duration::from_secs(after),
+        max_bytes: 1 << 20,
+        triggers: triggers
+            .iter()
+            .map(|name| Trigger::parse(name).unwrap())
+            .collect(),
+        min_interval: Duration::ZERO,
+        max_count: 20,
+        max_total_bytes: 1 << 30,
+    }
+}
+
+impl Robot {
+    fn new(settings: SnapshotSettings) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let latest = Arc::new(SnapshotCell::new(SourceKind::Wire));
+        let caps = Caps {
+            subscriptions: 4,
+            bytes: 1 << 20,
+        };
+        let stop = CancellationToken::new();
+        let subscriptions = Arc::new(Subscriptions::new(Arc::clone(&latest), caps, stop));
+        let events = Arc::new(EventLog::new());
+        let figures = Arc::new(RecordingFigures::default());
+        let recordings = Recordings::new(Components {
+            directory: Some(directory.path().to_owned()),
+            limits: RecordingLimits {
+                reserve_percent: 0,
+                reserve_bytes: 0,
+                ..RecordingLimits::default()
+            },
+            queue_bytes: 1 << 20,
+            latest,
+            events: Arc::clone(&events),
+            caps: Arc::new(LimitFigures::new(Limits::default())),
+            figures: Arc::clone(&figures),
+            subscriptions,
+            library: Arc::new(Library::new(Sources::default())),
+        });
+        let topic = Topic {
+            domain_id: DomainId(0),
+            name: "/imu".into(),
+            dds_name: "rt/imu".into(),
+            message_type: "std_msgs/msg/String".into(),
+            offered: None,
+        };
+        Self {
+            directory,
+            events,
+            figures,
+            task: SnapshotTask::new(settings, Arc::new(recordings)),
+            topic: Arc::new(topic),
+            now: 100 * SECOND / TENTH,
+            payload: 64,
+        }
+    }
+
+    /// Publishes for some tenths of a second.
+    fn run(&mut self, tenths: u64) {
+        for _ in 0..tenths {
+            self.now += 1;
+            let sample = Sample {
+                topic: Arc::clone(&self.topic),
+                time: self.time(),
+                writer: Guid::default(),
+                sequence_number: SequenceNumber(self.now),
+                source_timestamp: None,
+                header_stamp: None,
+                size: 64,
+                sampled: false,
+                payload: Some(vec![0; self.payload].into()),
+            };
+            self.task.take(Item::Sample(Arc::new(sample)));
+            self.pass();
+        }
+    }
+
+    fn pass(&mut self) {
+        self.task.take(Item::Clock(self.time()));
+        self.task.read_events();
+    }
+
+    fn time(&self) -> Timestamp {
+        Timestamp(self.now * TENTH)
+    }
+
+    /// Records an event at the current time.
+    fn event(&self, kind: EventKind) {
+        let at = self.time();
+        let events = vec![Event { at, kind }];
+        let overflow = Vec::new();
+        self.events.add(Taken { events, overflow }, at);
+    }
+
+    fn lose_messages(&self) {
+        self.event(EventKind::Loss(LossBurst {
+            writer: Guid::default(),
+            topic: None,
+            node: None,
+            count: 3,
+            first: SequenceNumber(1),
+            last: SequenceNumber(3),
+        }));
+    }
+
+    fn lose_participant(&self, change: churn::Event, domain: u32) {
+        self.event(EventKind::Participant {
+            change,
+            domain_id: DomainId(domain),
+            guid: Guid::default(),
+            vendor: VendorId([1, 15]),
+            host: None,
+            process: Some("driver".into()),
+        });
+    }
+
+    /// Numbers in each bag, by the bag's name.
+    fn bags(&self) -> BTreeMap<String, Vec<u64>> {
+        let bags = std::fs::read_dir(self.directory.path()).unwrap();
+        let bags = bags.map(|bag| bag.unwrap());
+        bags.map(|bag| {
+            let name = bag.file_name().into_string().unwrap();
+            (name, numbers(&bag.path()))
+        })
+        .collect()
+    }
+
+    fn only_bag(&self) -> Vec<u64> {
+        let bags: Vec<_> = self.bags().into_values().collect();
+        let [bag] = bags.as_slice() else {
+            panic!("{bags:?}");
+        };
+        bag.clone()
+    }
+
+    fn bytes(&self) -> u64 {
+        let bags = std::fs::read_dir(self.directory.path()).unwrap();
+        let files = bags.flat_map(|bag| std::fs::read_dir(bag.unwrap().path()).unwrap());
+        files
+            .map(|file| file.unwrap().metadata().unwrap().len())
+            .sum()
+    }
+
+    fn shown(&mut self) -> SnapshotFigures {
+        self.task.show();
+        self.figures.snapshots()[0].1
+    }
+
+    fn trigger_of(&self, bag: &str) -> serde_json::Value {
+        let file = self.directory.path().join(bag).join(metadata::FILE_NAME);
+        let metadata = Metadata::read(&std::fs::read_to_string(file).unwrap()).unwrap();
+        serde_json::from_str(&metadata.custom_data["ros2probe_trigger"]).unwrap()
+    }
+}
+
+/// Sequence numbers of all messages of a bag.
+fn numbers(bag: &Path) -> Vec<u64> {
+    let mut numbers = Vec::new();
+    let files = std::fs::read_dir(bag)
+        .unwrap()
+        .map(|file| file.unwrap().path());
+    for file in files.filter(|file| file.extension().is_some_and(|it| it == "mcap")) {
+        ros2probe_bag::read::scan(&file, &mut |message, _| {
+            numbers.push(u64::from(message.sequence));
+        })
+        .unwrap();
+    }
+    numbers.sort_unstable();
+    numbers
+}
+
+#[test]
+fn a_bag_holds_the_seconds_before_and_after_its_event_and_names_it() {
+    let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
+    robot.run(100);
+    let incident = robot.now;
+    robot.lose_messages();
+    robot.run(10);
+    assert_eq!(robot.figures.snapshots().len(), 0, "the bag is still open");
+    robot.run(30);
+    let expected: Vec<u64> = (incident - 30..=incident + 20).collect();
+    assert_eq!(robot.only_bag(), expected);
+    let bags = robot.bags();
+    let trigger = robot.trigger_of(bags.keys().next().unwrap());
+    assert_eq!(trigger["snapshot"], "incident");
+    assert_eq!(trigger["trigger"], "message_lost");
+    assert_eq!(trigger["event"], "ros2.message.lost");
+    assert_eq!(trigger["attributes"]["count"], 3, "{trigger}");
+    let taken = robot.events.read(0, 10).records.pop().unwrap();
+    assert_eq!(taken.definition.name, "ros2probe.snapshot.taken");
+    let attribute = |name| serde_json::to_value(taken.attribute(name).unwrap()).unwrap();
+    assert_eq!(attribute("trigger"), "message_lost");
+    assert_eq!(attribute("trigger_event_id"), trigger["event_id"]);
+    assert_eq!(attribute("messages"), 51);
+}
+
+/// An event arrives up to two seconds after the incident; the bag reaches back from the incident.
+#[test]
+fn the_delay_of_an_event_does_not_shorten_the_time_before() {
+    let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
+    robot.run(100);
+    let incident = robot.time();
+    let number = robot.now;
+    robot.run(15);
+    let kind = EventKind::Loss(LossBurst {
+        writer: Guid::default(),
+        topic: None,
+        node: None,
+        count: 1,
+        first: SequenceNumber(1),
+        last: SequenceNumber(1),
+    });
+    let events = vec![Event { at: incident, kind }];
+    let overflow = Vec::new();
+    robot.events.add(Taken { events, overflow }, robot.time());
+    robot.run(30);
+    let expected: Vec<u64> = (number - 30..=number + 20).collect();
+    assert_eq!(robot.only_bag(), expected);
+}
+
+#[test]
+fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_name() {
+    let mut robot = Robot::new(settings(&["participant_lost"], 1, 0));
+    robot.run(20);
+    robot.lose_participant(churn::Event::Disposed, 0);
+    robot.lose_participant(churn::Event::Expired, 1);
+    robot.run(20);
+    assert!(robot.bags().is_empty());
+    robot.lose_participant(churn::Event::Expired, 0);
+    robot.run(1);
+    assert_eq!(robot.bags().len(), 1);
+
+    let mut robot = Robot::new(settings(&["ros2.participant.lost"], 1, 0));
+    robot.run(20);
+    robot.lose_participant(churn::Event::Disposed, 0);
+    robot.run(1);
+    assert_eq!(robot.bags().len(), 1);
+}
+
+#[test]
+fn a_thousand_triggers_in_a_minute_cost_bounded_disk() {
+    let limit = 200_000;
+    let mut robot = Robot::new(SnapshotSettings {
+        max_count: 3,
+        max_total_bytes: limit,
+        ..settings(&["message_lost"], 1, 1)
+    });
+    robot.payload = 2000;
+    robot.run(20);
+    for _ in 0..600 {
+        robot.lose_messages();
+        robot.lose_messages();
+        robot.run(1);
+        assert!(robot.bags().len() <= 4 && robot.bytes() <= limit);
+    }
+    robot.run(20);
+    let figures = robot.shown();
+    // Each bag takes a second. The other triggers begin none.
+    assert!((50..=60).contains(&figures.written), "{figures:?}");
+    assert_eq!(figures.suppressed + figures.written, 1200, "{figures:?}");
+    let bags = robot.bags();
+    assert!((1..=3).contains(&bags.len()), "{:?}", bags.keys());
+    assert_eq!(figures.removed + bags.len() as u64, figures.written);
+    // The newest ones remain.
+    let last = bags.values().filter_map(|numbers| numbers.last()).max();
+    assert!(last.is_some_and(|last| *last + 40 > robot.now));
+    assert!(robot.bytes() <= limit, "{}", robot.bytes());
+}
+
+#[test]
+fn the_minimum_interval_separates_bags() {
+    let mut robot = Robot::new(SnapshotSettings {
+        min_interval: Duration::from_secs(20),
+        ..settings(&["message_lost"], 1, 0)
+    });
+    robot.run(20);
+    for _ in 0..60 {
+        robot.lose_messages();
+        robot.run(10);
+    }
+    assert_eq!(robot.shown().written, 3);
+    assert_eq!(robot.shown().suppressed, 57);
+}
+
+#[test]
+fn a_requested_bag_is_never_removed_for_others() {
+    let mut robot = Robot::new(SnapshotSettings {
+        max_count: 1,
+        max_total_bytes: 100_000,
+        ..settings(&["message_lost"], 1, 0)
+    });
+    robot.run(20);
+    let requested = robot.task.write_memory(Cause::Request).unwrap().name;
+    for _ in 0..5 {
+        robot.lose_messages();
+        robot.run(1);
+    }
+    let bags = robot.bags();
+    assert!(bags.len() == 2 && bags.contains_key(&requested), "{bags:?}");
+    // Requested bags that use up the space are kept, too, and the error says what to do.
+    robot.payload = 4000;
+    robot.run(20);
+    let mut results = (0..5).map(|_| robot.task.write_memory(Cause::Request));
+    let refused = results.find_map(Result::err).unwrap();
+    assert!(refused.contains("max_total_bytes"), "{refused}");
+    assert!(robot.bags().contains_key(&requested));
+    assert!(robot.shown().failed >= 1);
+}
+
+#[test]
+fn a_bag_with_an_oversized_metadata_file_is_kept() {
+    let mut robot = Robot::new(SnapshotSettings {
+        max_count: 1,
+        ..settings(&["message_lost"], 1, 0)
+    });
+    robot.run(20);
+    robot.lose_messages();
+    robot.run(1);
+    let first = robot.bags().into_keys().next().unwrap();
+    let file = robot
+        .directory
+        .path()
+        .join(&first)
+        .join(metadata::FILE_NAME);
+    let mut text = std::fs::read_to_string(&file).unwrap();
+    text.push_str(&"# a comment\n".repeat(100_000));
+    std::fs::write(&file, text).unwrap();
+    for _ in 0..3 {
+        robot.lose_messages();
+        robot.run(1);
+    }
+    let bags = robot.bags();
+    assert!(bags.len() == 2 && bags.contains_key(&first), "{bags:?}");
+}
+
+#[test]
+fn a_bag_that_reaches_the_limit_after_its_event_keeps_what_it_has() {
+    let mut robot = Robot::new(SnapshotSettings {
+        max_total_bytes: 100_000,
+        ..settings(&["message_lost"], 1, 60)
+    });
+    robot.payload = 4000;
+    robot.run(20);
+    let incident = robot.now;
+    robot.lose_messages();
+    robot.run(100);
+    let bag = robot.only_bag();
+    assert!(
+        bag.contains(&(incident - 10)) && bag.contains(&incident),
+        "{bag:?}"
+    );
+    let bytes = robot.bytes();
+    assert!(bag.len() < 30 && bytes <= 100_000, "{} {bytes}", bag.len());
+    assert_eq!((robot.shown().failed, robot.shown().written), (1, 0));
+}
+
+#[test]
+fn an_agent_that_stops_completes_the_open_bag() {
+    let mut robot = Robot::new(settings(&["message_lost"], 1, 600));
+    robot.run(20);
+    robot.lose_messages();
+    robot.run(5);
+    robot.task.complete(None);
+    assert_eq!(robot.only_bag().len(), 16);
+    assert_eq!(robot.shown().written, 1);
+}
+
+#[test]
+fn every_name_of_a_trigger_parses_and_snapshots_do_not_trigger_themselves() {
+    let names: Vec<_> = Trigger::names().collect();
+    assert!(names.len() > 30);
+    for name in names {
+        assert_eq!(Trigger::parse(name).unwrap().name(), name);
+    }
+    for name in ["ros2probe.snapshot.taken", "violation", ""] {
+        assert_eq!(Trigger::parse(name), None);
+    }
+}
