@@ -8,5 +8,6 @@
 )]
 
 mod echo;
+mod incident;
 mod installed;
 mod robot;
