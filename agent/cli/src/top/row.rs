@@ -292,6 +292,8 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "max_loss_ratio" => "loss",
             "max_latency_ms" => "late",
             "max_silence_s" => "silent",
+            "publishers" => "few pub",
+            "subscribers" => "few sub",
             _ => "violated",
         });
     }
