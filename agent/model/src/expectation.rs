@@ -246,8 +246,9 @@ const fn without_consequences(broken: u8, evidence: &Evidence<'_>) -> u8 {
     }
 }
 
-/// Returns the number of whole seconds in which three messages at this rate are due.
-fn window(rate: f64) -> u64 {
+/// Returns the number of whole seconds in which three messages at this rate are due, from 1 to 10.
+#[must_use]
+pub fn window(rate: f64) -> u64 {
     let seconds = (3.0 / rate.max(0.01)).ceil();
     (1..SECONDS)
         .find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1)))
