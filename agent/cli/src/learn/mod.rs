@@ -155,7 +155,7 @@ impl Learner {
             if self.selection.covers(topic)
                 && let Some(observation) = self.observation(&topic.name)
             {
-                observation.observe(topic, now, steps);
+                observation.observe(topic, now, elapsed, steps);
             }
         }
         self.seconds += steps;

@@ -57,9 +57,9 @@ impl Observation {
         &self.seconds
     }
 
-    /// Adds what happened since the last view, as `steps` seconds. Counts of the first view belong
-    /// to the time before.
-    pub fn observe(&mut self, topic: &Topic<'_>, now: f64, steps: u32) {
+    /// Adds what happened since the last view, `elapsed` seconds ago, as `steps` seconds. Counts of
+    /// the first view belong to the time before.
+    pub fn observe(&mut self, topic: &Topic<'_>, now: f64, elapsed: f64, steps: u32) {
         let before = self.totals;
         let measurement = topic.measurement.as_ref();
         let totals = measurement.map(|it| {
@@ -77,10 +77,12 @@ impl Observation {
             (Some(before), Some(totals)) => totals.since(before),
             _ => Totals::default(),
         };
+        // Views are about a second apart, and rates are counts of whole seconds.
+        let messages = scaled(since.messages, f64::from(steps) / elapsed);
         for step in 0..steps {
             let left = f64::from(steps - step - 1);
             self.seconds.push(Second {
-                messages: share(since.messages, step, steps),
+                messages: share(messages, step, steps),
                 lost: share(since.lost, step, steps),
                 delayed: share(since.delayed, step, steps),
                 delay: narrow(since.delay / f64::from(steps)),
@@ -137,6 +139,15 @@ fn share(count: u64, step: u32, steps: u32) -> u32 {
     let (step, steps) = (u64::from(step), u64::from(steps.max(1)));
     let part = count / steps + u64::from(step < count % steps);
     u32::try_from(part).unwrap_or(u32::MAX)
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "a count of messages, scaled by 0.5 to 2"
+)]
+fn scaled(messages: u64, factor: f64) -> u64 {
+    (count(messages) * factor).round() as u64
 }
 
 #[expect(

@@ -122,8 +122,7 @@ impl<'a> Draft<'a> {
             (None, 0) => "no message was seen".to_owned(),
             (_, messages) => format!("{messages} messages are too few"),
         };
-        let keys = "min_rate_hz, max_rate_hz, max_loss_ratio, max_latency_ms and max_silence_s";
-        self.leave_out(keys, why);
+        self.leave_out("rate, loss, latency and silence", why);
     }
 
     fn rate(&mut self) {
@@ -140,8 +139,9 @@ impl<'a> Draft<'a> {
             return self.leave_out(KEYS, why);
         }
         let window = rehearsal::window(lowest);
-        let Some(rates) = Summary::of(self.rates(window)) else {
-            return self.leave_out(KEYS, "the topic was published too briefly");
+        let rates = Summary::of(self.rates(window)).filter(|rates| rates.median > 0.0);
+        let Some(rates) = rates else {
+            return self.leave_out(KEYS, "no message arrived for most of the time");
         };
         let Summary { median, .. } = rates;
         let half = (RATE_MARGIN * median).max(RATE_DEVIATIONS * rates.deviation);
@@ -218,7 +218,8 @@ impl<'a> Draft<'a> {
         };
         // One lost message in a window is no fault.
         let base = LEAST_LOSS.max(1.5 / sent.median);
-        let candidates = [base.max(3.0 * ratios.p95), 1.5 * ratios.maximum].map(rounded_up);
+        let candidates = [3.0 * ratios.p95, 1.5 * ratios.maximum];
+        let candidates = candidates.map(|ratio| rounded_up(ratio.max(base)));
         let ratio = candidates.into_iter().find(|ratio| {
             let values = ExpectationValues {
                 max_loss_ratio: Some(*ratio),
@@ -369,8 +370,8 @@ impl<'a> Draft<'a> {
         expecting: fn(Option<u32>) -> ExpectationValues,
     ) -> Option<u32> {
         if settled.len() < LEAST {
-            let why = format!("{} s with a publisher are too few", self.seconds.len());
-            self.leave_out(key, why);
+            let published = self.seconds.iter().filter(|it| it.publishers > 0).count();
+            self.leave_out(key, format!("{published} s with a publisher are too few"));
             return None;
         }
         let mut counts: Vec<u16> = settled.iter().map(count).collect();
@@ -381,7 +382,10 @@ impl<'a> Draft<'a> {
         let least = candidates
             .into_iter()
             .find(|least| *least > 0 && !self.violates(expecting(Some(*least))));
-        let seen = format!("{fewest} to {most} {key}");
+        let seen = match fewest == most {
+            true => format!("always {most}"),
+            false => format!("{fewest} to {most}"),
+        };
         let why = match most {
             0 => format!("the topic had no {key}"),
             _ => format!("the number varies: {seen}"),
