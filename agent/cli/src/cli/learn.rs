@@ -51,7 +51,7 @@ pub(crate) struct Learn {
     #[arg(long, short = 'o', value_name = "FILE", default_value = "-")]
     output: Destination,
     /// Replace an existing file
-    #[arg(long, requires = "output")]
+    #[arg(long)]
     force: bool,
     #[command(flatten)]
     target: Target,
@@ -62,9 +62,10 @@ impl Learn {
         let selection = Selection::new(&self.topics)
             .map_err(|(typed, error)| UserError(format!("rp: the topic `{typed}` {error}")))?;
         let domain_id = self.target.domain()?;
-        let file = self.output.open(self.force)?;
+        self.output.check(self.force)?;
         let is_replay = self.target.replay.is_some();
         let default = if is_replay { MAX_MINUTES } else { 10 };
+        let is_whole = is_replay && self.minutes.is_none();
         let mut session = Session {
             domain_id,
             seconds: 60 * u32::from(self.minutes.unwrap_or(default)),
@@ -72,7 +73,7 @@ impl Learn {
             query: query(&selection),
             learner: Learner::new(selection),
             stop: super::interrupt::flag().context("cannot handle signals")?,
-            progress: Progress::new(),
+            progress: Progress::new(is_whole),
         };
         let agent = if is_replay {
             Agent::reach_steps(&self.target)
@@ -87,10 +88,7 @@ impl Learn {
         session.progress.clear();
         learnt?;
         let (text, learnt) = session.finish(&agent)?;
-        match file {
-            Some(file) => file.write(&text)?,
-            None => Output::new().write(&text)?,
-        }
+        self.output.write(&text, self.force)?;
         session.report(&learnt, &self.output);
         let is_truncated = agent
             .outcome()
@@ -256,24 +254,28 @@ fn time(seconds: f64) -> String {
 /// A line on stderr that is updated in place; nothing if stderr is no terminal.
 struct Progress {
     is_shown: bool,
+    /// Whether the end of a capture ends the command, at an unknown time.
+    is_whole: bool,
 }
 
 impl Progress {
-    fn new() -> Self {
+    fn new(is_whole: bool) -> Self {
         Self {
             is_shown: stderr().is_terminal(),
+            is_whole,
         }
     }
 
     fn show(&self, learner: &Learner, seconds: u32) {
         if self.is_shown {
             let (topics, now) = (learner.topics(), learner.seconds());
+            let all = match self.is_whole {
+                true => "the capture".to_owned(),
+                false => format!("{}:{:02}", seconds / 60, seconds % 60),
+            };
+            let (minutes, now) = (now / 60, now % 60);
             eprint!(
-                "\rlearning {topics} topics: {}:{:02} of {}:{:02}; Ctrl-C ends early\x1b[K",
-                now / 60,
-                now % 60,
-                seconds / 60,
-                seconds % 60
+                "\rlearning {topics} topics: {minutes}:{now:02} of {all}; Ctrl-C ends early\x1b[K"
             );
         }
     }

@@ -283,6 +283,36 @@ fn names_of_topics_cannot_break_the_file() {
     );
 }
 
+#[test]
+fn a_file_is_never_larger_than_an_agent_reads() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..30 {
+        robot.second(STEADY);
+    }
+    let mut learnt = robot.learner.finish().unwrap();
+    let lesson = learnt.lessons.remove(0);
+    learnt.lessons = (0..Limit::Watches.row().default)
+        .map(|number| Lesson {
+            topic: format!("/t{number}{}", "x".repeat(250)),
+            remarks: [
+                &lesson.remarks[..],
+                &vec![Remark::LeftOut("all", "y".repeat(900)); 1],
+            ]
+            .concat(),
+            ..lesson.clone()
+        })
+        .collect();
+    let source = Source {
+        place: "robot",
+        domain_id: 0,
+        names_domain: false,
+        period: ("a", "b"),
+        seconds: 30,
+    };
+    let config = Config::parse(text(&learnt, &source).as_bytes()).unwrap();
+    assert_eq!(config.watches.len(), learnt.lessons.len());
+}
+
 proptest! {
     /// Whatever a robot does, it does not violate what was learnt from it.
     #[test]

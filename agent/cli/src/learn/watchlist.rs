@@ -11,6 +11,8 @@ use ros2probe_daemon::escape::visible;
 
 /// Column at which reasons begin.
 const COLUMN: usize = 28;
+/// Largest configuration file that an agent reads, in bytes.
+const MAX_BYTES: usize = 1 << 20;
 
 /// Origin of a watchlist.
 #[derive(Clone, Copy, Debug)]
@@ -27,9 +29,17 @@ pub struct Source<'a> {
     pub seconds: u32,
 }
 
-/// Returns the file.
+/// Returns the file. If the reasons make it larger than an agent reads, they are left out.
 #[must_use]
 pub fn text(learnt: &Learnt, source: &Source<'_>) -> String {
+    let explained = entries(learnt, source, true);
+    if explained.len() <= MAX_BYTES {
+        return explained;
+    }
+    entries(learnt, source, false)
+}
+
+fn entries(learnt: &Learnt, source: &Source<'_>, is_explained: bool) -> String {
     let mut text = head(source);
     text.push_str("version: 1\nwatch:");
     if learnt.lessons.iter().all(|lesson| !is_expected(lesson)) {
@@ -37,7 +47,7 @@ pub fn text(learnt: &Learnt, source: &Source<'_>) -> String {
     }
     text.push('\n');
     for lesson in &learnt.lessons {
-        entry(&mut text, lesson, source);
+        entry(&mut text, lesson, source, is_explained);
     }
     if learnt.unnamed > 0 {
         let count = learnt.unnamed;
@@ -90,25 +100,26 @@ fn head(source: &Source<'_>) -> String {
     )
 }
 
-fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>) {
+fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: bool) {
     let name = &lesson.topic;
     if is_expected(lesson) {
         line(text, &format!("  - topic: {name}"));
         if source.names_domain {
             line(text, &format!("    domain: {}", source.domain_id));
         }
-    } else {
+    } else if is_explained {
         line(text, &format!("  # {name} has no expectations:"));
     }
     for remark in &lesson.remarks {
         match remark {
-            Remark::Set(key, value, why) if why.is_empty() => {
+            Remark::Set(key, value, why) if why.is_empty() || !is_explained => {
                 line(text, &format!("    {key}: {value}"));
             }
             Remark::Set(key, value, why) => {
                 let setting = format!("    {key}: {value}");
                 line(text, &format!("{setting:COLUMN$}  # {}", visible(why)));
             }
+            Remark::LeftOut(..) if !is_explained => {}
             Remark::LeftOut(keys, why) => {
                 line(text, &format!("    # no {keys}: {}", visible(why)));
             }

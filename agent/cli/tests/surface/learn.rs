@@ -1,5 +1,5 @@
-//! `rp learn` on captures in virtual time: the file is a configuration, the robot that it was learnt
-//! from meets it, and each fault of another robot violates its topic and no other.
+//! `rp learn` on captures in virtual time. The file is a configuration, and the robot that it was
+//! learnt from meets it. Each fault of another robot violates its topic and no other.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -8,6 +8,7 @@ use std::process::{Output, Stdio};
 use crate::rp;
 use ros2probe_testing::local_agent::{LocalAgent, request};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
+use ros2probe_testing::pseudo_terminal::Terminal;
 use ros2probe_wire::GuidPrefix;
 use serde_json::Value;
 
@@ -281,6 +282,29 @@ fn a_file_is_replaced_only_by_force_and_nothing_is_left_of_a_failure() {
     );
     let nothing = run(&["learn", "--replay", "/nowhere.pcap"]);
     assert!(stderr(&nothing).contains("cannot replay /nowhere.pcap"));
+}
+
+#[test]
+fn a_terminal_shows_the_progress_in_one_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = directory.path().join("robot.pcap");
+    robot(&capture, &[]);
+    let file = directory.path().join("watchlist.yaml");
+    let mut rp = rp();
+    rp.args(["learn", "--replay"])
+        .arg(&capture)
+        .arg("-o")
+        .arg(&file);
+    let mut terminal = Terminal::start(&mut rp);
+    assert_eq!(terminal.ends(), Some(0), "{}", terminal.written());
+    let written = terminal.written();
+    let progress = "\rlearning 6 topics: 0:59 of the capture; Ctrl-C ends early\u{1b}[K";
+    assert!(written.contains(progress), "{written:?}");
+    let screen = terminal.screen();
+    assert!(
+        screen.starts_with("rp: expectations for 6 of 6 topics"),
+        "{screen}"
+    );
 }
 
 #[test]

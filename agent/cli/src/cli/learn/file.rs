@@ -1,29 +1,21 @@
-//! The file of a watchlist. It is created before the robot is watched, so that a wrong path fails
-//! at once.
+//! The file of a watchlist. Whether it can be written is checked before the robot is watched, so
+//! that a wrong path fails at once. Nothing is left of it before the text is complete.
 
 use std::convert::Infallible;
 use std::fs::{self, File};
-use std::io::{ErrorKind, Write as _};
+use std::io::{self, ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context as _, Result};
 
-use super::UserError;
+use super::{Output, UserError};
 
 /// Where a watchlist is written.
 #[derive(Clone, Debug)]
 pub(super) enum Destination {
     StandardOutput,
     File(PathBuf),
-}
-
-/// An open file. Dropping it before [`Self::write`] removes it if it is new.
-#[derive(Debug)]
-pub(super) struct Reserved {
-    file: File,
-    path: PathBuf,
-    is_new: bool,
 }
 
 impl FromStr for Destination {
@@ -38,31 +30,44 @@ impl FromStr for Destination {
 }
 
 impl Destination {
-    /// Opens the file and leaves its content as it is. `None` for standard output.
+    /// Checks that the file can be written, and leaves no trace.
     ///
     /// # Errors
     ///
     /// The file exists and `force` is not set, or it cannot be written.
-    pub(super) fn open(&self, force: bool) -> Result<Option<Reserved>> {
+    pub(super) fn check(&self, force: bool) -> Result<()> {
         let Self::File(path) = self else {
-            return Ok(None);
+            return Ok(());
         };
-        let new = File::options().write(true).create_new(true).open(path);
-        let (file, is_new) = match new {
-            Ok(file) => (file, true),
-            Err(error) if error.kind() == ErrorKind::AlreadyExists && force => {
-                let file = File::options().write(true).open(path);
-                (file.with_context(|| unwritable(path))?, false)
-            }
-            Err(error) if error.kind() == ErrorKind::AlreadyExists => {
-                let path = path.display();
-                let text = format!("rp: {path} exists; pass --force to replace it");
-                return Err(UserError(text).into());
-            }
-            Err(error) => return Err(error).with_context(|| unwritable(path)),
+        let (_, is_new) = open(path, force)?;
+        if is_new {
+            fs::remove_file(path).with_context(|| unwritable(path))?;
+        }
+        Ok(())
+    }
+
+    /// Writes the text. If the file fails, standard output receives the text, as it took minutes.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::check`], or the disk is full.
+    pub(super) fn write(&self, text: &str, force: bool) -> Result<()> {
+        let path = match self {
+            Self::StandardOutput => return Ok(Output::new().write(text)?),
+            Self::File(path) => path,
         };
-        let path = path.clone();
-        Ok(Some(Reserved { file, path, is_new }))
+        let written = open(path, force).and_then(|(file, is_new)| {
+            let replaced = replace(file, text).with_context(|| unwritable(path));
+            if replaced.is_err() && is_new {
+                // The error of the writing is reported.
+                let _ = fs::remove_file(path);
+            }
+            replaced
+        });
+        if written.is_err() {
+            Output::new().write(text)?;
+        }
+        written
     }
 
     /// End of a sentence about the result.
@@ -74,31 +79,29 @@ impl Destination {
     }
 }
 
-impl Reserved {
-    /// Replaces the content.
-    ///
-    /// # Errors
-    ///
-    /// The disk is full, or fails.
-    pub(super) fn write(mut self, text: &str) -> Result<()> {
-        let mut write = || {
-            self.file.set_len(0)?;
-            self.file.write_all(text.as_bytes())?;
-            self.file.sync_all()
-        };
-        write().with_context(|| unwritable(&self.path))?;
-        self.is_new = false;
-        Ok(())
+/// Opens the file without changing its content. Returns whether it is new.
+fn open(path: &Path, force: bool) -> Result<(File, bool)> {
+    match File::options().write(true).create_new(true).open(path) {
+        Ok(file) => Ok((file, true)),
+        Err(error) if error.kind() == ErrorKind::AlreadyExists && force => {
+            let file = File::options().write(true).open(path);
+            Ok((file.with_context(|| unwritable(path))?, false))
+        }
+        Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+            let path = path.display();
+            let text = format!("rp: {path} exists; pass --force to replace it");
+            Err(UserError(text).into())
+        }
+        Err(error) => Err(error).with_context(|| unwritable(path)),
     }
 }
 
-impl Drop for Reserved {
-    fn drop(&mut self) {
-        if self.is_new {
-            // An error is reported already; an empty file remains.
-            let _ = fs::remove_file(&self.path);
-        }
+fn replace(mut file: File, text: &str) -> io::Result<()> {
+    // A device has no length.
+    if file.metadata()?.is_file() {
+        file.set_len(0)?;
     }
+    file.write_all(text.as_bytes())
 }
 
 fn unwritable(path: &Path) -> String {
