@@ -158,7 +158,7 @@ pub enum TopicState {
     Silent,
     /// The topic has no publisher.
     NotPublished,
-    /// The topic has no subscriber, and `subscribers` is not violated.
+    /// The topic has no subscriber, and neither `publishers` nor `subscribers` is violated.
     NoSubscriber,
 }
 

@@ -7,8 +7,8 @@
 //!
 //! Numbers of publishers and subscribers are evaluated from `GRACE` after the topic has its first
 //! publisher on, because a robot needs time to start. A writer without a reader mostly sends
-//! nothing. A topic that lacks every expected subscriber therefore violates `subscribers`, but not
-//! `min_rate_hz` and `max_silence_s`.
+//! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
+//! `max_silence_s`, but it may violate `publishers` and `subscribers`.
 
 use std::time::Duration;
 
@@ -51,8 +51,8 @@ pub enum WatchState {
     Silent,
     /// No publisher is known.
     NotPublished,
-    /// A publisher exists, but no subscriber, and `subscribers` is not violated; most writers then
-    /// send nothing.
+    /// A publisher exists, but no subscriber; most writers then send nothing. Neither `publishers`
+    /// nor `subscribers` is violated.
     NoSubscriber,
 }
 
@@ -147,7 +147,7 @@ impl Judgement {
         let before = (!self.fresh).then_some(self.state);
         let broken = broken(expectations, evidence);
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
-        let broken = without_consequences(broken, evidence);
+        let broken = without_consequences(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
         if broken & !MAX_SILENCE == 0 {
             (self.bad, self.good) = (0, self.good.saturating_add(1));
@@ -159,10 +159,10 @@ impl Judgement {
         } else if self.good >= GOOD {
             self.violated = false;
         }
-        let lacks_subscribers = self.violated && broken & SUBSCRIBERS != 0;
+        let lacks_endpoints = self.violated && broken & (PUBLISHERS | SUBSCRIBERS) != 0;
         self.state = if evidence.publishers == 0 {
             WatchState::NotPublished
-        } else if evidence.subscriptions == 0 && quiet && !lacks_subscribers {
+        } else if evidence.subscriptions == 0 && quiet && !lacks_endpoints {
             WatchState::NoSubscriber
         } else if silent {
             WatchState::Silent
@@ -237,9 +237,10 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
     broken
 }
 
-/// Removes the violations that follow from the lack of every expected subscriber.
-const fn without_consequences(broken: u8, evidence: &Evidence<'_>) -> u8 {
-    if broken & SUBSCRIBERS != 0 && evidence.subscriptions == 0 {
+/// Removes the violations that follow from the lack of every subscriber.
+const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
+    let is_expected = broken & SUBSCRIBERS != 0;
+    if evidence.subscriptions == 0 && (quiet || is_expected) {
         broken & !(MIN_RATE | MAX_SILENCE)
     } else {
         broken
@@ -440,6 +441,26 @@ mod tests {
         assert_eq!(states[4], WatchState::Silent);
         let violations = silent.judgement.violations();
         assert_eq!(violations, ["min_rate_hz", "max_silence_s", "subscribers"]);
+    }
+
+    #[test]
+    fn too_few_publishers_violate_without_a_subscriber_too() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(8.0),
+            max_silence: Some(Duration::from_secs(1)),
+            publishers: Some(2),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        bench.publishers = 2;
+        for _ in 0..=GRACE {
+            assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        }
+        bench.publishers = 1;
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        let (alone, bad) = (WatchState::NoSubscriber, WatchState::Violated);
+        assert_eq!(states, [alone, bad, bad]);
+        assert_eq!(bench.judgement.violations(), ["publishers"]);
     }
 
     #[test]
