@@ -4,6 +4,8 @@
 //! topic's own seconds violate it, by the agent's evaluation, it widens to the extreme value that
 //! was seen. If that is too wide to find a fault, the expectation is left out, with the reason.
 
+use std::ops::RangeInclusive;
+
 use ros2probe_daemon::config::Expectations;
 use ros2probe_daemon::config::rehearsal::{self, GRACE, Second};
 use ros2probe_daemon::config::watch::ExpectationValues;
@@ -112,6 +114,17 @@ impl<'a> Draft<'a> {
         }
     }
 
+    /// Returns the first candidate within its limits that the topic's own seconds do not violate.
+    fn first(
+        &self,
+        candidates: [f64; 2],
+        limits: RangeInclusive<f64>,
+        expecting: fn(f64) -> ExpectationValues,
+    ) -> Option<f64> {
+        let mut candidates = candidates.into_iter();
+        candidates.find(|it| limits.contains(it) && !self.violates(expecting(*it)))
+    }
+
     fn leave_out(&mut self, keys: &'static str, why: impl Into<String>) {
         self.remarks.push(Remark::LeftOut(keys, why.into()));
     }
@@ -143,43 +156,33 @@ impl<'a> Draft<'a> {
         let Some(rates) = rates else {
             return self.leave_out(KEYS, "no message arrived for most of the time");
         };
-        let Summary { median, .. } = rates;
+        self.band(&rates, window);
+    }
+
+    /// Chooses the lowest and the highest rate.
+    fn band(&mut self, rates: &Summary, window: u64) {
+        let median = rates.median;
         let half = (RATE_MARGIN * median).max(RATE_DEVIATIONS * rates.deviation);
+        let lows = [median - half, rates.minimum * 0.95].map(rounded_down);
+        let highs = [median + half, rates.maximum * 1.05].map(rounded_up);
+        let (lowest, highest) = (RATE_LIMITS.0 * median, RATE_LIMITS.1 * median);
+        let low = self.first(lows, lowest..=f64::INFINITY, |rate| ExpectationValues {
+            min_rate_hz: Some(rate),
+            ..ExpectationValues::default()
+        });
+        let high = self.first(highs, 0.0..=highest, |rate| ExpectationValues {
+            max_rate_hz: Some(rate),
+            ..ExpectationValues::default()
+        });
         let seen = format!(
             "{} to {} Hz in windows of {window} s",
             short(rates.minimum),
             short(rates.maximum)
         );
-        let (low, high) = (RATE_LIMITS.0 * median, RATE_LIMITS.1 * median);
-        let lows = [median - half, rates.minimum * 0.95].map(rounded_down);
-        let low = lows.into_iter().find(|rate| {
-            let values = ExpectationValues {
-                min_rate_hz: Some(*rate),
-                ..ExpectationValues::default()
-            };
-            *rate >= low && !self.violates(values)
-        });
-        let highs = [median + half, rates.maximum * 1.05].map(rounded_up);
-        let high = highs.into_iter().find(|rate| {
-            let values = ExpectationValues {
-                max_rate_hz: Some(*rate),
-                ..ExpectationValues::default()
-            };
-            *rate <= high && !self.violates(values)
-        });
-        let median = format!("median {} Hz, {seen}", short(median));
-        self.set(
-            "min_rate_hz",
-            low,
-            median,
-            &format!("the rate varies: {seen}"),
-        );
-        self.set(
-            "max_rate_hz",
-            high,
-            String::new(),
-            &format!("the rate varies: {seen}"),
-        );
+        let varies = format!("the rate varies: {seen}");
+        let seen = format!("median {} Hz, {seen}", short(median));
+        self.set("min_rate_hz", low, seen, &varies);
+        self.set("max_rate_hz", high, String::new(), &varies);
         (self.values.min_rate_hz, self.values.max_rate_hz) = (low, high);
     }
 
@@ -220,12 +223,9 @@ impl<'a> Draft<'a> {
         let base = LEAST_LOSS.max(1.5 / sent.median);
         let candidates = [3.0 * ratios.p95, 1.5 * ratios.maximum];
         let candidates = candidates.map(|ratio| rounded_up(ratio.max(base)));
-        let ratio = candidates.into_iter().find(|ratio| {
-            let values = ExpectationValues {
-                max_loss_ratio: Some(*ratio),
-                ..ExpectationValues::default()
-            };
-            *ratio <= MOST_LOSS && !self.violates(values)
+        let ratio = self.first(candidates, 0.0..=MOST_LOSS, |ratio| ExpectationValues {
+            max_loss_ratio: Some(ratio),
+            ..ExpectationValues::default()
         });
         let seen = format!(
             "{lost} of {} messages lost, at most {} % in 10 s",
@@ -270,17 +270,12 @@ impl<'a> Draft<'a> {
             (means.median + margin).max(2.0 * means.p95),
             1.5 * means.maximum,
         ];
-        let most = 10.0 * means.median + 10.0 * LATENCY_MARGIN;
-        let latency = candidates
-            .map(|it| rounded_up(it * 1e3))
-            .into_iter()
-            .find(|latency| {
-                let values = ExpectationValues {
-                    max_latency_ms: Some(*latency),
-                    ..ExpectationValues::default()
-                };
-                *latency <= most * 1e3 && !self.violates(values)
-            });
+        let candidates = candidates.map(|latency| rounded_up(latency * 1e3));
+        let most = 1e3 * (10.0 * means.median + 10.0 * LATENCY_MARGIN);
+        let latency = self.first(candidates, 0.0..=most, |latency| ExpectationValues {
+            max_latency_ms: Some(latency),
+            ..ExpectationValues::default()
+        });
         let seen = format!(
             "one-second means: median {} ms, 95 % below {}, at most {}",
             short(means.median * 1e3),
