@@ -9,4 +9,5 @@
 
 mod echo;
 mod installed;
+mod learn;
 mod robot;
