@@ -87,6 +87,14 @@ pub struct Expectations {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_silence_s: Option<f64>,
+    /// Smallest number of publishers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub publishers: Option<u32>,
+    /// Smallest number of subscribers.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub subscribers: Option<u32>,
 }
 
 /// Origin of a watch.
@@ -150,7 +158,7 @@ pub enum TopicState {
     Silent,
     /// The topic has no publisher.
     NotPublished,
-    /// The topic has no subscriber.
+    /// The topic has no subscriber, and neither `publishers` nor `subscribers` is violated.
     NoSubscriber,
 }
 
@@ -185,4 +193,10 @@ pub struct WatchRequest {
     /// Longest time without a message, in seconds.
     #[cfg_attr(feature = "openapi", schema(minimum = 0.001, maximum = 604_800))]
     pub max_silence_s: Option<f64>,
+    /// Smallest number of publishers, from 10 s after the first one on.
+    #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10_000))]
+    pub publishers: Option<u32>,
+    /// Smallest number of subscribers, from 10 s after the first publisher on.
+    #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10_000))]
+    pub subscribers: Option<u32>,
 }

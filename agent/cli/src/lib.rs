@@ -2,6 +2,7 @@
 //!
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
+//! - [`learn`] chooses expectations from what a healthy robot does.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).
@@ -16,5 +17,6 @@
 
 pub mod client;
 pub mod doctor;
+pub mod learn;
 pub mod ros2;
 pub mod top;

@@ -52,6 +52,8 @@ pub enum Pace {
     ToEnd,
     /// It pauses until [`ReplayAgent::resume`].
     Pause,
+    /// It pauses until [`ReplayAgent::advance`], which names the next pause. It reports no progress.
+    Steps,
     /// It continues at this speed.
     Live(Speed),
 }
@@ -161,6 +163,15 @@ impl ReplayAgent {
         }
     }
 
+    /// Replays to this time after a pause of [`Pace::Steps`], and pauses again. Returns `false` if
+    /// the replay has ended.
+    pub async fn advance(&self, to: CaptureTime) -> bool {
+        match &self.control {
+            Some(control) => control.advance(to).await,
+            None => false,
+        }
+    }
+
     /// Path of the capture.
     #[must_use]
     pub fn capture(&self) -> &Path {
@@ -186,7 +197,7 @@ fn open(
     };
     let speed = match options.pace {
         Pace::Live(speed) => speed,
-        Pace::ToEnd | Pace::Pause => Speed::Max,
+        Pace::ToEnd | Pace::Pause | Pace::Steps => Speed::Max,
     };
     let replay = Replay::open(capture, speed, limits).map_err(ReplayError::Capture)?;
     let replay = replay.until(options.until);
@@ -196,6 +207,10 @@ fn open(
         Pace::Pause => {
             let (pause, control) = pause_at(options.from);
             (replay.pausing_at(pause), Some(control))
+        }
+        Pace::Steps => {
+            let (pause, control) = pause_at(options.from);
+            (replay.quiet().pausing_at(pause), Some(control))
         }
     })
 }

@@ -4,6 +4,13 @@
 //! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
 //! window of at least three expected messages (1 to 10 s). One message of tolerance at the window's
 //! edges keeps a healthy periodic topic stable. Silence has its own time and no hysteresis.
+//!
+//! Numbers of publishers and subscribers are evaluated from `GRACE` after the topic has its first
+//! publisher on, because a robot needs time to start. A writer without a reader mostly sends
+//! nothing. A quiet topic without a subscriber therefore violates neither `min_rate_hz` nor
+//! `max_silence_s`, but it may violate `publishers` and `subscribers`.
+
+use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 
@@ -14,18 +21,24 @@ use crate::watch::Expectations;
 const BAD: u8 = 2;
 /// Good evaluations in a row until it recovers.
 const GOOD: u8 = 3;
-const NAMES: [&str; 5] = [
+/// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
+pub const GRACE: u64 = 10;
+const NAMES: [&str; 7] = [
     "min_rate_hz",
     "max_rate_hz",
     "max_loss_ratio",
     "max_latency_ms",
     "max_silence_s",
+    "publishers",
+    "subscribers",
 ];
 const MIN_RATE: u8 = 1 << 0;
 const MAX_RATE: u8 = 1 << 1;
 const MAX_LOSS: u8 = 1 << 2;
 const MAX_LATENCY: u8 = 1 << 3;
 const MAX_SILENCE: u8 = 1 << 4;
+const PUBLISHERS: u8 = 1 << 5;
+const SUBSCRIBERS: u8 = 1 << 6;
 
 /// State of one watchlist entry's expectations on one topic.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -38,7 +51,8 @@ pub enum WatchState {
     Silent,
     /// No publisher is known.
     NotPublished,
-    /// A publisher exists, but no subscriber; most writers then send nothing.
+    /// A publisher exists, but no subscriber; most writers then send nothing. Neither `publishers`
+    /// nor `subscribers` is violated.
     NoSubscriber,
 }
 
@@ -132,6 +146,8 @@ impl Judgement {
     ) -> Option<Option<WatchState>> {
         let before = (!self.fresh).then_some(self.state);
         let broken = broken(expectations, evidence);
+        let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
+        let broken = without_consequences(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
         if broken & !MAX_SILENCE == 0 {
             (self.bad, self.good) = (0, self.good.saturating_add(1));
@@ -143,10 +159,10 @@ impl Judgement {
         } else if self.good >= GOOD {
             self.violated = false;
         }
-        let quiet = silent || evidence.last_message.is_none();
+        let lacks_endpoints = self.violated && broken & (PUBLISHERS | SUBSCRIBERS) != 0;
         self.state = if evidence.publishers == 0 {
             WatchState::NotPublished
-        } else if evidence.subscriptions == 0 && quiet {
+        } else if evidence.subscriptions == 0 && quiet && !lacks_endpoints {
             WatchState::NoSubscriber
         } else if silent {
             WatchState::Silent
@@ -207,11 +223,33 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
             broken |= MAX_SILENCE;
         }
     }
+    if evidence.now - evidence.since >= Duration::from_secs(GRACE) {
+        let lacks = |expected: Option<u32>, there: usize| {
+            expected.is_some_and(|expected| there < usize::try_from(expected).unwrap_or(usize::MAX))
+        };
+        if lacks(expectations.publishers, evidence.publishers) {
+            broken |= PUBLISHERS;
+        }
+        if lacks(expectations.subscribers, evidence.subscriptions) {
+            broken |= SUBSCRIBERS;
+        }
+    }
     broken
 }
 
-/// Returns the number of whole seconds in which three messages at this rate are due.
-fn window(rate: f64) -> u64 {
+/// Removes the violations that follow from the lack of every subscriber.
+const fn without_consequences(broken: u8, quiet: bool, evidence: &Evidence<'_>) -> u8 {
+    let is_expected = broken & SUBSCRIBERS != 0;
+    if evidence.subscriptions == 0 && (quiet || is_expected) {
+        broken & !(MIN_RATE | MAX_SILENCE)
+    } else {
+        broken
+    }
+}
+
+/// Returns the number of whole seconds in which three messages at this rate are due, from 1 to 10.
+#[must_use]
+pub fn window(rate: f64) -> u64 {
     let seconds = (3.0 / rate.max(0.01)).ceil();
     (1..SECONDS)
         .find(|window| seconds <= f64::from(u32::try_from(*window).unwrap_or(1)))
@@ -220,8 +258,6 @@ fn window(rate: f64) -> u64 {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
     use ros2probe_wire::time::SECOND;
 
@@ -356,5 +392,87 @@ mod tests {
         bench.publishers = 0;
         assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
         assert!(bench.judgement.violations().is_empty());
+    }
+
+    /// Returns a bench after its grace, with ten messages each second.
+    fn counted(publishers: Option<u32>, subscribers: Option<u32>) -> Bench {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(8.0),
+            max_silence: Some(Duration::from_secs(1)),
+            publishers,
+            subscribers,
+            ..Expectations::default()
+        });
+        bench.publishers = publishers.map_or(1, |count| count as usize);
+        bench.subscriptions = subscribers.map_or(1, |count| count as usize);
+        for _ in 0..GRACE {
+            assert_eq!(bench.second(rate(10)), WatchState::Ok);
+        }
+        bench
+    }
+
+    #[test]
+    fn too_few_publishers_violate_after_two_seconds() {
+        let mut bench = counted(Some(2), None);
+        bench.publishers = 1;
+        let states = [(); 2].map(|()| bench.second(rate(10)));
+        assert_eq!(states, [WatchState::Ok, WatchState::Violated]);
+        assert_eq!(bench.judgement.violations(), ["publishers"]);
+        bench.publishers = 3;
+        let states = [(); 3].map(|()| bench.second(rate(10)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [bad, bad, ok]);
+        bench.publishers = 0;
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert_eq!(bench.second(rate(0)), WatchState::NotPublished);
+        assert!(bench.judgement.violations().is_empty());
+    }
+
+    #[test]
+    fn a_missing_subscriber_is_the_only_violation_of_a_writer_that_stops_for_it() {
+        let mut bench = counted(None, Some(1));
+        bench.subscriptions = 0;
+        let states = [(); 5].map(|()| bench.second(rate(0)));
+        assert_eq!(states[1..], [WatchState::Violated; 4]);
+        assert_eq!(bench.judgement.violations(), ["subscribers"]);
+        let silent = &mut counted(None, Some(2));
+        silent.subscriptions = 1;
+        let states = [(); 5].map(|()| silent.second(rate(0)));
+        assert_eq!(states[4], WatchState::Silent);
+        let violations = silent.judgement.violations();
+        assert_eq!(violations, ["min_rate_hz", "max_silence_s", "subscribers"]);
+    }
+
+    #[test]
+    fn too_few_publishers_violate_without_a_subscriber_too() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(8.0),
+            max_silence: Some(Duration::from_secs(1)),
+            publishers: Some(2),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        bench.publishers = 2;
+        for _ in 0..=GRACE {
+            assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        }
+        bench.publishers = 1;
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        let (alone, bad) = (WatchState::NoSubscriber, WatchState::Violated);
+        assert_eq!(states, [alone, bad, bad]);
+        assert_eq!(bench.judgement.violations(), ["publishers"]);
+    }
+
+    #[test]
+    fn a_robot_has_time_to_start_its_subscribers() {
+        let mut bench = Bench::new(Expectations {
+            subscribers: Some(1),
+            ..Expectations::default()
+        });
+        bench.subscriptions = 0;
+        for _ in 0..GRACE {
+            assert_eq!(bench.second(rate(0)), WatchState::NoSubscriber);
+        }
+        assert_eq!(bench.second(rate(0)), WatchState::Violated);
     }
 }

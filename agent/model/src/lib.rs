@@ -56,6 +56,7 @@ pub mod profiler;
 pub mod rate;
 pub mod receivers;
 pub mod reception;
+pub mod rehearsal;
 pub mod route;
 pub mod routes;
 pub mod sampled;

@@ -52,6 +52,10 @@ pub struct Expectations {
     pub max_latency: Option<Duration>,
     /// Longest time without a message.
     pub max_silence: Option<Duration>,
+    /// Smallest number of publishers.
+    pub publishers: Option<u32>,
+    /// Smallest number of subscribers.
+    pub subscribers: Option<u32>,
 }
 
 /// Expectations in the units of the configuration and of the API.
@@ -67,6 +71,10 @@ pub struct ExpectationValues {
     pub max_latency_ms: Option<f64>,
     /// Longest time without a message, in seconds.
     pub max_silence_s: Option<f64>,
+    /// Smallest number of publishers.
+    pub publishers: Option<u32>,
+    /// Smallest number of subscribers.
+    pub subscribers: Option<u32>,
 }
 
 /// Why a topic name or glob cannot match any topic.
@@ -139,13 +147,15 @@ impl Watch {
 impl Expectations {
     /// Returns each key and whether it is set.
     #[must_use]
-    pub const fn keys(&self) -> [(&'static str, bool); 5] {
+    pub const fn keys(&self) -> [(&'static str, bool); 7] {
         [
             ("min_rate_hz", self.min_rate_hz.is_some()),
             ("max_rate_hz", self.max_rate_hz.is_some()),
             ("max_loss_ratio", self.max_loss_ratio.is_some()),
             ("max_latency_ms", self.max_latency.is_some()),
             ("max_silence_s", self.max_silence.is_some()),
+            ("publishers", self.publishers.is_some()),
+            ("subscribers", self.subscribers.is_some()),
         ]
     }
 
@@ -163,6 +173,8 @@ impl Expectations {
             max_loss_ratio: self.max_loss_ratio,
             max_latency_ms: self.max_latency.map(|latency| nanoseconds(latency) / 1e6),
             max_silence_s: self.max_silence.map(|silence| nanoseconds(silence) / 1e9),
+            publishers: self.publishers,
+            subscribers: self.subscribers,
         }
     }
 }
@@ -178,6 +190,8 @@ impl TryFrom<ExpectationValues> for Expectations {
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
+            publishers,
+            subscribers,
         } = values;
         let values = [
             min_rate_hz,
@@ -185,6 +199,8 @@ impl TryFrom<ExpectationValues> for Expectations {
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
+            publishers.map(f64::from),
+            subscribers.map(f64::from),
         ];
         for ((key, low, high), value) in RANGES.into_iter().zip(values) {
             if let Some(value) = value.filter(|value| !(low..=high).contains(value)) {
@@ -206,6 +222,8 @@ impl TryFrom<ExpectationValues> for Expectations {
             max_loss_ratio,
             max_latency: max_latency_ms.map(|value| Duration::from_secs_f64(value / 1e3)),
             max_silence: max_silence_s.map(Duration::from_secs_f64),
+            publishers,
+            subscribers,
         })
     }
 }
@@ -218,12 +236,14 @@ pub const MAX_GLOBS: usize = 256;
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
 /// Valid ranges of expectations, as in the configuration's schema.
-const RANGES: [(&str, f64, f64); 5] = [
+const RANGES: [(&str, f64, f64); 7] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
     ("max_rate_hz", 0.0, 1_000_000.0),
     ("max_loss_ratio", 0.0, 1.0),
     ("max_latency_ms", 0.0, 3_600_000.0),
     ("max_silence_s", 0.001, 604_800.0),
+    ("publishers", 1.0, 10_000.0),
+    ("subscribers", 1.0, 10_000.0),
 ];
 
 /// Validates a share of messages for tracing.

@@ -2,6 +2,8 @@
 //! verb and distribution, and differs from that of a process ended by a signal.
 
 use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use tokio::signal::unix::{SignalKind, signal};
 
@@ -28,4 +30,38 @@ pub(crate) fn listen(code: u8) -> io::Result<()> {
     };
     let thread = std::thread::Builder::new().name("interrupt".to_owned());
     thread.spawn(wait).map(drop)
+}
+
+/// Returns a flag that the first Ctrl-C or SIGTERM sets. The second one ends the process.
+///
+/// # Errors
+///
+/// The signal handlers cannot be installed.
+pub(crate) fn flag() -> io::Result<Arc<AtomicBool>> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_io()
+        .build()?;
+    let (mut interrupts, mut ends) = {
+        let _entered = runtime.enter();
+        (
+            signal(SignalKind::interrupt())?,
+            signal(SignalKind::terminate())?,
+        )
+    };
+    let flag = Arc::new(AtomicBool::new(false));
+    let is_set = Arc::clone(&flag);
+    let wait = async move {
+        loop {
+            tokio::select! {
+                _ = interrupts.recv() => {}
+                _ = ends.recv() => {}
+            }
+            if is_set.swap(true, Ordering::Relaxed) {
+                std::process::exit(INTERRUPTED.into());
+            }
+        }
+    };
+    let thread = std::thread::Builder::new().name("interrupt".to_owned());
+    thread.spawn(move || runtime.block_on(wait))?;
+    Ok(flag)
 }

@@ -11,6 +11,7 @@ mod events;
 mod follow;
 mod foxglove;
 mod interrupt;
+mod learn;
 mod node;
 mod notes;
 mod output;
@@ -83,6 +84,8 @@ pub(crate) enum Question {
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
     Top(top::Top),
+    /// Write a watchlist with the expectations that a healthy robot meets
+    Learn(learn::Learn),
     /// Print the address of the page that shows the robot in a browser
     Page(page::Page),
     /// Print the address that Foxglove, Lichtblick and PlotJuggler open, with a token
@@ -103,6 +106,7 @@ impl Question {
             Self::Action(action) => action.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
+            Self::Learn(learn) => learn.ask(),
             Self::Page(page) => page.ask(),
             Self::Foxglove(foxglove) => foxglove.ask(),
         }
@@ -119,8 +123,8 @@ impl Question {
             | Self::Doctor(_)
             | Self::Page(_)
             | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
-            // `top` restores the terminal first.
-            Self::Top(_) => None,
+            // `top` restores the terminal first, and `learn` writes what it has learnt.
+            Self::Top(_) | Self::Learn(_) => None,
         }
     }
 }

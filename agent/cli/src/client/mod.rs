@@ -30,6 +30,7 @@ use ros2probe_api::problem::Code;
 use ros2probe_daemon::agent::Speed;
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::replay_agent::Pace;
+use ros2probe_daemon::run::CaptureTime;
 
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
@@ -93,6 +94,22 @@ impl Agent {
     /// As [`Self::reach`].
     pub fn reach_stream_measured(target: &Target) -> Result<Self, ClientError> {
         Self::find(target, Pace::Pause, true)
+    }
+
+    /// As [`Self::reach_stream_measured`], but the replay continues with [`Self::advance`].
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::reach`].
+    pub fn reach_steps(target: &Target) -> Result<Self, ClientError> {
+        Self::find(target, Pace::Steps, true)
+    }
+
+    /// Replays a capture of [`Self::reach_steps`] to this time. Returns `false` if the replay has
+    /// ended, and for a live agent.
+    #[must_use]
+    pub fn advance(&self, to: CaptureTime) -> bool {
+        self.runtime.block_on(self.transport.advance(to))
     }
 
     fn find(target: &Target, pace: Pace, measured: bool) -> Result<Self, ClientError> {

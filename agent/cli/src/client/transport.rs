@@ -20,6 +20,7 @@ use tokio::time::timeout;
 
 use super::{ClientError, Target};
 use ros2probe_daemon::replay_agent::{Outcome, Pace, ReplayAgent, ReplayError, ReplayOptions};
+use ros2probe_daemon::run::CaptureTime;
 
 /// The agent's socket, as created by the package and the service manager.
 const SOCKET: &str = "/run/ros2probe/api.sock";
@@ -123,6 +124,15 @@ impl Transport {
     pub(super) fn resume(&self) {
         if let Self::ReplayAgent(replayed) = self {
             replayed.resume();
+        }
+    }
+
+    /// Replays to this time and pauses again. Returns `false` if the replay has ended, and for other
+    /// transports.
+    pub(super) async fn advance(&self, to: CaptureTime) -> bool {
+        match self {
+            Self::ReplayAgent(replayed) => replayed.advance(to).await,
+            Self::Socket(_) | Self::Address(_) => false,
         }
     }
 

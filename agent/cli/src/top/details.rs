@@ -90,6 +90,12 @@ fn expectation(watch: &Watching<'_>) -> Styled {
     for (what, most) in most {
         expected.extend(most.map(|most| format!("{what} at most {most}")));
     }
+    for (what, least) in [
+        ("publishers", expectations.publishers),
+        ("subscribers", expectations.subscribers),
+    ] {
+        expected.extend(least.map(|least| format!("{what} at least {least}")));
+    }
     if expected.is_empty() {
         expected.push("no expectations".to_owned());
     }

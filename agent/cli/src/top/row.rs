@@ -292,6 +292,8 @@ fn problems(topic: &Topic<'_>, standing: Standing, is_losing: bool) -> Vec<&'sta
             "max_loss_ratio" => "loss",
             "max_latency_ms" => "late",
             "max_silence_s" => "silent",
+            "publishers" => "few pub",
+            "subscribers" => "few sub",
             _ => "violated",
         });
     }
@@ -442,6 +444,8 @@ mod tests {
         assert_eq!(state(json!([]), json!([])), "ok");
         let slow = json!([{"state": "violated", "violations": ["min_rate_hz", "max_latency_ms"]}]);
         assert_eq!(state(slow, json!([])), "!slow,late");
+        let few = json!([{"state": "violated", "violations": ["publishers", "subscribers"]}]);
+        assert_eq!(state(few, json!([])), "!few pub,few sub");
         let qos = json!([{"kind": "qos_incompatible"}, {"kind": "unheard_publisher"}]);
         assert_eq!(state(json!([{"state": "ok"}]), qos), "!qos");
         assert_eq!(state(json!([{"state": "silent"}]), json!([])), "!silent");

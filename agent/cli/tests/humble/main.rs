@@ -10,4 +10,5 @@
 mod echo;
 mod incident;
 mod installed;
+mod learn;
 mod robot;

@@ -49,11 +49,13 @@ const RIGHTLY_EMPTY: [(&str, &str); 12] = [
 ];
 
 /// Alerts whose condition holds here. The others are about agents and links that fail.
-const TRUE_ALERTS: [&str; 6] = [
+const TRUE_ALERTS: [&str; 8] = [
     "Ros2TopicSilent",
     "Ros2TopicNotPublished",
     "Ros2TopicRateBelowContract",
     "Ros2TopicRateAboveContract",
+    "Ros2TopicPublishersBelowContract",
+    "Ros2TopicSubscribersBelowContract",
     "Ros2TopicLatencyAboveContract",
     "Ros2QosIncompatible",
 ];
@@ -261,7 +263,7 @@ fn start<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
     let text = format!(
         "watch:\n\
          - {{topic: /**, per_subscriber: true}}\n\
-         - {{topic: /imu, min_rate_hz: 1000}}\n\
+         - {{topic: /imu, min_rate_hz: 1000, publishers: 9, subscribers: 9}}\n\
          - {{topic: /scan, max_rate_hz: 1, max_latency_ms: 0.001}}\n\
          - {{topic: /quiet, max_silence_s: 1}}\n\
          - {{topic: /camera, max_silence_s: 1}}\n\

@@ -25,6 +25,7 @@ mod foxglove;
 mod host;
 mod hostile;
 mod late_start;
+mod learn;
 mod links;
 mod otlp;
 mod page;

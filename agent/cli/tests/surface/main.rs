@@ -24,6 +24,7 @@ mod events;
 mod foxglove;
 mod fuzz_seeds;
 mod http;
+mod learn;
 mod limits;
 mod metrics;
 mod otlp;

@@ -23,6 +23,9 @@ const RENAMED: &[(&str, &str)] = &[
     ("max_loss", "max_loss_ratio"),
     ("max_delay_ms", "max_latency_ms"),
     ("timeout_s", "max_silence_s"),
+    ("min_publishers", "publishers"),
+    ("min_subscribers", "subscribers"),
+    ("subscriptions", "subscribers"),
     ("address", "listen"),
     ("port", "listen"),
 ];

@@ -242,6 +242,8 @@ impl Reader {
             max_loss_ratio: entry.max_loss_ratio,
             max_latency_ms: entry.max_latency_ms,
             max_silence_s: entry.max_silence_s,
+            publishers: entry.publishers,
+            subscribers: entry.subscribers,
         };
         Watch {
             pattern: entry.topic,

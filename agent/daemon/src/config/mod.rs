@@ -27,7 +27,9 @@ pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, ShmMode, ShmSettings, SourceChoice,
 };
+pub use ros2probe_model::glob;
 pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
+pub use ros2probe_model::rehearsal;
 pub use ros2probe_model::watch::{
     self, Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs,
     check_pattern,

@@ -103,6 +103,12 @@ pub(super) struct WatchEntryShape {
     /// Maximum time without a message, in seconds.
     #[schemars(range(min = 0.001, max = 604_800.0))]
     pub(super) max_silence_s: Option<f64>,
+    /// Minimum number of publishers, from 10 s after the first one on.
+    #[schemars(range(min = 1, max = 10_000))]
+    pub(super) publishers: Option<u32>,
+    /// Minimum number of subscribers, from 10 s after the first publisher on.
+    #[schemars(range(min = 1, max = 10_000))]
+    pub(super) subscribers: Option<u32>,
 }
 
 /// Messages of a topic kept for recordings that start later.

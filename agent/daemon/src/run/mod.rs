@@ -182,7 +182,8 @@ impl Run {
                 self.confirm_wishes();
             }
             let age = published.elapsed();
-            let due = age >= PUBLISH || (age >= PUBLISH_ASKED && self.outputs.latest.is_asked());
+            let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
+            let due = age >= PUBLISH || (!is_current && self.outputs.latest.is_asked());
             let held = self.source.reached_pause();
             if finished || held || polled.is_err() || due {
                 self.publish();

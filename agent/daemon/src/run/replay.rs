@@ -29,13 +29,14 @@ const PAUSE_POLL: Duration = Duration::from_millis(5);
 #[must_use]
 pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
     let (resume, resumed) = mpsc::channel();
-    let (pausing, paused) = watch::channel(false);
+    let (reports, reached) = watch::channel(0);
     let pause = PausePoint {
         at,
         resumed,
-        pausing,
+        is_reported: false,
+        reports,
     };
-    (pause, ReplayControl { resume, paused })
+    (pause, ReplayControl { resume, reached })
 }
 
 /// Point at which a replay pauses.
@@ -43,26 +44,40 @@ pub fn pause_at(at: Option<CaptureTime>) -> (PausePoint, ReplayControl) {
 pub struct PausePoint {
     /// Time of the pause. `None` means the beginning.
     at: Option<CaptureTime>,
-    resumed: mpsc::Receiver<()>,
-    pausing: watch::Sender<bool>,
+    /// Receives the time of the next pause; `None` resumes for the rest of the capture.
+    resumed: mpsc::Receiver<Option<CaptureTime>>,
+    is_reported: bool,
+    /// Number of pauses so far.
+    reports: watch::Sender<u64>,
 }
 
-/// Waits for the pause of a replay, and ends it.
+/// Waits for the pauses of a replay, and ends them.
 #[derive(Debug)]
 pub struct ReplayControl {
-    resume: mpsc::Sender<()>,
-    paused: watch::Receiver<bool>,
+    resume: mpsc::Sender<Option<CaptureTime>>,
+    reached: watch::Receiver<u64>,
 }
 
 impl ReplayControl {
     /// Returns when the replay pauses, or has ended earlier.
     pub async fn paused(&mut self) {
-        let _ = self.paused.wait_for(|pausing| *pausing).await;
+        let _ = self.reached.wait_for(|pauses| *pauses > 0).await;
     }
 
     /// Resumes the replay.
     pub fn resume(&self) {
-        let _ = self.resume.send(());
+        let _ = self.resume.send(None);
+    }
+
+    /// Resumes a paused replay and waits for its pause at this time. Returns `false` if the replay
+    /// has ended.
+    pub async fn advance(&self, to: CaptureTime) -> bool {
+        let mut reached = self.reached.clone();
+        let before = *reached.borrow();
+        if self.resume.send(Some(to)).is_err() {
+            return false;
+        }
+        reached.wait_for(|pauses| *pauses > before).await.is_ok()
     }
 }
 
@@ -296,15 +311,22 @@ impl Replay {
 
     /// Waits briefly for the end of the pause. New requests are handled before the next packets.
     fn wait(&mut self) {
-        let Some(pause) = &self.pause else { return };
-        let begins = pause
-            .at
-            .map(|moment| moment.in_capture(self.began.unwrap_or_default()));
-        self.clock = self.clock.max(begins.unwrap_or_default());
-        if *pause.pausing.borrow()
-            && pause.resumed.recv_timeout(PAUSE_POLL) != Err(RecvTimeoutError::Timeout)
-        {
-            self.pause = None;
+        let Some(pause) = &mut self.pause else { return };
+        if pause.is_reported {
+            match pause.resumed.recv_timeout(PAUSE_POLL) {
+                Ok(Some(next)) => (pause.at, pause.is_reported) = (Some(next), false),
+                Ok(None) | Err(RecvTimeoutError::Disconnected) => {
+                    self.pause = None;
+                    return;
+                }
+                Err(RecvTimeoutError::Timeout) => return,
+            }
+        }
+        let beginning = self.began.unwrap_or_default();
+        let time = self.waiting.as_ref().map(|waiting| waiting.time);
+        if time.is_some_and(|time| pause.at_or_behind(time, beginning)) {
+            let begins = pause.at.map(|moment| moment.in_capture(beginning));
+            self.clock = self.clock.max(begins.unwrap_or_default());
         }
     }
 
@@ -313,15 +335,21 @@ impl Replay {
     pub fn reached_pause(&self) -> bool {
         let time = self.waiting.as_ref().map(|waiting| waiting.time);
         let beginning = self.began.unwrap_or_default();
-        time.zip(self.pause.as_ref()).is_some_and(|(time, pause)| {
-            pause.at_or_behind(time, beginning) && !*pause.pausing.borrow()
-        })
+        time.zip(self.pause.as_ref())
+            .is_some_and(|(time, pause)| pause.at_or_behind(time, beginning) && !pause.is_reported)
+    }
+
+    /// Returns whether the replay is paused and its waiter knows it.
+    #[must_use]
+    pub fn is_paused(&self) -> bool {
+        self.pause.as_ref().is_some_and(|pause| pause.is_reported)
     }
 
     /// Reports the pause to its waiter.
     pub fn report_pause(&mut self) {
-        if let Some(pause) = &self.pause {
-            pause.pausing.send_replace(true);
+        if let Some(pause) = &mut self.pause {
+            pause.is_reported = true;
+            pause.reports.send_modify(|pauses| *pauses += 1);
         }
     }
 

@@ -131,6 +131,14 @@ impl Source {
         }
     }
 
+    /// Returns whether a replay is paused. Its state is current at no cost.
+    pub(super) fn is_paused(&self) -> bool {
+        match self {
+            Self::Live(_) => false,
+            Self::Replay(replay) => replay.is_paused(),
+        }
+    }
+
     /// Reports the pause after the publication.
     pub(super) fn report_pause(&mut self) {
         if let Self::Replay(replay) = self {

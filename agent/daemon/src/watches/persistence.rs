@@ -71,6 +71,10 @@ struct Line {
     max_loss_ratio: Option<f64>,
     max_latency_ms: Option<f64>,
     max_silence_s: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    publishers: Option<u32>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    subscribers: Option<u32>,
 }
 
 /// The writing thread.
@@ -142,6 +146,8 @@ impl TryFrom<Line> for Watch {
             max_loss_ratio: line.max_loss_ratio,
             max_latency_ms: line.max_latency_ms,
             max_silence_s: line.max_silence_s,
+            publishers: line.publishers,
+            subscribers: line.subscribers,
         };
         let expectations = Expectations::try_from(values)?;
         check_trace(line.trace)?;
@@ -164,6 +170,8 @@ impl From<&Watch> for Line {
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
+            publishers,
+            subscribers,
         } = watch.expectations.values();
         Self {
             topic: watch.pattern.clone(),
@@ -176,6 +184,8 @@ impl From<&Watch> for Line {
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
+            publishers,
+            subscribers,
         }
     }
 }
@@ -289,6 +299,7 @@ mod tests {
             expectations: Expectations {
                 min_rate_hz: Some(9.5),
                 max_silence: Some(Duration::from_secs(1)),
+                subscribers: Some(2),
                 ..Expectations::default()
             },
             ..Watch::named("/points").unwrap()
@@ -383,11 +394,12 @@ mod tests {
                 "max_latency_ms":null,"max_silence_s":1.0}]}"#,
         )
         .unwrap();
-        let first = Watch {
+        let mut first = Watch {
             trace: 0.0,
             retain: Retain::None,
             ..watches().remove(0)
         };
+        first.expectations.subscribers = None;
         assert_eq!(load(&directory), LoadedWatches::These(vec![first]));
     }
 

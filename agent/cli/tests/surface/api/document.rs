@@ -91,6 +91,16 @@ fn assert_expectations_are_documented(document: &Value) {
             *place = value;
         }
     }
+    for (key, place) in [
+        ("publishers", (&mut low.publishers, &mut high.publishers)),
+        ("subscribers", (&mut low.subscribers, &mut high.subscribers)),
+    ] {
+        for (limit, place) in [("minimum", place.0), ("maximum", place.1)] {
+            let value = configured[key][limit].as_u64();
+            assert_eq!(body[key][limit].as_u64(), value, "{key} {limit}");
+            *place = Some(u32::try_from(value.unwrap()).unwrap());
+        }
+    }
     let is_valid = |values| Expectations::try_from(values).is_ok();
     assert!(is_valid(low) && is_valid(high));
     let beyond = |change: fn(&mut ExpectationValues)| {
@@ -104,6 +114,8 @@ fn assert_expectations_are_documented(document: &Value) {
     assert!(beyond(|wrong| wrong.max_latency_ms = Some(3_600_000.1)));
     assert!(beyond(|wrong| wrong.max_silence_s = Some(0.0)));
     assert!(beyond(|wrong| wrong.max_silence_s = Some(f64::NAN)));
+    assert!(beyond(|wrong| wrong.publishers = Some(0)));
+    assert!(beyond(|wrong| wrong.subscribers = Some(10_001)));
     assert!(beyond(
         |wrong| (wrong.min_rate_hz, wrong.max_rate_hz) = (Some(2.0), Some(1.0))
     ));

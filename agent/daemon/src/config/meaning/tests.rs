@@ -300,7 +300,7 @@ fn a_full_file_is_understood() {
 watch:
   - /tf
   - {topic: /points, domain: 5, min_rate_hz: 18, max_rate_hz: 22.5, max_loss_ratio: 0.01,
-     max_latency_ms: 50, max_silence_s: 1, per_subscriber: true, trace: 0.25}
+     max_latency_ms: 50, max_silence_s: 1, publishers: 1, subscribers: 2, per_subscriber: true, trace: 0.25}
 limits: {topics: 5, participants: 6, endpoints: 7, unknown_writers: 8, reassembly_bytes: 65536}
 capture:
   source: wire
@@ -319,6 +319,11 @@ log: debug
         ("/points", Some(DomainId(5)))
     );
     assert_eq!(points.expectations.max_rate_hz, Some(22.5));
+    let counts = (
+        points.expectations.publishers,
+        points.expectations.subscribers,
+    );
+    assert_eq!(counts, (Some(1), Some(2)));
     assert!((points.trace - 0.25).abs() < 1e-9);
     assert!(points.per_subscriber && !config.watches.first().unwrap().per_subscriber);
     assert_eq!(config.capture.source, SourceChoice::Wire);

@@ -234,6 +234,8 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
         max_loss_ratio: settings.max_loss_ratio,
         max_latency_ms: settings.max_latency_ms,
         max_silence_s: settings.max_silence_s,
+        publishers: settings.publishers,
+        subscribers: settings.subscribers,
     };
     let trace = settings.trace;
     let expectations = watch::Expectations::try_from(values);
@@ -363,6 +365,8 @@ pub(super) fn expectations(expectations: &watch::Expectations) -> Expectations {
         max_loss_ratio: values.max_loss_ratio,
         max_latency_ms: values.max_latency_ms,
         max_silence_s: values.max_silence_s,
+        publishers: values.publishers,
+        subscribers: values.subscribers,
     }
 }
 

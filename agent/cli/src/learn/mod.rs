@@ -1,0 +1,221 @@
+//! Learns a watchlist from a healthy robot: what its topics did becomes what is expected of them.
+//!
+//! [`Learner`] takes the agent's view of all topics about once a second, and counts each topic in
+//! whole seconds. [`thresholds`] chooses expectations from them, and drops those that the same
+//! seconds would violate. [`watchlist`] writes the file. Nothing here performs I/O or reads a clock.
+
+mod observation;
+pub mod statistics;
+pub mod thresholds;
+pub mod watchlist;
+
+use std::collections::BTreeMap;
+
+use ros2probe_api::topics::{Topic, TopicList};
+use ros2probe_daemon::config::{Limit, PatternError, check_pattern, glob};
+
+use crate::ros2::name::is_hidden;
+use observation::Observation;
+use thresholds::Lesson;
+
+/// Longest time to learn from, in seconds. Bounds the memory of a topic.
+pub const MAX_SECONDS: u32 = 2 * 3600;
+/// Time between two views, in seconds, below which the later one is skipped.
+const MIN_STEP: f64 = 0.5;
+/// Longest time between two views, in seconds, that is split into seconds.
+const MAX_STEP: f64 = 60.0;
+
+/// Kinds of topics that a watch covers by their ROS name.
+const KINDS: [&str; 4] = ["topic", "action_feedback", "action_status", "service_event"];
+
+/// Names and globs of the topics to learn. Without any, all that `ros2 topic list` shows.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Selection(Vec<String>);
+
+/// Counts of all selected topics.
+#[derive(Debug)]
+pub struct Learner {
+    selection: Selection,
+    topics: BTreeMap<String, Observation>,
+    /// Time of the first and the last view, in Unix seconds.
+    period: Option<(f64, f64)>,
+    /// Whole seconds that were counted.
+    seconds: u32,
+    /// Topics that a watch cannot name, or beyond the limit of watches.
+    unnamed: BTreeMap<String, &'static str>,
+}
+
+/// Result of learning.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Learnt {
+    /// A lesson for each topic, by name.
+    pub lessons: Vec<Lesson>,
+    /// Time of the first and the last view, in Unix seconds.
+    pub period: (f64, f64),
+    /// Number of topics that no watch can name.
+    pub unnamed: usize,
+    /// Number of topics beyond the default limit of watches.
+    pub beyond_limit: usize,
+}
+
+impl Selection {
+    /// Validates names and globs. A relative name is in the root namespace.
+    ///
+    /// # Errors
+    ///
+    /// Returns the first text that is neither a ROS name nor a glob, with the reason.
+    pub fn new(typed: &[String]) -> Result<Self, (String, PatternError)> {
+        let absolute = |text: &String| {
+            let name = match text.starts_with('/') || text.is_empty() {
+                true => text.clone(),
+                false => format!("/{text}"),
+            };
+            match check_pattern(&name) {
+                Ok(()) => Ok(name),
+                Err(error) => Err((text.clone(), error)),
+            }
+        };
+        typed
+            .iter()
+            .map(absolute)
+            .collect::<Result<_, _>>()
+            .map(Self)
+    }
+
+    /// Names and globs.
+    #[must_use]
+    pub fn patterns(&self) -> &[String] {
+        &self.0
+    }
+
+    fn covers(&self, topic: &Topic<'_>) -> bool {
+        if !KINDS.contains(&topic.kind.as_ref()) {
+            return false;
+        }
+        if self.0.iter().any(|pattern| *pattern == topic.name) {
+            return true;
+        }
+        let is_plain = topic.kind == "topic" && !topic.hidden && !is_hidden(&topic.name);
+        let covers = |pattern: &String| glob::covers(pattern, &topic.name);
+        is_plain && (self.0.is_empty() || self.0.iter().any(covers))
+    }
+}
+
+impl Learner {
+    /// Creates a learner that has seen nothing.
+    #[must_use]
+    pub const fn new(selection: Selection) -> Self {
+        Self {
+            selection,
+            topics: BTreeMap::new(),
+            period: None,
+            seconds: 0,
+            unnamed: BTreeMap::new(),
+        }
+    }
+
+    /// Number of topics that were seen.
+    #[must_use]
+    pub fn topics(&self) -> usize {
+        self.topics.len()
+    }
+
+    /// Number of whole seconds that were counted.
+    #[must_use]
+    pub const fn seconds(&self) -> u32 {
+        self.seconds
+    }
+
+    /// Time of the last view, in Unix seconds.
+    #[must_use]
+    pub fn latest(&self) -> Option<f64> {
+        self.period.map(|(_, last)| last)
+    }
+
+    /// Names and globs that cover no topic so far.
+    pub fn unseen(&self) -> impl Iterator<Item = &str> {
+        let names = || self.topics.keys();
+        let is_unseen = move |pattern: &&String| !names().any(|name| glob::covers(pattern, name));
+        self.selection
+            .0
+            .iter()
+            .filter(is_unseen)
+            .map(String::as_str)
+    }
+
+    /// Counts what happened since the last view. Views that follow at once are skipped.
+    pub fn observe(&mut self, list: &TopicList<'_>) {
+        let now = list.timestamp_seconds;
+        let elapsed = self.period.map_or(0.0, |(_, last)| now - last);
+        if self.period.is_some() && elapsed < MIN_STEP {
+            return;
+        }
+        let steps = whole(elapsed.min(MAX_STEP)).min(MAX_SECONDS - self.seconds);
+        for topic in &list.topics {
+            if self.selection.covers(topic)
+                && let Some(observation) = self.observation(&topic.name)
+            {
+                observation.observe(topic, now, elapsed, steps);
+            }
+        }
+        self.seconds += steps;
+        for observation in self.topics.values_mut() {
+            observation.complete(self.seconds);
+        }
+        let first = self.period.map_or(now, |(first, _)| first);
+        self.period = Some((first, now));
+    }
+
+    /// Returns a lesson for each topic. `None` if less than one second was seen.
+    #[must_use]
+    pub fn finish(&self) -> Option<Learnt> {
+        let period = self.period.filter(|_| self.seconds > 0)?;
+        let count = |wanted: &str| self.unnamed.values().filter(|why| **why == wanted).count();
+        let lessons = self.topics.iter();
+        Some(Learnt {
+            lessons: lessons
+                .map(|(name, observation)| thresholds::lesson(name, observation))
+                .collect(),
+            period,
+            unnamed: count(UNNAMED),
+            beyond_limit: count(BEYOND),
+        })
+    }
+
+    /// Returns the counts of a topic. `None` if no watch can name it, or too many are known.
+    fn observation(&mut self, name: &str) -> Option<&mut Observation> {
+        let limit = Limit::Watches.row().default;
+        if !self.topics.contains_key(name) {
+            let why = match (check_pattern(name).is_err(), self.topics.len() >= limit) {
+                (true, _) => Some(UNNAMED),
+                (_, true) => Some(BEYOND),
+                _ => None,
+            };
+            if let Some(why) = why {
+                if self.unnamed.len() < limit {
+                    self.unnamed.insert(name.to_owned(), why);
+                }
+                return None;
+            }
+            let observation = Observation::new(self.seconds);
+            self.topics.insert(name.to_owned(), observation);
+        }
+        self.topics.get_mut(name)
+    }
+}
+
+const UNNAMED: &str = "no watch can name it";
+const BEYOND: &str = "limits.watches";
+
+/// Rounds a time of 0 to 60 s to whole seconds.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "from 0 to 60"
+)]
+fn whole(seconds: f64) -> u32 {
+    seconds.max(0.0).round() as u32
+}
+
+#[cfg(test)]
+mod tests;

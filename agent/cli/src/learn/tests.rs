@@ -1,0 +1,357 @@
+use proptest::prelude::*;
+use ros2probe_api::endpoints::Endpoint;
+use ros2probe_api::measurement::{Distribution, Measurement};
+use ros2probe_daemon::config::Config;
+use ros2probe_daemon::config::rehearsal::{self, Second};
+
+use super::thresholds::Remark;
+use super::watchlist::{Source, text};
+use super::*;
+
+/// A topic in virtual time, with the counters of its messages.
+struct Robot {
+    now: f64,
+    learner: Learner,
+    topics: Vec<Topic<'static>>,
+}
+
+/// What one topic does in a second.
+#[derive(Clone, Copy)]
+struct Activity {
+    messages: u64,
+    lost: u64,
+    latency: f64,
+}
+
+const STEADY: Activity = Activity {
+    messages: 10,
+    lost: 0,
+    latency: 0.001,
+};
+
+impl Robot {
+    fn new(names: &[&str]) -> Self {
+        let topic = |name: &&str| Topic {
+            name: name.to_string().into(),
+            kind: "topic".into(),
+            publishers: vec![Endpoint::default()],
+            subscriptions: vec![Endpoint::default(); 2],
+            measurement: Some(Measurement::default()),
+            ..Topic::default()
+        };
+        let mut robot = Self {
+            now: 1000.0,
+            learner: Learner::new(Selection::default()),
+            topics: names.iter().map(topic).collect(),
+        };
+        robot.view();
+        robot
+    }
+
+    fn view(&mut self) {
+        self.learner.observe(&TopicList {
+            timestamp_seconds: self.now,
+            topics: self.topics.clone(),
+        });
+    }
+
+    /// Lets one second pass, in which the first topic does this.
+    fn second(&mut self, activity: Activity) {
+        self.now += 1.0;
+        let counted = self.topics[0].measurement.as_mut().unwrap();
+        let before = counted.latency.unwrap_or_default();
+        let count = before.count + activity.messages;
+        let sum =
+            before.mean_seconds * before.count as f64 + activity.latency * activity.messages as f64;
+        counted.messages += activity.messages;
+        counted.lost_messages += activity.lost;
+        if count > 0 {
+            counted.latency = Some(Distribution {
+                count,
+                mean_seconds: sum / count as f64,
+                ..Distribution::default()
+            });
+        }
+        if activity.messages > 0 {
+            counted.last_message_timestamp_seconds = Some(self.now - 0.05);
+        }
+        self.view();
+    }
+
+    fn lesson(&self) -> Lesson {
+        self.learner.finish().unwrap().lessons.remove(0)
+    }
+}
+
+fn left_out(lesson: &Lesson, key: &str) -> String {
+    let mut remarks = lesson.remarks.iter();
+    remarks
+        .find_map(|remark| match remark {
+            Remark::LeftOut(keys, why) if keys.contains(key) => Some(why.clone()),
+            _ => None,
+        })
+        .unwrap_or_else(|| panic!("{key} is not left out: {lesson:?}"))
+}
+
+#[test]
+fn a_steady_topic_has_every_expectation() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..60 {
+        robot.second(STEADY);
+    }
+    let values = robot.lesson().values;
+    assert_eq!(
+        (values.min_rate_hz, values.max_rate_hz),
+        (Some(8.0), Some(12.0))
+    );
+    // One of the 100 messages in 10 s may be lost.
+    assert_eq!(values.max_loss_ratio, Some(0.015));
+    assert_eq!(values.max_latency_ms, Some(6.0));
+    assert_eq!(values.max_silence_s, Some(2.0));
+    assert_eq!((values.publishers, values.subscribers), (Some(1), Some(2)));
+}
+
+#[test]
+fn an_outlier_moves_no_threshold_and_a_changing_rate_is_left_out() {
+    let mut robot = Robot::new(&["/imu"]);
+    for second in 0..60 {
+        let is_hiccup = second == 30;
+        robot.second(Activity {
+            messages: if is_hiccup { 3 } else { 10 },
+            latency: if is_hiccup { 0.5 } else { 0.001 },
+            ..STEADY
+        });
+    }
+    let values = robot.lesson().values;
+    assert_eq!(values.min_rate_hz, Some(8.0));
+    assert_eq!(values.max_latency_ms, Some(6.0));
+
+    for second in 0..60 {
+        robot.second(Activity {
+            messages: if second < 30 { 10 } else { 40 },
+            ..STEADY
+        });
+    }
+    let lesson = robot.lesson();
+    assert_eq!(lesson.values.min_rate_hz, Some(8.0));
+    let why = left_out(&lesson, "max_rate_hz");
+    assert!(
+        why.starts_with("the rate varies: 3 to 40 Hz in windows of 1 s"),
+        "{why}"
+    );
+}
+
+#[test]
+fn a_topic_that_pauses_most_of_the_time_has_no_rate() {
+    let mut robot = Robot::new(&["/imu"]);
+    for second in 0..60 {
+        robot.second(Activity {
+            messages: if second < 20 { 10 } else { 0 },
+            ..STEADY
+        });
+    }
+    let lesson = robot.lesson();
+    let why = left_out(&lesson, "min_rate_hz");
+    assert_eq!(why, "no message arrived for most of the time");
+    assert_eq!(lesson.values.min_rate_hz, None);
+}
+
+#[test]
+fn rare_messages_give_a_silence_only_if_they_are_regular() {
+    let mut regular = Robot::new(&["/map"]);
+    for second in 0..200 {
+        regular.second(Activity {
+            messages: u64::from(second % 10 == 0),
+            ..STEADY
+        });
+    }
+    let lesson = regular.lesson();
+    assert!((27.0..31.0).contains(&lesson.values.max_silence_s.unwrap()));
+    assert!(left_out(&lesson, "min_rate_hz").contains("too seldom"));
+
+    let mut irregular = Robot::new(&["/goal"]);
+    for second in 0..200 {
+        irregular.second(Activity {
+            messages: u64::from(second < 12),
+            ..STEADY
+        });
+    }
+    assert!(left_out(&irregular.lesson(), "max_silence_s").contains("too irregular"));
+}
+
+#[test]
+fn what_cannot_be_known_is_explained() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..60 {
+        robot.second(STEADY);
+        let counted = robot.topics[0].measurement.as_mut().unwrap();
+        counted.negative_latency_messages += 1;
+    }
+    assert!(left_out(&robot.lesson(), "max_latency_ms").ends_with("the clocks differ"));
+    robot.topics[0].subscriptions.clear();
+    for _ in 0..90 {
+        robot.second(STEADY);
+    }
+    let lesson = robot.lesson();
+    assert_eq!(
+        left_out(&lesson, "subscribers"),
+        "the number varies: 0 to 2"
+    );
+    let mut silent = Robot::new(&["/imu"]);
+    for _ in 0..5 {
+        silent.second(Activity {
+            messages: 0,
+            ..STEADY
+        });
+    }
+    let lesson = silent.lesson();
+    assert_eq!(left_out(&lesson, "silence"), "no message was seen");
+    assert_eq!(
+        left_out(&lesson, "publishers"),
+        "5 s with a publisher are too few"
+    );
+}
+
+#[test]
+fn globs_select_and_hidden_topics_are_selected_by_name_alone() {
+    let typed = |names: &[&str]| {
+        let names: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
+        Selection::new(&names)
+    };
+    let topic = |name: &'static str| Topic {
+        name: name.into(),
+        kind: "topic".into(),
+        ..Topic::default()
+    };
+    let selection = typed(&["cam/*", "/_hidden"]).unwrap();
+    for (name, is_selected) in [
+        ("/cam/left", true),
+        ("/cam/_left", false),
+        ("/_hidden", true),
+        ("/imu", false),
+    ] {
+        assert_eq!(selection.covers(&topic(name)), is_selected, "{name}");
+    }
+    let (text, error) = typed(&["/imu", "/a b"]).unwrap_err();
+    assert_eq!(
+        (text.as_str(), error),
+        ("/a b", PatternError::Character(' '))
+    );
+}
+
+#[test]
+fn views_too_close_or_too_far_apart_count_whole_seconds() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..30 {
+        robot.second(STEADY);
+        robot.now += 0.1;
+        robot.view();
+        robot.now -= 0.1;
+    }
+    assert_eq!(robot.learner.seconds(), 30);
+    // The agent was busy for three seconds.
+    robot.now += 2.0;
+    robot.second(Activity {
+        messages: 30,
+        ..STEADY
+    });
+    assert_eq!(robot.learner.seconds(), 33);
+    assert_eq!(robot.lesson().values.min_rate_hz, Some(8.0));
+}
+
+#[test]
+fn names_of_topics_cannot_break_the_file() {
+    let mut robot = Robot::new(&["/imu", "/a: b\n- x", "/scan"]);
+    for _ in 0..30 {
+        robot.second(STEADY);
+    }
+    let learnt = robot.learner.finish().unwrap();
+    assert_eq!((learnt.lessons.len(), learnt.unnamed), (2, 1));
+    let source = Source {
+        place: "robot\n- 1",
+        domain_id: 3,
+        names_domain: true,
+        period: ("a", "b"),
+        seconds: 30,
+    };
+    let file = text(&learnt, &source);
+    let config = Config::parse(file.as_bytes()).unwrap();
+    assert_eq!(config.watches.len(), 2, "{file}");
+    assert_eq!(
+        config.watches[0].expectations.values(),
+        learnt.lessons[0].values
+    );
+}
+
+#[test]
+fn a_file_is_never_larger_than_an_agent_reads() {
+    let mut robot = Robot::new(&["/imu"]);
+    for _ in 0..30 {
+        robot.second(STEADY);
+    }
+    let mut learnt = robot.learner.finish().unwrap();
+    let lesson = learnt.lessons.remove(0);
+    learnt.lessons = (0..Limit::Watches.row().default)
+        .map(|number| Lesson {
+            topic: format!("/t{number}{}", "x".repeat(250)),
+            remarks: [
+                &lesson.remarks[..],
+                &vec![Remark::LeftOut("all", "y".repeat(900)); 1],
+            ]
+            .concat(),
+            ..lesson.clone()
+        })
+        .collect();
+    let source = Source {
+        place: "robot",
+        domain_id: 0,
+        names_domain: false,
+        period: ("a", "b"),
+        seconds: 30,
+    };
+    let config = Config::parse(text(&learnt, &source).as_bytes()).unwrap();
+    assert_eq!(config.watches.len(), learnt.lessons.len());
+}
+
+proptest! {
+    /// Whatever a robot does, it does not violate what was learnt from it.
+    #[test]
+    fn no_robot_violates_its_own_watchlist(
+        seconds in prop::collection::vec((0..30_u32, 0..3_u32, 0.0..0.1_f32, 0..3_u16, 0..3_u16), 20..120),
+    ) {
+        let mut last = None;
+        let mut list = Vec::new();
+        for (messages, lost, latency, publishers, subscriptions) in seconds {
+            last = if messages > 0 { Some(0.01) } else { last.map(|it: f32| it + 1.0) };
+            list.push(Second {
+                messages, lost, delayed: messages, delay: latency * messages as f32,
+                silence: last, publishers, subscriptions,
+            });
+        }
+        let lesson = thresholds::lesson("/x", &Observation::of(list.clone()));
+        let expectations = lesson.values.try_into().unwrap();
+        prop_assert_eq!(rehearsal::violations(&expectations, &list), Vec::<&str>::new());
+    }
+
+    /// A learnt band excludes half the rate, at every rate.
+    #[test]
+    fn half_the_rate_violates(rate in 0.5..500.0_f64, jitter in 0.0..0.05_f64) {
+        let count = |factor: f64, second: u32| {
+            let noise = 1.0 + jitter * f64::from(second % 7).sin();
+            let upto = |second: u32| (rate * factor * noise * f64::from(second)).floor() as u32;
+            upto(second + 1).saturating_sub(upto(second))
+        };
+        let make = |factor: f64| -> Vec<Second> {
+            (0..120).map(|second| Second {
+                messages: count(factor, second), silence: Some(0.5), publishers: 1,
+                subscriptions: 1, ..Second::default()
+            }).collect()
+        };
+        let lesson = thresholds::lesson("/x", &Observation::of(make(1.0)));
+        if lesson.values.min_rate_hz.is_some() {
+            let expectations = lesson.values.try_into().unwrap();
+            let violated = rehearsal::violations(&expectations, &make(0.5));
+            prop_assert!(violated.contains(&"min_rate_hz"), "{:?}: {violated:?}", lesson.values);
+        }
+    }
+}

@@ -1,0 +1,442 @@
+//! Chooses the expectations of a topic from what it did.
+//!
+//! Each threshold begins at a robust statistic (median, 95th percentile, MAD) with a margin. If the
+//! topic's own seconds violate it, by the agent's evaluation, it widens to the extreme value that
+//! was seen. If that is too wide to find a fault, the expectation is left out, with the reason.
+
+use std::ops::RangeInclusive;
+
+use ros2probe_daemon::config::Expectations;
+use ros2probe_daemon::config::rehearsal::{self, GRACE, Second};
+use ros2probe_daemon::config::watch::ExpectationValues;
+
+use super::observation::Observation;
+use super::statistics::{Summary, rounded_down, rounded_up};
+
+/// Margin of a rate around its median.
+pub const RATE_MARGIN: f64 = 0.2;
+/// Margin of a rate, in deviations.
+pub const RATE_DEVIATIONS: f64 = 4.0;
+/// Widest band of a rate, as parts of its median. A topic at half its rate stays outside.
+const RATE_LIMITS: (f64, f64) = (0.6, 1.6);
+/// Slowest rate with a band: three messages are due in the agent's longest window of 10 s.
+const SLOWEST: f64 = 0.3;
+/// Least number of seconds and of messages to learn from.
+const LEAST: usize = 10;
+/// Margin of a silence: times the longest one that was seen.
+pub const SILENCE_MARGIN: f64 = 3.0;
+/// Shortest learnt silence in seconds, since the agent evaluates once a second.
+const SHORTEST_SILENCE: f64 = 2.0;
+/// Part of the time that the longest silence may take, for topics without a rate.
+const SILENCE_PART: f64 = 0.2;
+/// Smallest learnt loss ratio.
+pub const LEAST_LOSS: f64 = 0.01;
+/// Largest learnt loss ratio.
+const MOST_LOSS: f64 = 0.5;
+/// Seconds over which the agent evaluates a loss.
+const LOSS_WINDOW: usize = 10;
+/// Margin of a latency in deviations, and its smallest one in seconds.
+pub const LATENCY_DEVIATIONS: f64 = 6.0;
+const LATENCY_MARGIN: f64 = 0.005;
+
+/// Expectations of one topic.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lesson {
+    /// ROS name.
+    pub topic: String,
+    /// The expectations.
+    pub values: ExpectationValues,
+    /// Their explanations, in the order of the configuration's keys.
+    pub remarks: Vec<Remark>,
+}
+
+/// Explanation of one or two keys.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Remark {
+    /// The key has this value, for this reason.
+    Set(&'static str, f64, String),
+    /// The keys are left out, for this reason.
+    LeftOut(&'static str, String),
+}
+
+/// Chooses the expectations of a topic.
+#[must_use]
+pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
+    let mut draft = Draft::new(observation);
+    if draft.messages < LEAST as u64 {
+        draft.too_few();
+    } else {
+        draft.rate();
+        draft.loss();
+        draft.latency();
+        draft.silence();
+    }
+    draft.endpoints();
+    draft.reconcile();
+    Lesson {
+        topic: topic.to_owned(),
+        values: draft.values,
+        remarks: draft.remarks,
+    }
+}
+
+/// Expectations under construction.
+struct Draft<'a> {
+    observation: &'a Observation,
+    seconds: &'a [Second],
+    /// Seconds after that of the first message, which is incomplete.
+    complete: &'a [Second],
+    messages: u64,
+    values: ExpectationValues,
+    remarks: Vec<Remark>,
+}
+
+impl<'a> Draft<'a> {
+    fn new(observation: &'a Observation) -> Self {
+        let seconds = observation.seconds();
+        let first = seconds.iter().position(|second| second.messages > 0);
+        let complete = first.and_then(|first| seconds.get(first + 1..));
+        Self {
+            observation,
+            seconds,
+            complete: complete.unwrap_or_default(),
+            messages: seconds.iter().map(|it| u64::from(it.messages)).sum(),
+            values: ExpectationValues::default(),
+            remarks: Vec::new(),
+        }
+    }
+
+    /// Returns whether the topic's own seconds violate these values, or they are invalid.
+    fn violates(&self, values: ExpectationValues) -> bool {
+        match Expectations::try_from(values) {
+            Ok(expectations) => !rehearsal::violations(&expectations, self.seconds).is_empty(),
+            Err(_) => true,
+        }
+    }
+
+    /// Returns the first candidate within its limits that the topic's own seconds do not violate.
+    fn first(
+        &self,
+        candidates: [f64; 2],
+        limits: RangeInclusive<f64>,
+        expecting: fn(f64) -> ExpectationValues,
+    ) -> Option<f64> {
+        let mut candidates = candidates.into_iter();
+        candidates.find(|it| limits.contains(it) && !self.violates(expecting(*it)))
+    }
+
+    fn leave_out(&mut self, keys: &'static str, why: impl Into<String>) {
+        self.remarks.push(Remark::LeftOut(keys, why.into()));
+    }
+
+    fn too_few(&mut self) {
+        let why = match (&self.observation.reason, self.messages) {
+            (Some(reason), 0) => format!("no message was seen: {reason}"),
+            (None, 0) => "no message was seen".to_owned(),
+            (_, messages) => format!("{messages} messages are too few"),
+        };
+        self.leave_out("rate, loss, latency and silence", why);
+    }
+
+    fn rate(&mut self) {
+        const KEYS: &str = "min_rate_hz and max_rate_hz";
+        let seconds = self.complete.len();
+        if seconds < LEAST {
+            return self.leave_out(KEYS, format!("{seconds} s are too short"));
+        }
+        let messages: u64 = self.complete.iter().map(|it| u64::from(it.messages)).sum();
+        let mean = number(messages) / number(seconds as u64);
+        let lowest = mean * (1.0 - RATE_MARGIN);
+        if lowest < SLOWEST {
+            let why = format!("{messages} messages in {seconds} s are too seldom for a rate");
+            return self.leave_out(KEYS, why);
+        }
+        let window = rehearsal::window(lowest);
+        let rates = Summary::of(self.rates(window)).filter(|rates| rates.median > 0.0);
+        let Some(rates) = rates else {
+            return self.leave_out(KEYS, "no message arrived for most of the time");
+        };
+        self.band(&rates, window);
+    }
+
+    /// Chooses the lowest and the highest rate.
+    fn band(&mut self, rates: &Summary, window: u64) {
+        let median = rates.median;
+        let half = (RATE_MARGIN * median).max(RATE_DEVIATIONS * rates.deviation);
+        let lows = [median - half, rates.minimum * 0.95].map(rounded_down);
+        let highs = [median + half, rates.maximum * 1.05].map(rounded_up);
+        let (lowest, highest) = (RATE_LIMITS.0 * median, RATE_LIMITS.1 * median);
+        let low = self.first(lows, lowest..=f64::INFINITY, |rate| ExpectationValues {
+            min_rate_hz: Some(rate),
+            ..ExpectationValues::default()
+        });
+        let high = self.first(highs, 0.0..=highest, |rate| ExpectationValues {
+            max_rate_hz: Some(rate),
+            ..ExpectationValues::default()
+        });
+        let seen = format!(
+            "{} to {} Hz in windows of {window} s",
+            short(rates.minimum),
+            short(rates.maximum)
+        );
+        let varies = format!("the rate varies: {seen}");
+        let seen = format!("median {} Hz, {seen}", short(median));
+        self.set("min_rate_hz", low, seen, &varies);
+        self.set("max_rate_hz", high, String::new(), &varies);
+        (self.values.min_rate_hz, self.values.max_rate_hz) = (low, high);
+    }
+
+    /// Rates of all windows of so many seconds with a publisher.
+    fn rates(&self, window: u64) -> Vec<f64> {
+        let length = usize::try_from(window).unwrap_or(1).max(1);
+        let windows = self.complete.windows(length);
+        let published = windows.filter(|it| it.iter().all(|second| second.publishers > 0));
+        published
+            .map(|it| {
+                let messages: u64 = it.iter().map(|second| u64::from(second.messages)).sum();
+                number(messages) / number(window)
+            })
+            .collect()
+    }
+
+    fn loss(&mut self) {
+        const KEY: &str = "max_loss_ratio";
+        let lost: u64 = self.seconds.iter().map(|it| u64::from(it.lost)).sum();
+        let windows = self.seconds.windows(LOSS_WINDOW);
+        let windows = windows.map(|it| {
+            let sum = |count: fn(&Second) -> u32| it.iter().map(|s| u64::from(count(s))).sum();
+            (sum(|second| second.messages), sum(|second| second.lost))
+        });
+        let windows: Vec<(u64, u64)> = windows
+            .filter(|(messages, lost)| messages + lost > 0)
+            .collect();
+        let ratios = windows
+            .iter()
+            .map(|(messages, lost)| number(*lost) / number(messages + lost));
+        let sent = windows
+            .iter()
+            .map(|(messages, lost)| number(messages + lost));
+        let (Some(ratios), Some(sent)) = (Summary::of(ratios), Summary::of(sent)) else {
+            return self.leave_out(KEY, "the topic was seen for less than 10 s");
+        };
+        // One lost message in a window is no fault.
+        let base = LEAST_LOSS.max(1.5 / sent.median);
+        let candidates = [3.0 * ratios.p95, 1.5 * ratios.maximum];
+        let candidates = candidates.map(|ratio| rounded_up(ratio.max(base)));
+        let ratio = self.first(candidates, 0.0..=MOST_LOSS, |ratio| ExpectationValues {
+            max_loss_ratio: Some(ratio),
+            ..ExpectationValues::default()
+        });
+        let seen = format!(
+            "{lost} of {} messages lost, at most {} % in 10 s",
+            self.messages + lost,
+            short(ratios.maximum * 100.0)
+        );
+        let why = if base > MOST_LOSS {
+            format!("{} messages in 10 s are too few", short(sent.median))
+        } else {
+            format!("the loss varies: {seen}")
+        };
+        self.set(KEY, ratio, seen, &why);
+        self.values.max_loss_ratio = ratio;
+    }
+
+    fn latency(&mut self) {
+        const KEY: &str = "max_latency_ms";
+        if self.observation.is_sampled {
+            return self.leave_out(KEY, "the topic is sampled in shared memory");
+        }
+        let odd = self.observation.odd_timestamps;
+        if odd > 0 {
+            let why = format!(
+                "{odd} messages are stamped later than their capture, or an hour away: the clocks \
+                 differ"
+            );
+            return self.leave_out(KEY, why);
+        }
+        let stamped = self.seconds.iter().filter(|second| second.delayed > 0);
+        let means: Vec<f64> = stamped
+            .map(|second| f64::from(second.delay) / f64::from(second.delayed))
+            .collect();
+        let count = means.len();
+        let Some(means) = Summary::of(means).filter(|_| count >= LEAST) else {
+            return self.leave_out(
+                KEY,
+                format!("{count} s with writer's timestamps are too few"),
+            );
+        };
+        let margin = LATENCY_MARGIN.max(LATENCY_DEVIATIONS * means.deviation);
+        let candidates = [
+            (means.median + margin).max(2.0 * means.p95),
+            1.5 * means.maximum,
+        ];
+        let candidates = candidates.map(|latency| rounded_up(latency * 1e3));
+        let most = 1e3 * (10.0 * means.median + 10.0 * LATENCY_MARGIN);
+        let latency = self.first(candidates, 0.0..=most, |latency| ExpectationValues {
+            max_latency_ms: Some(latency),
+            ..ExpectationValues::default()
+        });
+        let seen = format!(
+            "one-second means: median {} ms, 95 % below {}, at most {}",
+            short(means.median * 1e3),
+            short(means.p95 * 1e3),
+            short(means.maximum * 1e3)
+        );
+        self.set(
+            KEY,
+            latency,
+            seen.clone(),
+            &format!("the latency varies: {seen}"),
+        );
+        self.values.max_latency_ms = latency;
+    }
+
+    fn silence(&mut self) {
+        const KEY: &str = "max_silence_s";
+        let published = self.seconds.iter().filter(|second| second.publishers > 0);
+        let time = number(self.seconds.len() as u64);
+        let silences = published.filter_map(|second| second.silence).map(f64::from);
+        let Some(Summary { maximum, .. }) = Summary::of(silences) else {
+            return self.leave_out(KEY, "no message was seen");
+        };
+        let seen = format!("longest silence {} s", short(maximum));
+        let is_regular = self.values.min_rate_hz.is_some();
+        if !is_regular && maximum > SILENCE_PART * time {
+            let why = format!("{} messages, {seen}: too irregular", self.messages);
+            return self.leave_out(KEY, why);
+        }
+        let due = self.values.min_rate_hz.map_or(0.0, |rate| 5.0 / rate);
+        let silence = rounded_up(SHORTEST_SILENCE.max(SILENCE_MARGIN * maximum).max(due));
+        let values = ExpectationValues {
+            max_silence_s: Some(silence),
+            ..ExpectationValues::default()
+        };
+        let silence = (!self.violates(values)).then_some(silence);
+        self.set(KEY, silence, seen.clone(), &seen);
+        self.values.max_silence_s = silence;
+    }
+
+    fn endpoints(&mut self) {
+        let settled = self.settled();
+        let publishers = self.least(
+            "publishers",
+            &settled,
+            |it| it.publishers,
+            |least| ExpectationValues {
+                publishers: least,
+                ..ExpectationValues::default()
+            },
+        );
+        let subscribers = self.least(
+            "subscribers",
+            &settled,
+            |it| it.subscriptions,
+            |least| ExpectationValues {
+                subscribers: least,
+                ..ExpectationValues::default()
+            },
+        );
+        (self.values.publishers, self.values.subscribers) = (publishers, subscribers);
+    }
+
+    /// Seconds in which the agent evaluates the numbers of endpoints.
+    fn settled(&self) -> Vec<Second> {
+        let mut published = 0;
+        let mut settled = Vec::new();
+        for second in self.seconds {
+            published = if second.publishers > 0 {
+                published + 1
+            } else {
+                0
+            };
+            if published > GRACE {
+                settled.push(*second);
+            }
+        }
+        settled
+    }
+
+    /// Chooses a least number of endpoints: the median, or the smallest number that was seen.
+    fn least(
+        &mut self,
+        key: &'static str,
+        settled: &[Second],
+        count: fn(&Second) -> u16,
+        expecting: fn(Option<u32>) -> ExpectationValues,
+    ) -> Option<u32> {
+        if settled.len() < LEAST {
+            let published = self.seconds.iter().filter(|it| it.publishers > 0).count();
+            self.leave_out(key, format!("{published} s with a publisher are too few"));
+            return None;
+        }
+        let mut counts: Vec<u16> = settled.iter().map(count).collect();
+        counts.sort_unstable();
+        let at = |place: usize| counts.get(place).copied().map_or(0, u32::from);
+        let (fewest, median, most) = (at(0), at(counts.len() / 2), at(counts.len() - 1));
+        let candidates = [median, fewest];
+        let least = candidates
+            .into_iter()
+            .find(|least| *least > 0 && !self.violates(expecting(Some(*least))));
+        let seen = match fewest == most {
+            true => format!("always {most}"),
+            false => format!("{fewest} to {most}"),
+        };
+        let why = match most {
+            0 => format!("the topic had no {key}"),
+            _ => format!("the number varies: {seen}"),
+        };
+        self.set(key, least.map(f64::from), seen, &why);
+        least
+    }
+
+    /// Leaves out what the topic's own seconds violate together: bad seconds of different
+    /// expectations in a row count as one violation.
+    fn reconcile(&mut self) {
+        let Ok(expectations) = Expectations::try_from(self.values) else {
+            return;
+        };
+        for violated in rehearsal::violations(&expectations, self.seconds) {
+            let values = &mut self.values;
+            match violated {
+                "min_rate_hz" => values.min_rate_hz = None,
+                "max_rate_hz" => values.max_rate_hz = None,
+                "max_loss_ratio" => values.max_loss_ratio = None,
+                "max_latency_ms" => values.max_latency_ms = None,
+                "max_silence_s" => values.max_silence_s = None,
+                "publishers" => values.publishers = None,
+                _ => values.subscribers = None,
+            }
+            for remark in &mut self.remarks {
+                if matches!(remark, Remark::Set(key, ..) if *key == violated) {
+                    let why = "several figures of the topic vary at once".to_owned();
+                    *remark = Remark::LeftOut(violated, why);
+                }
+            }
+        }
+    }
+
+    fn set(&mut self, key: &'static str, value: Option<f64>, seen: String, why: &str) {
+        match value {
+            Some(value) => self.remarks.push(Remark::Set(key, value, seen)),
+            None => self.leave_out(key, why),
+        }
+    }
+}
+
+/// Text of a statistic, with three digits.
+fn short(value: f64) -> String {
+    if value <= 0.0 {
+        return "0".to_owned();
+    }
+    let (down, up) = (rounded_down(value), rounded_up(value));
+    let nearest = if value - down <= up - value { down } else { up };
+    nearest.to_string()
+}
+
+#[expect(
+    clippy::cast_precision_loss,
+    reason = "a count of messages or seconds is far below 2^52"
+)]
+const fn number(count: u64) -> f64 {
+    count as f64
+}

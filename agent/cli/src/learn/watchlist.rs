@@ -1,0 +1,133 @@
+//! Text of a learnt watchlist: a configuration file with the reason of each value.
+
+use std::fmt::Write as _;
+
+use super::Learnt;
+use super::thresholds::{
+    LATENCY_DEVIATIONS, LEAST_LOSS, Lesson, RATE_DEVIATIONS, RATE_MARGIN, Remark, SILENCE_MARGIN,
+};
+use ros2probe_daemon::config::rehearsal::GRACE;
+use ros2probe_daemon::escape::visible;
+
+/// Column at which reasons begin.
+const COLUMN: usize = 28;
+/// Largest configuration file that an agent reads, in bytes.
+const MAX_BYTES: usize = 1 << 20;
+
+/// Origin of a watchlist.
+#[derive(Clone, Copy, Debug)]
+pub struct Source<'a> {
+    /// The agent or the capture, as text for people.
+    pub place: &'a str,
+    /// Domain id.
+    pub domain_id: u32,
+    /// Whether entries name the domain, because the agent sees several.
+    pub names_domain: bool,
+    /// Time of the first and the last view.
+    pub period: (&'a str, &'a str),
+    /// Number of whole seconds.
+    pub seconds: u32,
+}
+
+/// Returns the file. If the reasons make it larger than an agent reads, they are left out.
+#[must_use]
+pub fn text(learnt: &Learnt, source: &Source<'_>) -> String {
+    let explained = entries(learnt, source, true);
+    if explained.len() <= MAX_BYTES {
+        return explained;
+    }
+    entries(learnt, source, false)
+}
+
+fn entries(learnt: &Learnt, source: &Source<'_>, is_explained: bool) -> String {
+    let mut text = head(source);
+    text.push_str("version: 1\nwatch:");
+    if learnt.lessons.iter().all(|lesson| !is_expected(lesson)) {
+        text.push_str(" []");
+    }
+    text.push('\n');
+    for lesson in &learnt.lessons {
+        entry(&mut text, lesson, source, is_explained);
+    }
+    if learnt.unnamed > 0 {
+        let count = learnt.unnamed;
+        line(
+            &mut text,
+            &format!("  # Topics that no watch can name: {count}"),
+        );
+    }
+    if learnt.beyond_limit > 0 {
+        let count = learnt.beyond_limit;
+        let why = "  # Topics beyond the default of limits.watches, not learnt";
+        line(&mut text, &format!("{why}: {count}"));
+    }
+    text
+}
+
+/// Returns whether a topic has any expectation.
+#[must_use]
+pub fn is_expected(lesson: &Lesson) -> bool {
+    let mut remarks = lesson.remarks.iter();
+    remarks.any(|remark| matches!(remark, Remark::Set(..)))
+}
+
+fn head(source: &Source<'_>) -> String {
+    let Source {
+        place,
+        domain_id,
+        period: (from, to),
+        seconds,
+        ..
+    } = source;
+    let place = visible(place);
+    let (rate, loss) = (RATE_MARGIN * 100.0, LEAST_LOSS * 100.0);
+    format!(
+        "\
+# Watchlist learnt by `rp learn` from {place}, domain {domain_id},
+# {from} to {to}: {seconds} s.
+# Review it: faults that the robot had at that time are expected now.
+#
+# min_rate_hz, max_rate_hz: median of the rates in windows of at least three messages (1 to 10 s),
+#   with a margin of {rate} % or {RATE_DEVIATIONS} deviations (1.4826 times the MAD), whichever is larger
+# max_loss_ratio: three times the 95th percentile of windows of 10 s, at least {loss} % and one message
+# max_latency_ms: median of one-second means with {LATENCY_DEVIATIONS} deviations or 5 ms, at least twice
+#   the 95th percentile
+# max_silence_s: {SILENCE_MARGIN} times the longest silence, at least 2 s and five messages
+# publishers, subscribers: median of the numbers, from {GRACE} s after the first publisher on
+# A value that the robot itself would have violated is widened to the extreme that was seen. One
+# that is then too wide to find a fault is left out.
+"
+    )
+}
+
+fn entry(text: &mut String, lesson: &Lesson, source: &Source<'_>, is_explained: bool) {
+    let name = &lesson.topic;
+    if is_expected(lesson) {
+        line(text, &format!("  - topic: {name}"));
+        if source.names_domain {
+            line(text, &format!("    domain: {}", source.domain_id));
+        }
+    } else if is_explained {
+        line(text, &format!("  # {name} has no expectations:"));
+    }
+    for remark in &lesson.remarks {
+        match remark {
+            Remark::Set(key, value, why) if why.is_empty() || !is_explained => {
+                line(text, &format!("    {key}: {value}"));
+            }
+            Remark::Set(key, value, why) => {
+                let setting = format!("    {key}: {value}");
+                line(text, &format!("{setting:COLUMN$}  # {}", visible(why)));
+            }
+            Remark::LeftOut(..) if !is_explained => {}
+            Remark::LeftOut(keys, why) => {
+                line(text, &format!("    # no {keys}: {}", visible(why)));
+            }
+        }
+    }
+}
+
+fn line(text: &mut String, line: &str) {
+    // Writing into a string cannot fail.
+    let _ = writeln!(text, "{line}");
+}

@@ -1,0 +1,103 @@
+//! `rp learn` beside the talker and the listener of ROS 2 Humble: they meet the watchlist, and
+//! without the listener they lack its endpoints and nothing else.
+//!
+//! Needs root and ROS 2 Humble: `make test-ros2`.
+
+use std::fs;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use anyhow::{Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::shared_memory::SharedMemory;
+use ros2probe_testing::harness::{run, wait_until};
+
+use crate::installed;
+
+const RP: &str = env!("CARGO_BIN_EXE_rp");
+const VIOLATED: &str = "ros2_watch_expectation_violated";
+/// Longer than the 20 s with a publisher that the numbers of endpoints need.
+const LEARNS: Duration = Duration::from_secs(40);
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn fast_dds_with_shared_memory_meets_what_was_learnt_from_it() -> Result<()> {
+    meets_what_was_learnt("rmw_fastrtps_cpp")
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn cyclone_dds_meets_what_was_learnt_from_it() -> Result<()> {
+    meets_what_was_learnt("rmw_cyclonedds_cpp")
+}
+
+fn meets_what_was_learnt(middleware: &str) -> Result<()> {
+    let host = Namespace::alone()?;
+    let shared_memory = SharedMemory::of(&host, 64)?;
+    let directory = tempfile::tempdir()?;
+    let file = |name: &str| directory.path().join(name);
+    let settings = format!(
+        "{}api: {{socket: {}}}\n",
+        at_the_sockets_of(&host),
+        file("api.sock").display()
+    );
+    fs::write(file("ros2probe.yaml"), &settings)?;
+    let agent = Agent::start(&host, RP, &file("ros2probe.yaml"))?;
+    let node = |name: &str| -> Result<Process> {
+        let mut enter = shared_memory.inside(&host);
+        let rmw = format!("RMW_IMPLEMENTATION={middleware}");
+        let logs = format!("ROS_LOG_DIR={}", directory.path().display());
+        enter.extend(["env".to_owned(), rmw, logs, "ROS_DOMAIN_ID=0".to_owned()]);
+        let prefix = installed::prefix();
+        let prefix = prefix.display();
+        let shell = format!(". {prefix}/env.sh && exec {prefix}/lib/demo_nodes_cpp/{name}");
+        Process::start_with(&enter, "bash", ["-c", &shell], Stdio::null())
+    };
+    let mut listener = node("listener")?;
+    let _talker = node("talker")?;
+    agent.scrape_until("talking", |page| {
+        let endpoints = |kind| page.sum(kind, &[("topic", "/chatter")]);
+        endpoints("ros2_topic_publishers") == 1.0 && endpoints("ros2_topic_subscriptions") == 1.0
+    })?;
+
+    let learning = Command::new(RP)
+        .env_remove("ROS_DOMAIN_ID")
+        .args(["learn", "--socket"])
+        .arg(file("api.sock"))
+        .arg("-o")
+        .arg(file("watchlist.yaml"))
+        .stdin(Stdio::null())
+        .spawn()?;
+    std::thread::sleep(LEARNS);
+    run(&format!("kill -INT {}", learning.id()))?;
+    ensure!(learning.wait_with_output()?.status.success());
+    let learnt = fs::read_to_string(file("watchlist.yaml"))?;
+    fs::write(file("ros2probe.yaml"), settings + &learnt)?;
+    agent.process.signal("HUP")?;
+    let is_violated = |page: &Scrape, topic: &str, expectation: &str| {
+        page.value(VIOLATED, &[("topic", topic), ("expectation", expectation)])
+    };
+    agent.scrape_until("the watchlist", |page| {
+        let keys = ["min_rate_hz", "max_silence_s", "publishers", "subscribers"];
+        let mut keys = keys.into_iter();
+        keys.all(|key| is_violated(page, "/chatter", key).is_some())
+    })?;
+    std::thread::sleep(Duration::from_secs(15));
+    let violated = agent.scrape()?.sum(VIOLATED, &[]);
+    ensure!(violated == 0.0, "{violated} of {learnt}");
+
+    listener.signal("INT")?;
+    listener.wait(Duration::from_secs(30))?;
+    wait_until("the listener is missed", || {
+        let page = agent.scrape()?;
+        let is_missed = |topic, key| is_violated(&page, topic, key) == Some(1.0);
+        Ok(is_missed("/chatter", "subscribers") && is_missed("/rosout", "publishers"))
+    })?;
+    std::thread::sleep(Duration::from_secs(10));
+    let page = agent.scrape()?;
+    let of_chatter = page.sum(VIOLATED, &[("topic", "/chatter")]);
+    ensure!(of_chatter == 1.0, "{of_chatter} of {learnt}");
+    Ok(())
+}

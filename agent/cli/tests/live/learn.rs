@@ -1,0 +1,200 @@
+//! `rp learn` beside a live agent: it measures topics that no watch covers, leaves nothing behind,
+//! and what it writes finds the faults of the same robot.
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::wait_until;
+
+/// Longer than 20 s with a publisher, which the numbers of endpoints need.
+const LEARNS: Duration = Duration::from_secs(30);
+const VIOLATED: &str = "ros2_watch_expectation_violated";
+
+/// An agent that watches nothing by itself, and its files.
+struct Place<'a> {
+    agent: Agent<'a>,
+    configuration: PathBuf,
+    settings: String,
+    socket: PathBuf,
+    watchlist: PathBuf,
+}
+
+impl<'a> Place<'a> {
+    fn new(host: &'a Namespace, directory: &Path) -> Result<Self> {
+        let configuration = directory.join("ros2probe.yaml");
+        let socket = directory.join("api.sock");
+        let settings = format!(
+            "{}api: {{socket: {}}}\n",
+            at_the_sockets_of(host),
+            socket.display()
+        );
+        std::fs::write(&configuration, &settings)?;
+        Ok(Self {
+            agent: Agent::start(host, env!("CARGO_BIN_EXE_rp"), &configuration)?,
+            configuration,
+            settings,
+            socket,
+            watchlist: directory.join("watchlist.yaml"),
+        })
+    }
+
+    fn learn(&self) -> Result<Child> {
+        let child = Command::new(env!("CARGO_BIN_EXE_rp"))
+            .env_remove("ROS_DOMAIN_ID")
+            .args(["learn", "/imu", "/sca*", "--socket"])
+            .arg(&self.socket)
+            .arg("-o")
+            .arg(&self.watchlist)
+            .stdin(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()?;
+        Ok(child)
+    }
+
+    /// Adds the learnt watchlist to the configuration, and applies it.
+    fn apply(&self) -> Result<()> {
+        let learnt = std::fs::read_to_string(&self.watchlist)?;
+        std::fs::write(&self.configuration, format!("{}{learnt}", self.settings))?;
+        self.agent.process.signal("HUP")
+    }
+
+    /// Whether the topic violates this expectation now. `None` without the expectation.
+    fn violates(&self, topic: &str, expectation: &str) -> Result<Option<bool>> {
+        let labels = [("topic", topic), ("expectation", expectation)];
+        let value = self.agent.scrape()?.value(VIOLATED, &labels);
+        Ok(value.map(|value| value > 0.0))
+    }
+}
+
+#[test]
+fn a_live_robot_is_learnt_without_a_watch_and_its_faults_are_found() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let place = Place::new(&host, directory.path())?;
+    let imu = Stream {
+        depth: 10,
+        ..Stream::small(1_000_000)
+    };
+    let scan = Stream {
+        topic: "/scan".to_owned(),
+        rate: 20.0,
+        ..imu.clone()
+    };
+    let start =
+        |role, stream: &Stream, node: &str| Peer::start(&host, Stack::Rust, role, stream, &[node]);
+    let _ekf = start(Role::Subscriber, &imu, "/ekf")?;
+    let mut slam = start(Role::Subscriber, &scan, "/slam")?;
+    let mut driver = start(Role::Publisher, &imu, "/driver")?;
+    let mut lidar = start(Role::Publisher, &scan, "/lidar")?;
+    for publisher in [&mut driver, &mut lidar] {
+        publisher.wait_matched()?;
+        publisher.go()?;
+    }
+
+    let begin = Instant::now();
+    let mut learning = place.learn()?;
+    wait_until("the topics are measured", || {
+        let page = place.agent.scrape()?;
+        let counted = |topic| page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+        Ok(counted("/imu") > 0.0 && counted("/scan") > 0.0)
+    })?;
+    std::thread::sleep(LEARNS.saturating_sub(begin.elapsed()));
+    ensure!(learning.try_wait()?.is_none(), "it ended by itself");
+    harness::run(&format!("kill -INT {}", learning.id()))?;
+    let output = learning.wait_with_output()?;
+    let said = String::from_utf8(output.stderr)?;
+    ensure!(output.status.success(), "{said}");
+    ensure!(
+        said.lines().count() == 1 && said.contains("for 2 of 2 topics"),
+        "{said}"
+    );
+    is_complete(&place.watchlist)?;
+
+    // Nothing stays watched or measured.
+    wait_until("the stream is closed", || {
+        let page = place.agent.scrape()?;
+        Ok(page.value("ros2probe_subscriptions", &[]) == Some(0.0))
+    })?;
+    let watches = place.agent.scrape()?.sum("ros2_watch_state", &[]);
+    ensure!(watches == 0.0, "{watches} watched topics");
+
+    place.apply()?;
+    wait_until("the watchlist applies", || {
+        Ok(place.violates("/scan", "subscribers")?.is_some())
+    })?;
+    std::thread::sleep(Duration::from_secs(15));
+    let violated = place.agent.scrape()?.sum(VIOLATED, &[]);
+    ensure!(
+        violated == 0.0,
+        "{violated} expectations of a healthy robot"
+    );
+
+    drop(driver);
+    let half = Stream {
+        rate: imu.rate / 2.0,
+        ..imu
+    };
+    let mut driver = start(Role::Publisher, &half, "/driver")?;
+    driver.wait_matched()?;
+    driver.go()?;
+    slam.process.terminate()?;
+    for (topic, expectation) in [("/imu", "min_rate_hz"), ("/scan", "subscribers")] {
+        let what = format!("{topic} violates {expectation}");
+        wait_until(&what, || {
+            Ok(place.violates(topic, expectation)? == Some(true))
+        })?;
+    }
+    ensure!(place.violates("/scan", "max_silence_s")? == Some(false));
+    Ok(())
+}
+
+/// The file is valid, and each topic has a rate, a loss, a silence and endpoints.
+fn is_complete(watchlist: &Path) -> Result<()> {
+    let text = std::fs::read_to_string(watchlist)?;
+    let checked = Command::new(env!("CARGO_BIN_EXE_rp"))
+        .arg("check-config")
+        .arg(watchlist)
+        .output()?;
+    ensure!(checked.status.success(), "{text}");
+    for key in [
+        "min_rate_hz: ",
+        "max_rate_hz: ",
+        "max_loss_ratio: ",
+        "max_silence_s: ",
+        "publishers: 1",
+        "subscribers: 1",
+    ] {
+        let lines = text
+            .lines()
+            .filter(|line| line.trim_start().starts_with(key));
+        let count = lines.count();
+        ensure!(count == 2, "{count} times `{key}` in {text}");
+    }
+    Ok(())
+}
+
+#[test]
+fn an_agent_that_ends_leaves_no_watchlist() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let mut place = Place::new(&host, directory.path())?;
+    let learning = place.learn()?;
+    let agent = &place.agent;
+    agent.scrape_until("a stream open", |page| {
+        page.value("ros2probe_subscriptions", &[]) == Some(1.0)
+    })?;
+    place.agent.process.terminate()?;
+    let output = learning.wait_with_output()?;
+    let said = String::from_utf8(output.stderr)?;
+    let last = said.lines().last().context("no error")?;
+    ensure!(output.status.code() == Some(1), "{said}");
+    ensure!(last.contains("the agent has ended"), "{said}");
+    ensure!(!place.watchlist.exists());
+    Ok(())
+}
