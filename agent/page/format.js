@@ -107,6 +107,26 @@ export function percent(part) {
 }
 
 /**
+ * Formats the calls of a service: "1,000 calls, p50 4.22 ms, p99 7.50 ms, 1 hanging"; empty without
+ * calls.
+ * @param {any} calls as `GET /services` has them
+ */
+export function calls(calls) {
+  if (!calls) {
+    return '';
+  }
+  const { requests, hanging, latency_p50_seconds: p50, latency_p99_seconds: p99 } = calls;
+  const parts = [several(requests, 'call')];
+  if (p50 != null) {
+    parts.push(`p50 ${duration(p50)}`, `p99 ${duration(p99)}`);
+  }
+  if (hanging > 0) {
+    parts.push(`${count(hanging)} hanging`);
+  }
+  return parts.join(', ');
+}
+
+/**
  * Formats the time of day of a Unix time, in the browser's zone.
  * @param {number|null|undefined} seconds
  */

@@ -55,6 +55,11 @@ pub enum Diagnosis<'a> {
         /// has no writer.
         reason: Cow<'static, str>,
     },
+    /// A client has called a service and received no reply within `service_timeout_s`.
+    HangingCall {
+        /// GUID of the client's writer.
+        writer: String,
+    },
     /// One node appears in several domains on one machine.
     NodeInSeveralDomains {
         /// Domain ids in which the node appears.
@@ -76,6 +81,7 @@ impl Diagnosis<'_> {
             Self::DuplicateNode { .. } => "duplicate_node",
             Self::UnheardPublisher { .. } => "unheard_publisher",
             Self::UnfedSubscriber { .. } => "unfed_subscriber",
+            Self::HangingCall { .. } => "hanging_call",
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
         }
     }

@@ -41,9 +41,60 @@ pub struct Service<'a> {
     pub requests: Option<Measurement>,
     /// Counts and times of replies; null if their DDS topic is not watched.
     pub replies: Option<Measurement>,
+    /// Calls since the first one; null if none was seen.
+    pub calls: Option<Calls>,
+    /// Paths between clients and servers on which the agent does not see calls: `shared_memory`,
+    /// `data_sharing`, `same_process`, `iceoryx`.
+    pub unseen: Vec<Cow<'static, str>>,
     /// Problems of the service's topics.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
+}
+
+/// The calls of a service.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Calls {
+    /// Requests, each counted once regardless of copies and servers.
+    pub requests: u64,
+    /// Requests with a reply that reached the client, as far as the source shows that.
+    pub answered: u64,
+    /// Requests without a reply within `service_timeout_s`; some may have been answered later.
+    pub unanswered: u64,
+    /// Requests that have had no reply for longer than that.
+    pub hanging: u64,
+    /// Requests that wait for a reply, including these.
+    pub open: u64,
+    /// Median of the latest 1024 times from a request to its reply; null before the first.
+    pub latency_p50_seconds: Option<f64>,
+    /// 99th percentile of these times.
+    pub latency_p99_seconds: Option<f64>,
+    /// Whether calls are not measured at present because the service's messages exceed 4 MiB/s.
+    pub suspended: bool,
+}
+
+/// The goals of an action.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Goals {
+    /// Goals that the server accepted.
+    pub accepted: u64,
+    /// Goals that it rejected.
+    pub rejected: u64,
+    /// Goals with a result that a client received, and that had succeeded.
+    pub succeeded: u64,
+    /// The same for cancelled goals.
+    pub canceled: u64,
+    /// The same for aborted goals.
+    pub aborted: u64,
+    /// Accepted goals whose result no client has received so far.
+    pub open: u64,
+    /// Median of the latest 1024 times from a goal's request to its result; null before the first.
+    pub duration_p50_seconds: Option<f64>,
+    /// 99th percentile of these times.
+    pub duration_p99_seconds: Option<f64>,
 }
 
 /// All actions.
@@ -74,6 +125,8 @@ pub struct Action<'a> {
     pub servers: Vec<Party<'a>>,
     /// Nodes that call the action. A node that only reads the feedback is not a client.
     pub clients: Vec<Party<'a>>,
+    /// Goals since the first one; null if none was seen.
+    pub goals: Option<Goals>,
     /// DDS names of the action's topics and services.
     pub parts: Vec<Cow<'a, str>>,
     /// Problems of these topics.

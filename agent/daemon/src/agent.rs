@@ -487,6 +487,7 @@ fn report_listeners(
 fn settings(config: &Config, is_live: bool) -> observer::Settings {
     observer::Settings {
         topic_grace: config.topic_grace,
+        service_timeout: config.service_timeout,
         directed: is_live,
         ..observer::Settings::default().with_limits(&config.limits)
     }

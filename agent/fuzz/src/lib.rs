@@ -424,6 +424,7 @@ const SMALL: Settings = Settings {
     sample_bytes: 1 << 12,
     payload_bytes: 1 << 14,
     topic_grace: Duration::from_secs(1),
+    service_timeout: Duration::from_secs(1),
     payload_delay: Duration::from_millis(400),
     directed: true,
 };

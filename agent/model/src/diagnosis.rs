@@ -88,6 +88,13 @@ pub enum Diagnosis {
         /// The nearest mismatch.
         reason: Unmatched,
     },
+    /// A client has called a service and received no reply within the timeout.
+    HangingCall {
+        /// Topic of the requests.
+        topic: TopicKey,
+        /// GUID of the client's writer.
+        writer: Guid,
+    },
     /// A node whose endpoints or names are in several domains, so nodes of one domain miss some.
     NodeInSeveralDomains {
         /// Fully qualified name.
@@ -149,13 +156,14 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 7] = [
+    pub const KINDS: [&'static str; 8] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
         "duplicate_node",
         "unheard_publisher",
         "unfed_subscriber",
+        "hanging_call",
         "node_in_several_domains",
     ];
 
@@ -169,6 +177,7 @@ impl Diagnosis {
             Self::DuplicateNode { .. } => "duplicate_node",
             Self::UnheardPublisher { .. } => "unheard_publisher",
             Self::UnfedSubscriber { .. } => "unfed_subscriber",
+            Self::HangingCall { .. } => "hanging_call",
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
         }
     }
@@ -181,7 +190,8 @@ impl Diagnosis {
             | Self::TypeConflict { topic, .. }
             | Self::TypeHashConflict { topic, .. }
             | Self::UnheardPublisher { topic, .. }
-            | Self::UnfedSubscriber { topic, .. } => Some(topic),
+            | Self::UnfedSubscriber { topic, .. }
+            | Self::HangingCall { topic, .. } => Some(topic),
             Self::DuplicateNode { .. } | Self::NodeInSeveralDomains { .. } => None,
         }
     }
@@ -211,7 +221,9 @@ impl Diagnosis {
             Self::DuplicateNode {
                 domain_id, node, ..
             } => (*domain_id, node, None, None),
-            Self::UnheardPublisher { writer, .. } => (DomainId(0), "", Some(*writer), None),
+            Self::UnheardPublisher { writer, .. } | Self::HangingCall { writer, .. } => {
+                (DomainId(0), "", Some(*writer), None)
+            }
             Self::UnfedSubscriber { reader, .. } => (DomainId(0), "", Some(*reader), None),
             Self::NodeInSeveralDomains {
                 node, participant, ..

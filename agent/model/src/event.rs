@@ -330,7 +330,8 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::NodeInSeveralDomains { domains, .. } => domains.truncate(LIST),
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnheardPublisher { .. }
-        | Diagnosis::UnfedSubscriber { .. } => {}
+        | Diagnosis::UnfedSubscriber { .. }
+        | Diagnosis::HangingCall { .. } => {}
     }
     finding
 }

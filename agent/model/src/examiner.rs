@@ -13,6 +13,7 @@ use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use crate::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::discovery::Discovery;
+use crate::services::Services;
 use crate::size::Size;
 use crate::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
@@ -30,8 +31,8 @@ const STEPS_PER_TOPIC: usize = 50_000;
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Revision of discovery at the last examination.
-    revision: Option<u64>,
+    /// Revisions of discovery and of the hanging calls at the last examination.
+    revision: Option<(u64, u64)>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<Timestamp>,
     /// Time since which each endpoint is unmatched.
@@ -100,12 +101,19 @@ impl Examiner {
     }
 
     /// Examines the graph if anything has changed since the last time.
-    pub fn examine(&mut self, discovery: &Discovery, topics: &Topics, now: Timestamp) {
+    pub fn examine(
+        &mut self,
+        discovery: &Discovery,
+        topics: &Topics,
+        services: &Services,
+        now: Timestamp,
+    ) {
+        let revision = Some((discovery.revision(), services.revision()));
         let is_due = self.due.is_some_and(|due| due <= now);
-        if self.revision == Some(discovery.revision()) && !is_due {
+        if self.revision == revision && !is_due {
             return;
         }
-        self.revision = Some(discovery.revision());
+        self.revision = revision;
         let mut findings = Findings::new();
         let endpoints = EndpointExaminer::new(discovery);
         let mut alone = HashMap::new();
@@ -124,6 +132,9 @@ impl Examiner {
             }
         }
         nodes::examine(discovery, &mut findings);
+        for (topic, writer) in services.hanging() {
+            findings.add(Diagnosis::HangingCall { topic, writer });
+        }
         (self.alone, self.due) = (alone, due);
         let found = findings.finish();
         let more = found.left_out.saturating_sub(self.current.left_out);

@@ -63,6 +63,7 @@ pub mod sampled;
 pub mod samples;
 pub mod selection;
 pub mod sequence;
+pub mod services;
 pub mod size;
 pub mod snapshot;
 pub mod sockets;

@@ -6,6 +6,7 @@
 
 mod announcements;
 mod calendar;
+mod calls;
 mod clock;
 mod lists;
 mod report;
@@ -37,6 +38,7 @@ use super::payloads::Payloads;
 use super::profiler::{Profiler, RecordOutcome, UNDELIVERED};
 use super::receivers::Receivers;
 use super::selection::SampleRequest;
+use super::services::Services;
 use super::size::Size;
 use super::snapshot::Snapshot;
 use super::topic::{TopicId, Topics, Watched};
@@ -95,6 +97,7 @@ pub struct Observer {
     pub(super) payloads: Payloads,
     sample_requests: Arc<Vec<SampleRequest>>,
     pub(super) receivers: Receivers,
+    pub(super) services: Services,
     pub(super) tracer: Tracer,
     pub(super) examiner: Examiner,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
@@ -131,6 +134,7 @@ impl Observer {
             payloads: Payloads::new(settings.payload_bytes, settings.payload_delay),
             sample_requests: Arc::default(),
             receivers: Receivers::new(settings.deliveries, settings.participants),
+            services: Services::default(),
             tracer: Tracer::new(settings.directed),
             examiner: Examiner::default(),
             decode_errors: BTreeMap::new(),
@@ -231,6 +235,7 @@ impl Observer {
             payloads,
             sample_requests,
             receivers,
+            services,
             tracer,
             examiner,
             decode_errors,
@@ -260,6 +265,7 @@ impl Observer {
             sample_requests.len(),
         ));
         sizes.extend(receivers.sizes());
+        sizes.extend(services.sizes());
         sizes.extend(tracer.sizes());
         sizes.extend(examiner.sizes(settings.endpoints));
         sizes.extend(journal.sizes());
@@ -379,10 +385,16 @@ impl Observer {
         if self.tracer.is_wanted() {
             self.trace(record);
         }
+        // Requests and replies are seldom measured: ordinary topics need no further lookup.
+        let measures_calls = self.services.has_measured();
+        if measures_calls {
+            self.call_seen(record);
+        }
         let graph = graph!(self);
         let journal = &mut self.journal;
         match self.profiler.record(writer, record, journal, graph) {
-            RecordOutcome::Unmeasured => {}
+            RecordOutcome::Unmeasured if measures_calls => {}
+            RecordOutcome::Unmeasured => self.call_seen(record),
             RecordOutcome::Measured => {
                 if self.payloads.is_unsettled(writer) {
                     self.came_again(writer, record);
@@ -400,6 +412,8 @@ impl Observer {
             && !self.discovery.endpoints().contains_key(&writer)
             && !self.discovery.was_disposed(writer, at);
         if is_strange {
+            let graph = graph!(self);
+            let journal = &mut self.journal;
             let outcome = self.profiler.unknown_writer(writer, record, journal, graph);
             if let RecordOutcome::Counted(counted) = outcome {
                 self.counted(writer, &counted);
@@ -508,6 +522,7 @@ impl Observer {
 
     fn gone(&mut self, guid: Guid, endpoint: &Endpoint, now: Timestamp) {
         self.interest.remove(guid);
+        self.services.forget(guid);
         self.tracer.forget(guid);
         self.retire(guid, now);
         self.payloads.release(guid, now);

@@ -4,6 +4,7 @@
 //! were settled when the snapshot was taken.
 
 mod delivery;
+mod service;
 
 use std::sync::Arc;
 
@@ -23,6 +24,7 @@ pub use super::sockets::SocketFacts;
 use super::topic_kind::TopicKind;
 use super::watch::Watch;
 pub use delivery::{AcknowledgementFacts, DeliveryFacts, Subscriber};
+pub use service::{ActionFacts, GoalCounts, LatencyFacts, ServiceFacts};
 
 /// All facts at the time `at`. Lists are sorted by identity.
 #[derive(Clone, Debug, Default)]
@@ -41,6 +43,10 @@ pub struct Snapshot {
     pub sockets: Vec<SocketFacts>,
     /// Watchlist entries, in configuration order.
     pub watches: Vec<WatchFacts>,
+    /// Services with calls, sorted by domain and name.
+    pub services: Vec<ServiceFacts>,
+    /// Actions with goals, sorted by domain and name.
+    pub actions: Vec<ActionFacts>,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.
@@ -285,7 +291,7 @@ pub struct WatchedTopicFacts {
 /// Number of parse failures of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DecodeErrorCount {
-    /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`.
+    /// Stage of parsing: `frame`, `rtps`, `spdp`, `sedp`, `entities`, `request`.
     pub stage: &'static str,
     /// Reason, from [`ros2probe_wire::Reason::label`].
     pub reason: &'static str,
@@ -297,8 +303,8 @@ pub struct DecodeErrorCount {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
-    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `payloads`,
-    /// `history`.
+    /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `calls`,
+    /// `payloads`, `history`.
     pub table: &'static str,
     /// Number of entries (bytes for `reassembly` and `payloads`).
     pub size: u64,

@@ -127,6 +127,12 @@ impl Topics {
             .copied()
     }
 
+    /// Returns whether there is a topic with this DDS name.
+    #[must_use]
+    pub fn knows(&self, domain_id: DomainId, dds_name: &str) -> bool {
+        self.index.contains_key(&(domain_id, dds_name.into()))
+    }
+
     /// Returns all topics, sorted by domain and DDS name.
     pub fn iter(&self) -> impl Iterator<Item = (TopicId, &Topic)> {
         self.index

@@ -78,3 +78,10 @@ test('an age is in whole seconds', () => {
     assert.equal(format.age(seconds), text);
   }
 });
+
+test('the calls of a service are one line', () => {
+  assert.equal(format.calls(null), '');
+  assert.equal(format.calls({ requests: 1, hanging: 0 }), '1 call');
+  const all = { requests: 3, hanging: 1, latency_p50_seconds: 0.00422, latency_p99_seconds: 0.0075 };
+  assert.equal(format.calls(all), '3 calls, p50 4.22 ms, p99 7.50 ms, 1 hanging');
+});

@@ -2,7 +2,7 @@
 
 import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
-import { bytes, count, date, percent, several } from '../format.js';
+import { bytes, calls, count, date, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
@@ -137,7 +137,7 @@ export function NodeView({ name, query }) {
   const node = state.nodeNamed(name, domain);
   const scope = node ? `?domain_id=${node.domain}` : '';
   const details = usePoll(node ? named('nodes', name.replace(/^\//, ''), scope) : null, 5000);
-  const services = usePoll(node ? `services${scope}${scope ? '&' : '?'}hidden=true` : null, 0);
+  const services = usePoll(node ? `services${scope}${scope ? '&' : '?'}hidden=true` : null, 5000);
   const { byId } = useProcesses();
   if (!node) {
     return html`<h1 tabindex="-1"><${Name} text=${name} /></h1>
@@ -146,14 +146,16 @@ export function NodeView({ name, query }) {
   const { data } = details;
   const findings = state.findings.filter((finding) => finding.node === node.id);
   const instances = node.participants.map((id) => state.participants.get(id)).filter(Boolean);
-  const names = new Set((services.data?.services ?? []).map((/** @type {any} */ each) => each.name));
-  const known = PARAMETER_SERVICES.filter((each) => names.has(`${name}/${each}`));
+  const byName = new Map((services.data?.services ?? []).map((/** @type {any} */ each) =>
+    [each.name, each]));
+  const known = PARAMETER_SERVICES.filter((each) => byName.has(`${name}/${each}`));
   const list = (/** @type {string} */ title, /** @type {any[]|undefined} */ rows,
     /** @type {string|null} */ view) => rows && rows.length > 0 && html`<section
     aria-label=${title}><h2>${title} (${count(rows.length)})</h2><ul class="plain">${rows.map((row) => html`
     <li key=${row.name}>${view ? html`<a href=${address(view, row.name, { domain: node.domain })}><${Name}
       text=${row.name} /></a>` : html`<${Name} text=${row.name} />`} <span class="dim"><${Name}
-      text=${row.types.join(', ')} /></span></li>`)}</ul></section>`;
+      text=${row.types.join(', ')} /></span> ${view ? '' : calls(byName.get(row.name)?.calls)}</li>`)}
+    </ul></section>`;
   return html`<h1 tabindex="-1"><${Name} text=${node.name} /></h1>
     <p class="facts">${state.hasDomains() && html`<span class="dim">Domain</span> ${node.domain} `}
       <a href=${address('graph', null, { focus: nodeKey(node), hops: 1 })}>In the graph</a></p>

@@ -13,11 +13,13 @@ use ros2probe_model::diagnosis::{
 };
 use ros2probe_model::discovery::Addresses;
 use ros2probe_model::histogram::Histogram;
+use ros2probe_model::services::latency::Latencies;
 use ros2probe_model::snapshot::{
-    AcknowledgementFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered, DeliveryFacts,
-    Direction, EndpointFacts, Measurement, NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts,
-    Snapshot, SocketFacts, Subscriber, TableFacts, TopicFacts, Transport, TransportCount,
-    UnknownWriterFacts, WatchFacts, WatchState, WatchedTopicFacts,
+    AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
+    DeliveryFacts, Direction, EndpointFacts, GoalCounts, LatencyFacts, Measurement, NodeFacts,
+    ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts, Subscriber,
+    TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts, WatchFacts, WatchState,
+    WatchedTopicFacts,
 };
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_model::watch::Watch;
@@ -78,6 +80,8 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             first_seen: Timestamp(3),
             measurement: measurement(),
         }],
+        services: vec![service()],
+        actions: vec![action()],
         diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
@@ -105,6 +109,45 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
 }
 
 /// Returns one finding of each kind.
+fn service() -> ServiceFacts {
+    ServiceFacts {
+        domain_id: DomainId(0),
+        name: "/add_two_ints".into(),
+        requests: 9,
+        answered: 7,
+        unanswered: 2,
+        open: 2,
+        hanging: 1,
+        latency: latencies(&[0.0012, 0.004]),
+        suspended: false,
+        exact: false,
+    }
+}
+
+fn action() -> ActionFacts {
+    ActionFacts {
+        domain_id: DomainId(0),
+        name: "/fibonacci".into(),
+        goals: GoalCounts {
+            accepted: 5,
+            rejected: 1,
+            succeeded: 2,
+            canceled: 1,
+            aborted: 1,
+        },
+        open: 1,
+        duration: latencies(&[3.5, 12.0]),
+    }
+}
+
+fn latencies(values: &[f64]) -> LatencyFacts {
+    let mut latencies = Latencies::default();
+    for value in values {
+        latencies.observe(Duration::from_secs_f64(*value));
+    }
+    latencies.facts()
+}
+
 fn diagnoses() -> Diagnoses {
     let guid = |entity: [u8; 4]| Guid::new(GuidPrefix([1; 12]), EntityId(entity));
     let (writer, reader) = (guid([0, 0, 1, 3]), guid([0, 0, 2, 4]));
@@ -147,6 +190,15 @@ fn diagnoses() -> Diagnoses {
             topic: topic.clone(),
             reader,
             reason: Unmatched::Type,
+        },
+        Diagnosis::HangingCall {
+            topic: TopicKey {
+                domain_id: DomainId(0),
+                dds_name: "rq/add_two_intsRequest".into(),
+                name: "/add_two_ints".into(),
+                kind: TopicKind::ServiceRequest,
+            },
+            writer,
         },
         Diagnosis::NodeInSeveralDomains {
             node: "/lidar".into(),

@@ -9,6 +9,7 @@ mod flags;
 mod inline_qos;
 mod locator;
 mod payload;
+mod request_header;
 
 use core::fmt;
 use core::ops::{Add, AddAssign, Sub};
@@ -19,6 +20,7 @@ pub use flags::SubmessageFlags;
 pub use inline_qos::{InlineQos, SampleIdentity, StatusInfo};
 pub use locator::{Locator, LocatorKind};
 pub use payload::Payload;
+pub use request_header::RequestHeader;
 
 /// Vendor of an implementation (RTPS 2.5, 9.3.2; numbers assigned by the OMG).
 #[derive(Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]

@@ -79,6 +79,9 @@ struct Find {
 struct Info {
     /// Name of the service, e.g. /talker/list_parameters
     service_name: String,
+    /// Also print the number of calls and the time until their replies
+    #[arg(short = 'v', long)]
+    verbose: bool,
     #[command(flatten)]
     spinning: Spinning,
     #[command(flatten)]
@@ -133,13 +136,20 @@ impl Find {
 
 impl Info {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let names = Graph::reach(&self.target)?.names()?;
+        let graph = Graph::reach(&self.target)?;
+        let names = graph.names()?;
         let services = shown(&names, hidden);
-        answer(service::info(
-            &self.service_name,
-            services,
-            self.target.dialect(),
-        ))
+        let mut text = service::info(&self.service_name, services, self.target.dialect());
+        if self.verbose
+            && let Ok(text) = &mut text
+        {
+            let services = graph.services()?.services;
+            let mut services = services.iter();
+            if let Some(found) = services.find(|service| service.name == self.service_name) {
+                text.push_str(&service::calls(found));
+            }
+        }
+        answer(text)
     }
 }
 

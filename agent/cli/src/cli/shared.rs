@@ -12,6 +12,7 @@ use ros2probe_api::names::Names;
 use ros2probe_api::nodes::Node;
 use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
+use ros2probe_api::services::ServiceList;
 use ros2probe_api::topics::Topic;
 use serde::de::DeserializeOwned;
 
@@ -93,6 +94,13 @@ impl Graph {
     /// The node of this name, with hidden entities. `None` if it does not exist.
     pub(crate) fn node(&self, name: &str) -> Result<Option<Node<'static>>> {
         self.thing("nodes", name, Code::NoSuchNode)
+    }
+
+    /// All services, with hidden ones and their calls.
+    pub(crate) fn services(&self) -> Result<ServiceList<'static>> {
+        let domain_id = self.domain_id;
+        let path = format!("/services?domain_id={domain_id}&hidden=true");
+        Ok(self.agent.get_visible(&path)?)
     }
 
     fn thing<T: DeserializeOwned>(&self, noun: &str, name: &str, code: Code) -> Result<Option<T>> {

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use ros2probe_api::names::ServiceName;
+use ros2probe_api::services::Service;
 
 use super::{Dialect, Refused};
 
@@ -60,8 +61,42 @@ pub fn info<'a>(
     ))
 }
 
+/// Text about the calls of a service, which `service info` prints below with `-v`.
+#[must_use]
+pub fn calls(service: &Service<'_>) -> String {
+    let mut text = match &service.calls {
+        None => "Calls: none seen\n".to_owned(),
+        Some(calls) => {
+            let mut text = format!(
+                "Calls: {}\n  Answered: {}\n  Unanswered: {}\n  Hanging: {}\n",
+                calls.requests, calls.answered, calls.unanswered, calls.hanging
+            );
+            let quantiles = [
+                ("p50", calls.latency_p50_seconds),
+                ("p99", calls.latency_p99_seconds),
+            ];
+            for (name, seconds) in quantiles {
+                if let Some(seconds) = seconds {
+                    let _ = writeln!(text, "  Latency {name}: {:.3} ms", seconds * 1e3);
+                }
+            }
+            if calls.suspended {
+                text.push_str("  Suspended: its messages exceed 4 MiB/s\n");
+            }
+            text
+        }
+    };
+    if !service.unseen.is_empty() {
+        let paths = service.unseen.join(", ").replace('_', " ");
+        let _ = writeln!(text, "Calls not seen: through {paths}");
+    }
+    text
+}
+
 #[cfg(test)]
 mod tests {
+    use ros2probe_api::services::Calls;
+
     use super::*;
 
     fn services() -> [ServiceName<'static>; 2] {
@@ -89,6 +124,33 @@ mod tests {
             "/add [a/srv/Add]\n/fib/_action/send_goal [a/srv/Add]\n"
         );
         assert_eq!(said(true, true), "2\n");
+    }
+
+    #[test]
+    fn calls_are_printed_with_what_is_not_seen() {
+        let mut service = Service {
+            unseen: vec!["shared_memory".into()],
+            ..Service::default()
+        };
+        assert_eq!(
+            calls(&service),
+            "Calls: none seen\nCalls not seen: through shared memory\n"
+        );
+        service.unseen.clear();
+        service.calls = Some(Calls {
+            requests: 10,
+            answered: 8,
+            unanswered: 2,
+            hanging: 1,
+            latency_p50_seconds: Some(0.0042),
+            latency_p99_seconds: Some(0.0101),
+            ..Calls::default()
+        });
+        assert_eq!(
+            calls(&service),
+            "Calls: 10\n  Answered: 8\n  Unanswered: 2\n  Hanging: 1\n  Latency p50: 4.200 ms\n  \
+             Latency p99: 10.100 ms\n"
+        );
     }
 
     #[test]

@@ -262,6 +262,9 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
             let reason = safe(unmatched(reason));
             format!("{} has no matching publisher ({reason})", name(reader))
         }
+        Open::Known(Diagnosis::HangingCall { writer }) => {
+            format!("{} receives no reply", name(writer))
+        }
         // Findings about nodes, not topics.
         Open::Known(Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. }) => {
             finding.kind().to_owned()

@@ -12,3 +12,4 @@ mod incident;
 mod installed;
 mod learn;
 mod robot;
+mod services;

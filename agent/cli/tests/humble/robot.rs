@@ -36,7 +36,7 @@ const ECHOED: [&str; 3] = ["/imu", "/cam", "/odom"];
 /// Large messages are seldom captured: their pieces reuse the same memory. The rest is always counted.
 const CAPTURED: f64 = 0.7;
 const LARGE: [&str; 2] = ["/cam", "/points"];
-const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
+pub(super) const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
 <profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
   <transport_descriptors>
     <transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type></transport_descriptor>

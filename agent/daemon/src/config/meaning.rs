@@ -143,6 +143,7 @@ impl Reader {
             otlp: otlp(shape.otlp.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
             topic_grace: Duration::from_secs(shape.topic_grace_s),
+            service_timeout: Duration::from_secs_f64(shape.service_timeout_s),
             state_directory: state(&shape.state_directory),
             log: shape.log,
         }

@@ -61,6 +61,8 @@ pub struct Config {
     pub recordings: RecordingSettings,
     /// Time for which a topic without endpoints is still reported.
     pub topic_grace: Duration,
+    /// Time without a reply after which a call of a service is reported as hanging.
+    pub service_timeout: Duration,
     /// Directory of the saved discovery state.
     pub state_directory: StateChoice,
     /// Least severe level that is logged.
@@ -377,6 +379,10 @@ impl Config {
             ("recordings", self.recordings != new.recordings),
             ("topic_grace_s", self.topic_grace != new.topic_grace),
             (
+                "service_timeout_s",
+                self.service_timeout != new.service_timeout,
+            ),
+            (
                 "state_directory",
                 self.state_directory != new.state_directory,
             ),
@@ -436,6 +442,7 @@ impl Default for Config {
             otlp: OtlpSettings::default(),
             recordings: RecordingSettings::default(),
             topic_grace: Duration::from_secs(defaults::topic_grace_s()),
+            service_timeout: Duration::from_secs_f64(defaults::service_timeout_s()),
             state_directory: StateChoice::default(),
             log: Level::default(),
         }
@@ -473,6 +480,10 @@ mod defaults {
 
     pub(super) const fn topic_grace_s() -> u64 {
         600
+    }
+
+    pub(super) const fn service_timeout_s() -> f64 {
+        5.0
     }
 
     pub(super) const fn snapshot_seconds() -> u64 {

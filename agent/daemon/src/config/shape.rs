@@ -46,6 +46,11 @@ pub(super) struct ConfigShape {
     #[schemars(range(min = 0, max = 604_800))]
     #[serde(default = "defaults::topic_grace_s")]
     pub(super) topic_grace_s: u64,
+    /// Time without a reply after which a call of a service is reported as hanging, in seconds. The
+    /// results of actions are exempt.
+    #[schemars(range(min = 0.1, max = 86_400.0))]
+    #[serde(default = "defaults::service_timeout_s")]
+    pub(super) service_timeout_s: f64,
     /// Directory of the saved discovery state, so that a restart on a running robot loses no name:
     /// an absolute path, `off`, or `auto`: `$STATE_DIRECTORY` as set by the service manager, else
     /// /var/lib/ros2probe if it exists and is writable.

@@ -187,6 +187,8 @@ impl Occurrence {
             Self::Robot(EventKind::Diagnosis { resolved, finding }) => match (finding, resolved) {
                 (Diagnosis::QosIncompatible { .. }, false) => &table::QOS_INCOMPATIBLE,
                 (Diagnosis::QosIncompatible { .. }, true) => &table::QOS_RESOLVED,
+                (Diagnosis::HangingCall { .. }, false) => &table::CALL_HANGING,
+                (Diagnosis::HangingCall { .. }, true) => &table::CALL_RESOLVED,
                 (_, false) => &table::GRAPH_DIAGNOSED,
                 (_, true) => &table::GRAPH_RESOLVED,
             },
@@ -374,6 +376,13 @@ fn loss(loss: &LossBurst) -> Values {
 
 fn finding(finding: &Diagnosis) -> Values {
     let mut values = Vec::new();
+    if let Diagnosis::HangingCall { topic, writer } = finding {
+        return vec![
+            domain(topic.domain_id),
+            ("ros_service", Some(text(&topic.name))),
+            ("writer", written(writer)),
+        ];
+    }
     if !matches!(finding, Diagnosis::QosIncompatible { .. }) {
         values.push(("diagnosis", Some(text(finding.kind()))));
     }
@@ -419,6 +428,8 @@ fn finding(finding: &Diagnosis) -> Values {
             ("reader", written(reader)),
             ("reason", Some(text(reason.label()))),
         ],
+        // Described above.
+        Diagnosis::HangingCall { .. } => Vec::new(),
         Diagnosis::NodeInSeveralDomains {
             node,
             participant,

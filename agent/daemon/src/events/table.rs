@@ -104,6 +104,7 @@ const ENDPOINT_GONE: &[&str] = &[
     "cause",
 ];
 const QOS: &[&str] = &["domain_id", "topic", "writer", "reader", "policies"];
+const CALL: &[&str] = &["domain_id", "ros_service", "writer"];
 const FINDING: &[&str] = &[
     "diagnosis",
     "domain_id",
@@ -220,6 +221,18 @@ pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
     FINDING,
     "The fault is gone; the attributes describe it.",
 );
+pub(super) const CALL_HANGING: Definition = Definition::new(
+    "ros2.service.call_hanging",
+    Severity::Warn,
+    CALL,
+    "A client called a service and received no reply within service_timeout_s.",
+);
+pub(super) const CALL_RESOLVED: Definition = Definition::new(
+    "ros2.service.call_resolved",
+    Severity::Info,
+    CALL,
+    "The client's calls are answered now, the client left, or ten minutes have passed.",
+);
 
 pub(super) const STARTED: Definition = Definition::new(
     "ros2probe.agent.started",
@@ -322,6 +335,8 @@ pub const EVENTS: &[Definition] = &[
     QOS_RESOLVED,
     GRAPH_DIAGNOSED,
     GRAPH_RESOLVED,
+    CALL_HANGING,
+    CALL_RESOLVED,
     STARTED,
     CAPTURE_DROPPED,
     CAPTURE_BLIND,

@@ -8,11 +8,13 @@
 mod agent;
 mod delivery;
 mod diagnosis;
+mod service;
 
 use crate::stability::Stability;
 pub(super) use agent::*;
 pub(super) use delivery::*;
 pub(super) use diagnosis::*;
+pub(super) use service::*;
 
 /// A metric family.
 #[derive(Debug, PartialEq, Eq)]
@@ -393,6 +395,18 @@ pub const CATALOGUE: &[Metric] = &[
     UNFED_SUBSCRIPTIONS,
     DUPLICATE_NODES,
     NODE_DOMAINS,
+    SERVICE_REQUESTS,
+    SERVICE_ANSWERED,
+    SERVICE_UNANSWERED,
+    SERVICE_HANGING,
+    SERVICE_LATENCY,
+    SERVICE_P50,
+    SERVICE_P99,
+    SERVICE_SUSPENDED,
+    ACTION_GOALS,
+    ACTION_OPEN,
+    ACTION_P50,
+    ACTION_P99,
     TOPIC_INFO,
     TOPIC_PUBLISHERS,
     TOPIC_SUBSCRIPTIONS,

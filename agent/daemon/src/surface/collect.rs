@@ -13,6 +13,7 @@ use super::foxglove::Viewers;
 use super::metric_sink::MetricSink;
 use super::otlp::Exports;
 use super::ros2_metrics::{self, TopicRows};
+use super::service_metrics;
 use crate::agent_facts::SourceKind;
 use crate::events::{AgentEvent, EventLog};
 use crate::limit_facts::LimitFigures;
@@ -76,6 +77,7 @@ pub(super) fn collect(
 
     ros2_metrics::graph(sink, snapshot)?;
     diagnosis_metrics::diagnoses(sink, snapshot)?;
+    service_metrics::services(sink, snapshot, &settings)?;
     let deliveries = Deliveries::new(&rows.shown);
     ros2_metrics::topics(sink, &rows.shown, &settings)?;
     delivery_metrics::sums(sink, &rows.shown, &settings)?;

@@ -21,6 +21,7 @@ mod metric_sink;
 pub mod otlp;
 mod process;
 mod ros2_metrics;
+mod service_metrics;
 mod serving;
 mod text;
 #[cfg(feature = "tls")]

@@ -32,6 +32,7 @@ impl Observer {
             };
             self.read(found, sample, vendor, &origin);
             self.follow_up(origin.at);
+            self.identify_call(found, sample, vendor, origin.at);
             self.keep(found);
         }
     }

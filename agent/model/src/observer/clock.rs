@@ -81,6 +81,7 @@ impl Observer {
                 .locate(|prefix| self.receivers.is_local(prefix));
             self.promote();
             self.judge(now);
+            self.advance_calls(now);
             self.report_losses();
             self.examine(now);
             self.tracer.advance(now);
@@ -89,7 +90,8 @@ impl Observer {
 
     pub(super) fn examine(&mut self, now: Timestamp) {
         let before = Arc::clone(self.examiner.current());
-        self.examiner.examine(&self.discovery, &self.topics, now);
+        self.examiner
+            .examine(&self.discovery, &self.topics, &self.services, now);
         let after = self.examiner.current();
         if Arc::ptr_eq(&before, after) {
             return;

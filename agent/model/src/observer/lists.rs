@@ -120,9 +120,11 @@ impl Observer {
             Role::Writer => {
                 let counts = naming(endpoint).is_some_and(|naming| naming.counts);
                 let measured = is_watched && counts;
+                let is_call = self.services.announce(guid, topic.domain_id, &topic.naming);
                 let verdict = match topic.naming.kind {
                     TopicKind::Discovery => Verdict::Capture,
                     _ if measured && wants_bytes(topic) => Verdict::Capture,
+                    _ if is_call => Verdict::Capture,
                     _ if measured => Verdict::Meter,
                     _ => Verdict::Ignore,
                 };
@@ -146,6 +148,9 @@ impl Observer {
                     _ => self.payloads.release(guid, now),
                 }
                 if measured {
+                    if topic.naming.kind.is_service() {
+                        self.services.note_measured();
+                    }
                     let (traits, opened) = (traits(endpoint), topic.reader_appeared);
                     self.profiler.measure(guid, id, traits, opened, now);
                 } else {

@@ -35,6 +35,8 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         unknown_writers: unknown_writers(observer, now),
         sockets: deliveries::sockets(observer),
         watches: watches(observer),
+        services: observer.services.facts(),
+        actions: observer.services.action_facts(),
         diagnoses: Arc::clone(observer.examiner.current()),
         diagnosed: Arc::clone(observer.examiner.since()),
         churn: observer.discovery.churn.facts(),
@@ -352,6 +354,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (addresses, addresses_limit, addresses_evictions) = observer.receivers.addresses();
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let (spans, spans_limit, spans_evictions) = observer.tracer.size();
+    let (calls, calls_limit, calls_evictions) = observer.services.size();
     let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
     let quota = profiler.quota();
     let refused = profiler.iter().filter_map(|(_, measured)| {
@@ -405,6 +408,7 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         table("addresses", addresses, addresses_limit, addresses_evictions),
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
         table("spans", spans, spans_limit, spans_evictions),
+        table("calls", calls, calls_limit, calls_evictions),
         table("payloads", payloads, payloads_limit, payloads_evictions),
     ]
 }

@@ -30,6 +30,8 @@ pub struct Settings {
     pub topic_grace: Duration,
     /// Longest time from a request for payloads to the first captured payload.
     pub payload_delay: Duration,
+    /// Time without a reply after which a call of a service is reported as hanging.
+    pub service_timeout: Duration,
     /// Whether records contain the sender; those of a capture file do not.
     pub directed: bool,
 }
@@ -48,6 +50,7 @@ impl Default for Settings {
             payload_bytes: 20 << 20,
             topic_grace: Duration::from_secs(600),
             payload_delay: payloads::PAYLOAD_DELAY,
+            service_timeout: Duration::from_secs(5),
             directed: true,
         }
     }

@@ -1,4 +1,7 @@
 //! Forged messages in which every field varies fill every table, but none beyond its cap.
+
+mod calls;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
@@ -479,7 +482,13 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     assert_filled(&crowded, &["discovery.endpoints", "discovery.nodes"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    for (table, (entries, cap)) in of_one.into_iter().chain(crowded) {
+    let (called, half, whole) = drive(MESSAGES * 2 / 5, 1_000_000, &mut calls::calls);
+    println!("{half} bytes after half of it, {whole} at the end\n{called:#?}");
+    assert_filled(&called, &["services.identities", "services.clients"]);
+    assert!(whole < 96 << 20, "{whole} bytes");
+
+    let further = of_one.into_iter().chain(crowded).chain(called);
+    for (table, (entries, cap)) in further {
         let seen = largest.entry(table).or_insert((0, cap));
         seen.0 = seen.0.max(entries);
     }

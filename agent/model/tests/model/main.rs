@@ -20,4 +20,5 @@ mod observer;
 mod order;
 mod restart;
 mod room;
+mod services;
 mod tables;

@@ -19,6 +19,13 @@ impl Message {
         Self(bytes)
     }
 
+    /// Returns a message of Fast DDS.
+    pub fn from_fast(prefix: GuidPrefix) -> Self {
+        let mut bytes = b"RTPS\x02\x01\x01\x0f".to_vec();
+        bytes.extend_from_slice(&prefix.0);
+        Self(bytes)
+    }
+
     pub fn info_ts(self, nanoseconds: u64) -> Self {
         let seconds = u32::try_from(nanoseconds / 1_000_000_000).unwrap();
         let fraction =
@@ -31,6 +38,19 @@ impl Message {
     pub fn data(self, writer: EntityId, number: u64, payload: &[u8]) -> Self {
         let body = [&fixed(16, writer, number)[..], payload].concat();
         self.submessage(0x15, 0x05, &body)
+    }
+
+    /// Adds a DATA with inline QoS and a payload.
+    pub fn data_with(
+        self,
+        writer: EntityId,
+        number: u64,
+        inline_qos: &[(u16, Vec<u8>)],
+        payload: &[u8],
+    ) -> Self {
+        let inline_qos = parameters(inline_qos);
+        let body = [&fixed(16, writer, number)[..], &inline_qos, payload].concat();
+        self.submessage(0x15, 0x01 | 0x02 | 0x04, &body)
     }
 
     /// Adds a disposal with a key as payload, as Cyclone DDS writes it.

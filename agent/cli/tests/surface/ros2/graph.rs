@@ -161,3 +161,28 @@ fn what_humble_lacks_is_printed_as_jazzy_prints_it() {
     let gid = "\nGID: 01.10.b4.2b.fd.42.e1.d5.5f.39.f0.30.00.00.30.03\n";
     assert!(out.contains(gid), "{out}");
 }
+
+#[test]
+fn service_info_prints_the_calls_only_when_verbose() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../testing/data");
+    let capture = data.join("cyclonedds/lifecycle-2ns/capture.pcap.gz");
+    let ask = |option: &[&str]| {
+        let mut words = vec!["service", "info", "/robot1/add_two_ints"];
+        words.extend([
+            "--until",
+            "1795143025",
+            "--replay",
+            capture.to_str().unwrap(),
+        ]);
+        words.extend(option);
+        stdout(&run(&words))
+    };
+    let plain = ask(&[]);
+    assert_eq!(
+        plain,
+        "Type: example_interfaces/srv/AddTwoInts\nClients count: 1\nServices count: 1\n"
+    );
+    let calls = "Calls: 5\n  Answered: 5\n  Unanswered: 0\n  Hanging: 0\n  Latency p50: 0.933 ms\n  \
+                 Latency p99: 1.855 ms\n";
+    assert_eq!(ask(&["-v"]), format!("{plain}{calls}"));
+}

@@ -17,7 +17,7 @@ use super::party::{Parties, action, action_type};
 use super::problem::Problem;
 use super::scope::Scope;
 use super::services::sorted;
-use ros2probe_api::services::{Action, ActionList};
+use ros2probe_api::services::{Action, ActionList, Goals};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
 
@@ -45,7 +45,11 @@ async fn list(
     let answer = ActionList {
         timestamp_seconds: snapshot.at.seconds(),
         actions: actions
-            .filter_map(|((domain_id, name), parts)| view(domain_id.0, name, &parts, &index))
+            .filter_map(|((domain_id, name), parts)| {
+                let goals = goals(snapshot, domain_id, &name);
+                let action = view(domain_id.0, name, &parts, &index)?;
+                Some(Action { goals, ..action })
+            })
             .collect(),
     };
     Ok(Json(answer).into_response())
@@ -77,6 +81,22 @@ pub(super) fn parties<'a>(parts: &[&'a TopicFacts]) -> Parties<'a> {
     parties
 }
 
+/// Returns the goals of an action, if any was seen.
+fn goals(snapshot: &Snapshot, domain_id: DomainId, name: &str) -> Option<Goals> {
+    let mut actions = snapshot.actions.iter();
+    let facts = actions.find(|each| each.domain_id == domain_id && each.name == name)?;
+    Some(Goals {
+        accepted: facts.goals.accepted,
+        rejected: facts.goals.rejected,
+        succeeded: facts.goals.succeeded,
+        canceled: facts.goals.canceled,
+        aborted: facts.goals.aborted,
+        open: facts.open as u64,
+        duration_p50_seconds: facts.duration.p50,
+        duration_p99_seconds: facts.duration.p99,
+    })
+}
+
 /// Returns `None` for an action without endpoints.
 fn view<'a>(
     domain_id: u32,
@@ -97,6 +117,7 @@ fn view<'a>(
         types: sorted(types.filter_map(|each| action_type(each))),
         servers,
         clients,
+        goals: None,
         parts: parts
             .iter()
             .map(|part| Cow::Borrowed(&*part.dds_name))

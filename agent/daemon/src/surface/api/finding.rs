@@ -48,6 +48,9 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
                 reason: reason.label().into(),
             }
         }
+        diagnosis::Diagnosis::HangingCall { writer, .. } => Diagnosis::HangingCall {
+            writer: writer.to_string(),
+        },
         diagnosis::Diagnosis::NodeInSeveralDomains { domains, .. } => {
             Diagnosis::NodeInSeveralDomains {
                 domains: domains.iter().map(|id| id.0).collect(),

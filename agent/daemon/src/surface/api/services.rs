@@ -17,8 +17,8 @@ use super::parameters::Parameters;
 use super::party::{Parties, service_type};
 use super::problem::Problem;
 use super::scope::Scope;
-use ros2probe_api::services::{Service, ServiceList};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_api::services::{Calls, Service, ServiceList};
+use ros2probe_model::snapshot::{ServiceFacts, Snapshot, TopicFacts, Transport};
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::DomainId;
 
@@ -53,7 +53,14 @@ async fn list(
         timestamp_seconds: snapshot.at.seconds(),
         services: services(snapshot, scope)
             .into_iter()
-            .filter_map(|((domain_id, name), halves)| view(domain_id.0, name, &halves, &index))
+            .filter_map(|((domain_id, name), halves)| {
+                let service = view(domain_id.0, name, &halves, &index)?;
+                Some(with_calls(
+                    service,
+                    &halves,
+                    facts(snapshot, domain_id, name),
+                ))
+            })
             .collect(),
     };
     Ok(Json(answer).into_response())
@@ -99,6 +106,48 @@ pub(super) fn sorted<'a>(types: impl Iterator<Item = &'a str>) -> Vec<Cow<'a, st
     types.into_iter().map(Cow::Borrowed).collect()
 }
 
+/// Returns the calls of a service, if any was seen.
+fn facts<'a>(snapshot: &'a Snapshot, domain_id: DomainId, name: &str) -> Option<&'a ServiceFacts> {
+    let place = snapshot
+        .services
+        .binary_search_by(|each| (each.domain_id, &*each.name).cmp(&(domain_id, name)));
+    snapshot.services.get(place.ok()?)
+}
+
+fn with_calls<'a>(
+    service: Service<'a>,
+    halves: &Halves<'_>,
+    facts: Option<&ServiceFacts>,
+) -> Service<'a> {
+    let exact = facts.is_some_and(|facts| facts.exact);
+    let transports = halves.topics().flat_map(|topic| &topic.transports);
+    let is_unseen = |transport: &Transport| match transport {
+        Transport::Network => false,
+        Transport::SharedMemory => !exact,
+        Transport::DataSharing | Transport::SameProcess | Transport::Iceoryx => true,
+    };
+    let unseen = transports.map(|count| count.transport).filter(is_unseen);
+    let unseen: BTreeSet<_> = unseen.map(Transport::label).collect();
+    Service {
+        calls: facts.map(calls),
+        unseen: unseen.into_iter().map(Cow::Borrowed).collect(),
+        ..service
+    }
+}
+
+fn calls(facts: &ServiceFacts) -> Calls {
+    Calls {
+        requests: facts.requests,
+        answered: facts.answered,
+        unanswered: facts.unanswered,
+        hanging: facts.hanging as u64,
+        open: facts.open as u64,
+        latency_p50_seconds: facts.latency.p50,
+        latency_p99_seconds: facts.latency.p99,
+        suspended: facts.suspended,
+    }
+}
+
 /// Returns `None` for a service without endpoints.
 fn view<'a>(
     domain_id: u32,
@@ -123,6 +172,8 @@ fn view<'a>(
         clients,
         requests: measured(halves.requests),
         replies: measured(halves.replies),
+        calls: None,
+        unseen: Vec::new(),
         diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
     })
 }

@@ -227,6 +227,18 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
             reader: Some(reader.to_string()),
             ..unmatched(kind, topic, *reader, reason.label(), ends, SUBSCRIBER)
         },
+        Diagnosis::HangingCall { topic, writer } => {
+            let text = format!(
+                "{} calls {} and receives no reply",
+                ends.who(*writer),
+                topic.name
+            );
+            let about = format!("{}|{}|{writer}", topic.domain_id, topic.dds_name);
+            Finding {
+                writer: Some(writer.to_string()),
+                ..finding(kind, Severity::Warning, &about, text)
+            }
+        }
         Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
             let listed: Vec<_> = domains.iter().map(DomainId::to_string).collect();
             let text = format!("{node} is in several domains: {}", listed.join(", "));

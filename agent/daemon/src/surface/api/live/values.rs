@@ -113,7 +113,9 @@ impl Figures<'_> {
                     mark(Flag::Unheard, true);
                 }
                 Diagnosis::UnfedSubscriber { .. } => mark(Flag::Unfed, true),
-                Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. } => {}
+                Diagnosis::DuplicateNode { .. }
+                | Diagnosis::NodeInSeveralDomains { .. }
+                | Diagnosis::HangingCall { .. } => {}
             }
         }
         let measured = topic.measurement.as_deref();

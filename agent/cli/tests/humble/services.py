@@ -1,0 +1,142 @@
+"""A client and a server of real ROS 2 services and of an action, and what the client logs.
+
+    services.py serve           answers /add after some milliseconds, never answers /hang,
+                                executes goals of /fib
+    services.py call LOG COUNT  waits for the server, then obeys lines on standard input:
+                                `add` calls /add COUNT times, `hang` calls /hang once,
+                                `lose` calls /add, which takes 1.5 s, without waiting, `goal`
+                                sends a goal and waits for its result, `end` ends it
+
+Both print `ready`; the client prints `done` after each line. The log has one line of JSON for each
+call: the times at which the call that sends the request began (`began`) and returned (`sent`), and
+at which the response was received by the middleware, if that reports it, and taken from it. Both
+processes have real-time priority, so that other programs do not delay what they log.
+"""
+
+import json
+import os
+import sys
+import threading
+import time
+
+import rclpy
+from example_interfaces.action import Fibonacci
+from example_interfaces.srv import AddTwoInts
+from rclpy.action import ActionClient, ActionServer
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
+from std_srvs.srv import Trigger
+
+# Steps of a goal, in seconds.
+STEPS = 3
+STEP = 0.2
+
+
+def say(word):
+    print(word, flush=True)
+
+
+def add(request, response):
+    time.sleep(request.a * 1e-3)
+    response.sum = request.a + request.b
+    return response
+
+
+def hang(_request, response):
+    threading.Event().wait()
+    return response
+
+
+def execute(goal):
+    for _ in range(STEPS):
+        time.sleep(STEP)
+    goal.succeed()
+    return Fibonacci.Result(sequence=[0, 1])
+
+
+def serve():
+    node = rclpy.create_node("server")
+    group = ReentrantCallbackGroup()
+    node.create_service(AddTwoInts, "add", add, callback_group=group)
+    node.create_service(Trigger, "hang", hang, callback_group=group)
+    server = ActionServer(node, Fibonacci, "fib", execute, callback_group=group)
+    say("ready")
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(node)
+    executor.spin()
+    server.destroy()
+
+
+class Client:
+    def __init__(self, log, count):
+        self.file = open(log, "w", buffering=1)
+        self.count = count
+        self.node = rclpy.create_node("client")
+        self.adder = self.node.create_client(AddTwoInts, "add")
+        self.hanger = self.node.create_client(Trigger, "hang")
+        self.action = ActionClient(self.node, Fibonacci, "fib")
+        self.adder.wait_for_service()
+        self.hanger.wait_for_service()
+        self.action.wait_for_server()
+        # Some time for the agent, and for the endpoints at the other end.
+        time.sleep(1.0)
+
+    def call(self, milliseconds):
+        """Calls /add, and takes the response as soon as the middleware has it."""
+        handle = self.adder.handle
+        request = AddTwoInts.Request(a=milliseconds, b=1)
+        with handle:
+            began = time.time_ns()
+            handle.send_request(request)
+            sent = time.time_ns()
+            while True:
+                header, response = handle.take_response(AddTwoInts.Response)
+                taken = time.time_ns()
+                if response is not None:
+                    break
+                time.sleep(0.000_002)
+        assert response.sum == milliseconds + 1
+        # Cyclone DDS does not report when it received a response.
+        received = header.received_timestamp or taken
+        self.write({"began": began, "sent": sent, "received": received, "taken": taken})
+
+    def write(self, line):
+        self.file.write(json.dumps(line) + "\n")
+
+    def add(self):
+        for number in range(self.count):
+            self.call(number % 9)
+
+    def hang(self):
+        self.hanger.call_async(Trigger.Request())
+
+    def lose(self):
+        with self.adder.handle:
+            self.adder.handle.send_request(AddTwoInts.Request(a=1500, b=1))
+
+    def goal(self):
+        sent = time.time_ns()
+        accepted = self.action.send_goal_async(Fibonacci.Goal(order=5))
+        rclpy.spin_until_future_complete(self.node, accepted)
+        result = accepted.result().get_result_async()
+        rclpy.spin_until_future_complete(self.node, result)
+        self.write({"goal": True, "sent": sent, "received": time.time_ns()})
+
+
+def call(log, count):
+    client = Client(log, int(count))
+    # The threads of the middleware have a higher priority than this one, which polls.
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    say("ready")
+    for line in sys.stdin:
+        if line.strip() == "end":
+            break
+        getattr(client, line.strip())()
+        say("done")
+
+
+if __name__ == "__main__":
+    # The threads of the middleware inherit it.
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
+    rclpy.init()
+    {"serve": serve, "call": call}[sys.argv[1]](*sys.argv[2:])

@@ -1,0 +1,295 @@
+//! Real services and an action of ROS 2 Humble: the agent's times agree with the client's log, a
+//! hanging call is found, and a lost reply is no answer.
+//!
+//! Needs root and ROS 2 Humble: `make test-ros2`.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, Scrape};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::shared_memory::SharedMemory;
+use ros2probe_testing::harness::{run, wait_until};
+use serde::Deserialize;
+use tempfile::TempDir;
+
+use crate::robot::UDP_ONLY;
+
+const RP: &str = env!("CARGO_BIN_EXE_rp");
+const PATIENCE: Duration = Duration::from_secs(60);
+const CALLS: usize = 1000;
+/// Largest difference between the agent's and the client's median and mean.
+const CLOSE: f64 = 0.000_1;
+/// Largest difference of the 99th percentile, which a delay of ten calls changes.
+const TAIL: f64 = 0.000_2;
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Middleware {
+    Cyclone,
+    FastUdp,
+    /// Shared memory with `capture.shm.exact: uprobe`.
+    FastExact,
+    /// Shared memory, which is sampled.
+    FastSampled,
+}
+
+/// One call or goal of the client's log, in nanoseconds.
+#[derive(Deserialize)]
+struct Logged {
+    #[serde(default)]
+    goal: bool,
+    /// Time at which the request was with the network.
+    sent: u64,
+    /// Time at which the middleware received the response.
+    received: u64,
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn calls_over_cyclone_dds_take_as_long_as_the_client_logs() -> Result<()> {
+    agrees_with_the_client(Middleware::Cyclone)
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn calls_over_fast_dds_and_udp_take_as_long_as_the_client_logs() -> Result<()> {
+    agrees_with_the_client(Middleware::FastUdp)
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn calls_over_shared_memory_with_the_uprobe_take_as_long_as_the_client_logs() -> Result<()> {
+    agrees_with_the_client(Middleware::FastExact)
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn calls_over_sampled_shared_memory_are_reported_as_not_seen() -> Result<()> {
+    let network = Namespace::alone()?;
+    let robot = Robot::start(&network, Middleware::FastSampled)?;
+    let (agent, _server, mut client) = robot.ready()?;
+    robot.obey(&mut client, "add")?;
+    std::thread::sleep(Duration::from_secs(8));
+    let page = agent.scrape()?;
+    ensure!(count(&page, "ros2_service_requests_total", "/add") == 0.0);
+    ensure!(page.sum("ros2_diagnoses", &[("kind", "hanging_call")]) == 0.0);
+    let text = robot.rp(&["service", "info", "-v", "/add"])?;
+    let expected = "Calls: none seen\nCalls not seen: through shared memory\n";
+    ensure!(text.ends_with(expected), "{text}");
+    Ok(())
+}
+
+fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
+    let network = Namespace::alone()?;
+    let robot = Robot::start(&network, middleware)?;
+    let (agent, _server, mut client) = robot.ready()?;
+    robot.obey(&mut client, "add")?;
+    robot.obey(&mut client, "goal")?;
+    let page = agent.scrape_until("all calls are answered", |page| {
+        count(page, "ros2_service_answered_requests_total", "/add") == CALLS as f64
+            && page.sum("ros2_action_goals_total", &[("state", "succeeded")]) == 1.0
+    })?;
+    robot.compare(&page)?;
+    hang(&robot, &agent, &mut client)?;
+    if middleware != Middleware::FastExact {
+        lose(&network, &agent, &mut client)?;
+    }
+    let text = robot.rp(&["service", "info", "-v", "/add"])?;
+    ensure!(text.contains("\n  Latency p50: "), "{text}");
+    client.write_line("end")?;
+    Ok(())
+}
+
+/// A call that the server never answers becomes a finding.
+fn hang(robot: &Robot<'_>, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
+    robot.obey(client, "hang")?;
+    let page = agent.scrape_until("the call hangs", |page| {
+        page.sum("ros2_diagnoses", &[("kind", "hanging_call")]) == 1.0
+    })?;
+    ensure!(count(&page, "ros2_service_hanging_requests", "/hang") == 1.0);
+    ensure!(count(&page, "ros2_service_hanging_requests", "/add") == 0.0);
+    Ok(())
+}
+
+/// A reply that is lost between server and client is no answer until it is repaired.
+fn lose(network: &Namespace, agent: &Agent<'_>, client: &mut Process) -> Result<()> {
+    let nft = |rule: &str| run(&format!("ip netns exec {} nft {rule}", network.name()));
+    nft("add table ip lost")?;
+    nft("add chain ip lost input { type filter hook input priority 0 ; }")?;
+    client.write_line("lose")?;
+    client.wait_for("done", PATIENCE)?;
+    // The server has the request by now, and takes 1.5 s.
+    std::thread::sleep(Duration::from_millis(500));
+    nft("add rule ip lost input meta l4proto udp drop")?;
+    let answered = |page: &Scrape| count(page, "ros2_service_answered_requests_total", "/add");
+    let page = agent.scrape_until("the call hangs", |page| {
+        count(page, "ros2_service_hanging_requests", "/add") == 1.0
+    })?;
+    ensure!(answered(&page) == CALLS as f64, "{}", answered(&page));
+    nft("delete table ip lost")?;
+    agent.scrape_until("the repaired reply is an answer", |page| {
+        answered(page) == (CALLS + 1) as f64
+            && count(page, "ros2_service_hanging_requests", "/add") == 0.0
+    })?;
+    Ok(())
+}
+
+fn count(page: &Scrape, name: &str, service: &str) -> f64 {
+    page.sum(name, &[("ros_service", service)])
+}
+
+/// The host of client and server, with its own `/dev/shm`.
+struct Robot<'n> {
+    network: &'n Namespace,
+    shared_memory: SharedMemory,
+    directory: TempDir,
+    middleware: Middleware,
+}
+
+impl<'n> Robot<'n> {
+    fn start(network: &'n Namespace, middleware: Middleware) -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        fs::write(directory.path().join("udp.xml"), UDP_ONLY)?;
+        Ok(Self {
+            network,
+            shared_memory: SharedMemory::of(network, 128)?,
+            directory,
+            middleware,
+        })
+    }
+
+    /// Starts agent, server and client.
+    fn ready(&self) -> Result<(Agent<'n>, Process, Process)> {
+        let agent = self.agent()?;
+        let mut server = self.node(&["serve"])?;
+        server.wait_for("ready", PATIENCE)?;
+        if self.middleware == Middleware::FastExact {
+            agent.scrape_until("the uprobe is attached", |page| {
+                let ability = [("ability", "shared_memory_exact")];
+                page.sum("ros2probe_capture_ability", &ability) == 1.0
+            })?;
+        }
+        let log = self.log().display().to_string();
+        let mut client = self.node(&["call", &log, &CALLS.to_string()])?;
+        client.wait_for("ready", PATIENCE)?;
+        Ok((agent, server, client))
+    }
+
+    fn agent(&self) -> Result<Agent<'n>> {
+        let exact = match self.middleware {
+            Middleware::FastExact => ", shm: {exact: uprobe}",
+            _ => "",
+        };
+        let path = self.directory.path();
+        let text = format!(
+            "capture: {{source: host, cgroup: {}{exact}}}\napi: {{socket: {}}}\n\
+             state_directory: {}\nservice_timeout_s: 2\n",
+            self.network.cgroup().display(),
+            self.socket(),
+            path.display()
+        );
+        let configuration = path.join("ros2probe.yaml");
+        fs::write(&configuration, text)?;
+        Agent::start(self.network, RP, &configuration)
+    }
+
+    fn socket(&self) -> String {
+        self.directory.path().join("api.sock").display().to_string()
+    }
+
+    fn log(&self) -> std::path::PathBuf {
+        self.directory.path().join("calls.jsonl")
+    }
+
+    /// A process of `humble/services.py`.
+    fn node(&self, arguments: &[&str]) -> Result<Process> {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/humble/services.py");
+        let rmw = match self.middleware {
+            Middleware::Cyclone => "rmw_cyclonedds_cpp",
+            _ => "rmw_fastrtps_cpp",
+        };
+        let path = self.directory.path();
+        let mut enter = self.shared_memory.inside(self.network);
+        enter.extend(["env".to_owned(), "ROS_DOMAIN_ID=0".to_owned()]);
+        enter.push(format!("RMW_IMPLEMENTATION={rmw}"));
+        enter.push(format!("ROS_LOG_DIR={}", path.display()));
+        if self.middleware == Middleware::FastUdp {
+            let profile = path.join("udp.xml");
+            enter.push(format!(
+                "FASTRTPS_DEFAULT_PROFILES_FILE={}",
+                profile.display()
+            ));
+        }
+        let shell = r#". /opt/ros/humble/env.sh && exec python3 "$@""#;
+        let script = script.display().to_string();
+        let mut words = vec!["-c", shell, "services", &script];
+        words.extend(arguments);
+        Process::start(&enter, "bash", words)
+    }
+
+    fn obey(&self, client: &mut Process, command: &str) -> Result<()> {
+        client.write_line(command)?;
+        client.wait_for("done", PATIENCE)
+    }
+
+    /// Compares the agent's figures with the client's log.
+    fn compare(&self, page: &Scrape) -> Result<()> {
+        let logged = self.logged()?;
+        let seconds = |each: &Logged| (each.received - each.sent) as f64 / 1e9;
+        let (goals, calls): (Vec<_>, Vec<_>) = logged.iter().partition(|each| each.goal);
+        let mut calls: Vec<f64> = calls.into_iter().map(seconds).collect();
+        ensure!(calls.len() == CALLS, "{}", calls.len());
+        calls.sort_by(f64::total_cmp);
+        let of_agent = |figure: &str| {
+            let name = format!("ros2_service_latency_{figure}");
+            count(page, &name, "/add")
+        };
+        let sum = of_agent("seconds_sum");
+        let mean = calls.iter().sum::<f64>() / CALLS as f64;
+        let pairs = [
+            ("mean", sum / CALLS as f64, mean, CLOSE),
+            ("p50", of_agent("p50_seconds"), calls[CALLS / 2 - 1], CLOSE),
+            (
+                "p99",
+                of_agent("p99_seconds"),
+                calls[CALLS * 99 / 100 - 1],
+                TAIL,
+            ),
+        ];
+        for (name, agent, client, close) in pairs {
+            println!("{name}: agent {agent:.6} s, client {client:.6} s");
+            ensure!((agent - client).abs() < close, "{name}: {agent} {client}");
+        }
+        let goal = seconds(goals.first().context("no goal")?);
+        let labels = [("ros_action", "/fib")];
+        let seen = page.sum("ros2_action_goal_duration_p50_seconds", &labels);
+        println!("goal: agent {seen:.6} s, client {goal:.6} s");
+        // The client is written in Python, and spins.
+        ensure!((goal - seen).abs() < 0.02, "{seen} {goal}");
+        Ok(())
+    }
+
+    fn logged(&self) -> Result<Vec<Logged>> {
+        let mut logged = Vec::new();
+        wait_until("the log is complete", || {
+            let text = fs::read_to_string(self.log())?;
+            let lines = text.lines().map(serde_json::from_str::<Logged>);
+            logged = lines.flatten().collect();
+            Ok(logged.len() > CALLS)
+        })?;
+        Ok(logged)
+    }
+
+    fn rp(&self, arguments: &[&str]) -> Result<String> {
+        let output = std::process::Command::new(RP)
+            .args(arguments)
+            .args(["--socket", &self.socket()])
+            .env_remove("ROS_DOMAIN_ID")
+            .output()?;
+        ensure!(output.status.success(), "{output:?}");
+        Ok(String::from_utf8(output.stdout)?)
+    }
+}

@@ -1,0 +1,67 @@
+//! Calls of services: captured requests and replies, and their further copies.
+
+use ros2probe_wire::record::{Sample, Verdict};
+use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::walk::Found;
+use ros2probe_wire::{Record, Timestamp};
+
+use super::{Observer, naming};
+use crate::route::Route;
+
+impl Observer {
+    /// Reads the identity of a captured request or reply.
+    pub(super) fn identify_call(
+        &mut self,
+        found: &Found<'_>,
+        sample: Sample<'_>,
+        vendor: VendorId,
+        at: Timestamp,
+    ) {
+        let writer = found.record.writer();
+        match self.services.identify(found, sample, vendor, at) {
+            Ok(false) => {}
+            Ok(true) if self.payloads.wants_bytes(writer) => {}
+            Ok(true) => {
+                let is_measured = self.profiler.get(writer).is_some();
+                let verdict = match is_measured {
+                    true => Verdict::Meter,
+                    false => Verdict::Ignore,
+                };
+                self.interest.set(writer, verdict);
+            }
+            Err(error) => self.decode_error("request", error.reason),
+        }
+    }
+
+    /// Counts a copy of a request or reply.
+    pub(super) fn call_seen(&mut self, record: &Record) {
+        if let Some(sample) = record.sample()
+            && self.services.follows(record.writer())
+        {
+            let (receivers, discovery) = (&self.receivers, &self.discovery);
+            self.services.seen(record, sample, || {
+                receivers.owner(&Route::of(record), discovery)
+            });
+        }
+    }
+
+    /// Marks hanging calls, and captures writers again that had exceeded their budget.
+    pub(super) fn advance_calls(&mut self, now: Timestamp) {
+        let topics = &self.topics;
+        let timeout = self.settings.service_timeout;
+        let resumed = self.services.advance(timeout, now, |domain_id, name| {
+            let halves = [format!("rq{name}Request"), format!("rr{name}Reply")];
+            halves
+                .iter()
+                .any(|dds_name| topics.knows(domain_id, dds_name))
+        });
+        for guid in resumed {
+            let endpoint = self.discovery.endpoints().get(&guid);
+            let id = endpoint
+                .and_then(|endpoint| self.topics.find(endpoint.domain_id, &naming(endpoint)?));
+            if let Some(id) = id {
+                self.apply(id, guid, now);
+            }
+        }
+    }
+}

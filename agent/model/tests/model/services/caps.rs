@@ -1,0 +1,177 @@
+//! The caps of the tables of services.
+
+use super::*;
+
+/// Size and cap of a table.
+fn size(robot: &Robot, table: &str) -> (usize, usize) {
+    let sizes = robot.domain.observer.sizes();
+    let size = sizes.iter().find(|size| size.table == table).unwrap();
+    (size.entries, size.cap)
+}
+
+fn evictions(robot: &Robot) -> u64 {
+    let tables = robot.domain.snapshot().tables;
+    tables
+        .iter()
+        .find(|table| table.table == "calls")
+        .unwrap()
+        .evictions
+}
+
+/// Adds the writers of many services to one participant.
+fn clients(robot: &mut Robot, count: u64) -> Vec<Party> {
+    robot.domain.participant(prefix(1), LEASE);
+    let client = |number: u64| {
+        let [.., high, low] = (number + 256).to_be_bytes();
+        let writer = Guid::new(prefix(1), EntityId([0, high, low, 3]));
+        let topic = format!("rq/s{number}Request");
+        robot.domain.endpoint(writer, number + 1, &topic);
+        Party {
+            writer,
+            identity: writer.to_bytes(),
+        }
+    };
+    (0..count).map(client).collect()
+}
+
+#[test]
+fn writers_beyond_the_cap_are_not_captured() {
+    let mut robot = Robot::new(Middleware::Fast);
+    clients(&mut robot, 4_000);
+    let full = size(&robot, "services.writers").1 - 4_000;
+    for number in 0..=full {
+        let writer = Guid::new(prefix(2), EntityId([1, number as u8, 1, 3]));
+        robot.domain.participant(prefix(2), LEASE);
+        robot
+            .domain
+            .endpoint(writer, number as u64 + 1, "rr/otherReply");
+    }
+    assert_eq!(size(&robot, "services.writers"), (4_096, 4_096));
+    assert_eq!(evictions(&robot), 1);
+    let interest = robot.domain.observer.drain().interest;
+    let captured = interest
+        .iter()
+        .filter(|(_, it)| *it == Some(Verdict::Capture));
+    assert_eq!(captured.count(), 4_096);
+}
+
+#[test]
+fn the_service_with_the_oldest_call_makes_room_for_a_new_one() {
+    let mut robot = Robot::new(Middleware::Fast);
+    let server = robot.server(9, "/s0");
+    let clients = clients(&mut robot, 514);
+    robot.request(clients[0], 1);
+    robot.reply(server, 1, clients[0], 1);
+    for client in &clients[1..] {
+        robot.wait(1);
+        robot.request(*client, 1);
+    }
+    // The first one is idle; all others wait for a reply and stay.
+    assert_eq!(size(&robot, "services.services"), (512, 512));
+    assert_eq!((robot.service("/s0"), evictions(&robot)), (None, 2));
+    assert!(robot.service("/s1").is_some() && robot.service("/s512").is_some());
+    assert_eq!(robot.service("/s513"), None);
+}
+
+#[test]
+fn the_oldest_call_makes_room_for_a_new_one() {
+    let mut robot = Robot::new(Middleware::Cyclone);
+    let client = robot.client(1, ADD);
+    let server = robot.server(2, ADD);
+    for number in 1..=4_100 {
+        robot.request(client, number);
+        robot.domain.now += MILLISECOND / 100;
+    }
+    assert_eq!(size(&robot, "services.calls"), (4_096, 4_096));
+    assert_eq!(size(&robot, "services.identities"), (4_096, 4_096));
+    assert_eq!(evictions(&robot), 4);
+    robot.reply(server, 1, client, 1);
+    assert_eq!(robot.counts(), (4_100, 0, 0, 0));
+    robot.reply(server, 2, client, 5);
+    assert_eq!(robot.counts(), (4_100, 1, 0, 0));
+}
+
+#[test]
+fn the_client_with_the_longest_silence_makes_room_for_a_new_one() {
+    let mut robot = Robot::new(Middleware::Cyclone);
+    let client = robot.client(1, ADD);
+    for number in 0..300_u16 {
+        let mut identity = [0; 16];
+        identity[..2].copy_from_slice(&number.to_be_bytes());
+        let message = robot.message(client, number.into(), (identity, 1), &[7; 8]);
+        robot.domain.put(message);
+        robot.wait(1);
+    }
+    assert_eq!(size(&robot, "services.clients"), (256, 256));
+    assert_eq!(robot.counts().0, 300);
+}
+
+#[test]
+fn a_reply_in_too_many_parts_keeps_within_its_runs() {
+    let mut robot = Robot::new(Middleware::Cyclone);
+    let client = robot.client(1, ADD);
+    let server = robot.server(2, ADD);
+    robot.request(client, 1);
+    let payload = [
+        &[0, 1, 0, 0],
+        &client.identity[..8],
+        &1_u64.to_le_bytes()[..],
+        &[5; 10_000],
+    ];
+    let payload = payload.concat();
+    let mut fragment = |start: u32| {
+        let message = Message::from(server.writer.prefix);
+        let message = message.fragment(server.writer.entity, 1, start, 100, &payload);
+        robot.domain.put(message);
+    };
+    (0..50).for_each(|part| fragment(2 * part + 1));
+    (0..50).for_each(|part| fragment(2 * part + 2));
+    assert_eq!(size(&robot, "services.runs"), (16, 16));
+    // Runs were forgotten, so the reply is not known to be whole.
+    assert_eq!(robot.counts(), (1, 0, 0, 0));
+}
+
+#[test]
+fn a_service_beyond_its_bytes_is_not_captured_for_a_while() {
+    let mut robot = Robot::new(Middleware::Cyclone);
+    let client = robot.client(1, ADD);
+    robot.domain.observer.drain();
+    let verdicts = |robot: &mut Robot| robot.domain.observer.drain().interest;
+    for number in 1..=80 {
+        robot.request_with(client, number, &[7; 60_000]);
+    }
+    assert_eq!(
+        verdicts(&mut robot),
+        [(client.writer, Some(Verdict::Ignore))]
+    );
+    let service = robot.service(ADD).unwrap();
+    assert!(service.suspended);
+    assert_eq!((service.open, robot.hanging()), (0, vec![]));
+    robot.wait(11_000);
+    assert_eq!(
+        verdicts(&mut robot),
+        [(client.writer, Some(Verdict::Capture))]
+    );
+    let before = robot.counts().0;
+    robot.request(client, 100);
+    assert_eq!(robot.counts(), (before + 1, 0, 0, 0));
+    assert!(!robot.service(ADD).unwrap().suspended);
+}
+
+#[test]
+fn an_observer_without_calls_lists_the_same_tables() {
+    let tables = |observer: &Observer| -> Vec<_> {
+        let sizes = observer.sizes();
+        let names = sizes.into_iter().map(|size| size.table);
+        names
+            .filter(|table| table.starts_with("services."))
+            .collect()
+    };
+    let mut robot = Robot::new(Middleware::Cyclone);
+    let client = robot.client(1, ADD);
+    robot.request(client, 1);
+    assert_eq!(
+        tables(&robot.domain.observer),
+        tables(&Observer::new(Settings::default()))
+    );
+}
