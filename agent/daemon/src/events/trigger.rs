@@ -6,11 +6,12 @@ use super::record::{Record, Value};
 use super::table::{self, Definition, EVENTS, Severity};
 
 /// Short names of triggers, with the event that reports each problem.
-const PROBLEMS: [(&str, &Definition); 4] = [
+const PROBLEMS: [(&str, &Definition); 5] = [
     ("expectation", &table::EXPECTATION_CHANGED),
     ("message_lost", &table::MESSAGE_LOST),
     ("participant_lost", &table::PARTICIPANT_LOST),
     ("qos_incompatible", &table::QOS_INCOMPATIBLE),
+    ("hanging_call", &table::CALL_HANGING),
 ];
 
 /// A condition on events.

@@ -8,8 +8,10 @@ use std::time::Duration;
 use ros2probe_bag::metadata::{self, Metadata};
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::churn;
+use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::dispatch::Sample;
 use ros2probe_model::event::{Event, EventKind, LossBurst, Taken};
+use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
@@ -283,6 +285,34 @@ fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_
     robot.lose_participant(churn::Event::Disposed, 0);
     robot.run(1);
     assert_eq!(robot.bags().len(), 1);
+}
+
+#[test]
+fn findings_meet_their_kind_once_they_are_new() {
+    let topic = TopicKey {
+        domain_id: DomainId(0),
+        dds_name: "rq/addRequest".into(),
+        name: "/add".into(),
+        kind: TopicKind::ServiceRequest,
+    };
+    let writer = Guid::default();
+    let hanging = Diagnosis::HangingCall { topic, writer };
+    let duplicate = Diagnosis::DuplicateNode {
+        domain_id: DomainId(0),
+        node: "/driver".into(),
+        participants: Vec::new(),
+    };
+    for finding in [hanging, duplicate] {
+        let mut robot = Robot::new(settings(&[finding.kind()], 1, 0));
+        robot.run(20);
+        let mut change = |resolved| {
+            let finding = finding.clone();
+            robot.event(EventKind::Diagnosis { resolved, finding });
+            robot.run(1);
+            robot.bags().len()
+        };
+        assert_eq!((change(true), change(false)), (0, 1), "{finding:?}");
+    }
 }
 
 #[test]
