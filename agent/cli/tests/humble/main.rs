@@ -10,3 +10,4 @@
 mod echo;
 mod installed;
 mod robot;
+mod ros2_daemon;
