@@ -6,6 +6,7 @@ use std::path::Path;
 use ros2probe_message::Dialect;
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_wire::DomainId;
+use ros2probe_wire::rtps::VendorId;
 
 use super::function::Caller;
 use super::peer::{self, PeerProcess};
@@ -51,9 +52,12 @@ impl Caller for Client<'_> {
             .unwrap_or_default()
     }
 
+    /// Returns the RMW implementation of the process, else the one that all participants of the domain
+    /// use, else the default.
     fn rmw_implementation(&self) -> String {
         let known = self.process().rmw_implementation.as_deref();
-        known.unwrap_or(DEFAULT_RMW).to_owned()
+        let common = || common_rmw(self.snapshot, self.domain_id);
+        known.or_else(common).unwrap_or(DEFAULT_RMW).to_owned()
     }
 }
 
@@ -81,6 +85,24 @@ fn announced(snapshot: &Snapshot, domain_id: DomainId) -> Option<Dialect> {
     let mut participants = snapshot.participants.iter();
     let is_ros = participants.any(|each| each.domain_id == domain_id && each.enclave.is_some());
     is_ros.then_some(Dialect::Humble)
+}
+
+/// Returns the RMW implementation of all ROS participants of a domain. `None` if they differ.
+fn common_rmw(snapshot: &Snapshot, domain_id: DomainId) -> Option<&'static str> {
+    let participants = snapshot.participants.iter();
+    let of_domain = participants.filter(|each| each.domain_id == domain_id);
+    let mut vendors = of_domain
+        .filter(|each| each.enclave.is_some())
+        .map(|each| each.vendor);
+    let first = vendors.next()?;
+    if vendors.any(|vendor| vendor != first) {
+        return None;
+    }
+    match first {
+        VendorId::EPROSIMA => Some("rmw_fastrtps_cpp"),
+        VendorId::CYCLONE => Some("rmw_cyclonedds_cpp"),
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -148,5 +170,19 @@ mod tests {
             Humble
         );
         assert_eq!(announced(&Snapshot::default(), DomainId(0)), None);
+    }
+
+    #[test]
+    fn the_rmw_implementation_is_the_common_one_of_the_robot() {
+        let mut snapshot = sample_robot::snapshot(["/points"]);
+        let common = |snapshot: &Snapshot| common_rmw(snapshot, DomainId(0));
+        assert_eq!(common(&snapshot), Some("rmw_fastrtps_cpp"));
+        let mut other = snapshot.participants[0].clone();
+        other.vendor = VendorId::CYCLONE;
+        snapshot.participants.push(other.clone());
+        assert_eq!(common(&snapshot), None);
+        snapshot.participants = vec![other];
+        assert_eq!(common(&snapshot), Some("rmw_cyclonedds_cpp"));
+        assert_eq!(common_rmw(&snapshot, DomainId(1)), None);
     }
 }
