@@ -115,9 +115,9 @@ fn unused(daemons: &[(u32, Option<u32>)]) -> Option<Finding> {
 
 fn daemon_stop(domain_id: u32) -> String {
     match domain_id {
-        0 => "ros2 daemon stop    # the agent takes over within a second".to_owned(),
+        0 => "ros2 daemon stop    # the agent takes over after 3 s".to_owned(),
         domain_id => format!(
-            "ROS_DOMAIN_ID={domain_id} ros2 daemon stop    # the agent takes over within a second"
+            "ROS_DOMAIN_ID={domain_id} ros2 daemon stop    # the agent takes over after 3 s"
         ),
     }
 }

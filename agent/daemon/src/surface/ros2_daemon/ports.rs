@@ -11,6 +11,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
+use rustix::net::{AddressFamily, SocketFlags, SocketType, bind, socket_with, sockopt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
@@ -23,6 +24,9 @@ pub(super) const MAX_PORTS: usize = 32;
 /// Time for which a released port stays free.
 pub(super) const RELEASED: Duration = Duration::from_secs(60);
 
+/// Time for which a port of another process has to be free before the agent takes it over.
+const TAKEOVER: Duration = Duration::from_secs(3);
+
 /// The ports of all domains.
 #[derive(Debug)]
 pub(super) struct Ports {
@@ -34,8 +38,12 @@ pub(super) struct Ports {
 enum Port {
     /// Listening, with the token that ends its connections.
     Open(TcpListener, CancellationToken),
-    /// Another process has it, or binding failed.
+    /// Not bound yet.
     Waiting,
+    /// Another process had it at the last attempt.
+    Occupied,
+    /// It is free again since this time.
+    Free(Instant),
     Released(Instant),
 }
 
@@ -72,13 +80,15 @@ impl Ports {
         }
         let is_due = |port: &Port| match port {
             Port::Open(..) => false,
-            Port::Waiting => true,
+            Port::Waiting | Port::Occupied | Port::Free(_) => true,
             Port::Released(since) => now.saturating_duration_since(*since) >= RELEASED,
         };
         let due = self.ports.iter().filter(|(_, port)| is_due(port));
         let due: Vec<u32> = due.map(|(domain_id, _)| *domain_id).collect();
         for domain_id in due {
-            self.bind(domain_id);
+            if self.is_takeover_due(domain_id, now) {
+                self.bind(domain_id);
+            }
         }
     }
 
@@ -124,6 +134,26 @@ impl Ports {
         .await
     }
 
+    /// Returns whether the port may be bound: at once if no other process had it, otherwise some time
+    /// after the port became free. `ros2 daemon stop` waits until no process listens.
+    fn is_takeover_due(&mut self, domain_id: u32, now: Instant) -> bool {
+        let (Some(state), Some(number)) = (self.ports.get_mut(&domain_id), port(domain_id)) else {
+            return false;
+        };
+        match *state {
+            Port::Open(..) | Port::Waiting | Port::Released(_) => true,
+            Port::Occupied | Port::Free(_) if !is_free(number) => {
+                *state = Port::Occupied;
+                false
+            }
+            Port::Occupied => {
+                *state = Port::Free(now);
+                false
+            }
+            Port::Free(since) => now.saturating_duration_since(since) >= TAKEOVER,
+        }
+    }
+
     fn bind(&mut self, domain_id: u32) {
         let Some(number) = port(domain_id) else {
             return;
@@ -136,7 +166,7 @@ impl Ports {
                 PortState::Listening,
             ),
             Err(error) if error.kind() == io::ErrorKind::AddrInUse => {
-                (Port::Waiting, PortState::Occupied)
+                (Port::Occupied, PortState::Occupied)
             }
             Err(error) => (Port::Waiting, PortState::Failed(error.to_string())),
         };
@@ -177,9 +207,42 @@ impl Ports {
     }
 }
 
+/// Returns whether the port can be bound, without listening.
+fn is_free(port: u16) -> bool {
+    let bound = || -> rustix::io::Result<()> {
+        let flags = SocketFlags::CLOEXEC;
+        let socket = socket_with(AddressFamily::INET, SocketType::STREAM, flags, None)?;
+        sockopt::set_socket_reuseaddr(&socket, true)?;
+        bind(&socket, &SocketAddr::from((Ipv4Addr::LOCALHOST, port)))
+    };
+    bound().is_ok()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_port_of_another_process_is_taken_over_a_while_after_it_is_free() {
+        const OTHER: u32 = DOMAIN + 3;
+        let figures = Arc::<Ros2DaemonFigures>::default();
+        let mut ports = Ports::new(Arc::clone(&figures));
+        let domains = BTreeSet::from([OTHER]);
+        let state = || figures.ports().remove(&OTHER).unwrap();
+        let address = (Ipv4Addr::LOCALHOST, port(OTHER).unwrap());
+        let other = std::net::TcpListener::bind(address).unwrap();
+        let start = Instant::now();
+        ports.update(&domains, start);
+        ports.update(&domains, start + TAKEOVER);
+        assert_eq!(state(), PortState::Occupied);
+        drop(other);
+        ports.update(&domains, start + TAKEOVER);
+        ports.update(&domains, start + TAKEOVER * 2 - Duration::from_millis(1));
+        // Nothing listens, so that `ros2 daemon stop` ends.
+        assert!(std::net::TcpStream::connect(address).is_err());
+        ports.update(&domains, start + TAKEOVER * 2);
+        assert_eq!(state(), PortState::Listening);
+    }
 
     /// A domain that no other test and no robot uses.
     const DOMAIN: u32 = 229;
