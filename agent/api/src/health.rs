@@ -70,6 +70,9 @@ pub struct Health {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub foxglove: Option<Foxglove>,
+    /// Ports at which the agent answers as the daemon of the `ros2` command line, by domain; empty
+    /// if it does not.
+    pub ros2_daemon: Vec<Ros2DaemonPort>,
     /// Process id of the agent, in its own PID namespace.
     pub process_id: u32,
     /// Seconds since the agent's process started; null if unknown.
@@ -111,6 +114,26 @@ pub struct FoxgloveClient {
     pub sent_messages: u64,
     /// Messages dropped because the viewer reads too slowly.
     pub dropped_messages: u64,
+}
+
+/// The port of the ros2 daemon of a domain.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Ros2DaemonPort {
+    /// Domain id.
+    pub domain_id: u32,
+    /// TCP port on loopback.
+    #[cfg_attr(feature = "openapi", schema(example = 11511))]
+    pub port: u16,
+    /// `listening` (the agent answers), `occupied` (another process has the port), `released` (by
+    /// `ros2 daemon stop`), `failed` or `limit` (more domains than ports).
+    #[cfg_attr(feature = "openapi", schema(example = "listening"))]
+    pub state: Cow<'static, str>,
+    /// Why the port cannot be bound; null unless the state is `failed`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub reason: Option<String>,
 }
 
 /// An ability that depends on privileges, the kernel or the configuration.

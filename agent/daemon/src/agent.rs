@@ -32,6 +32,7 @@ use crate::surface::api::{self, reload};
 use crate::surface::foxglove;
 use crate::surface::http::Server;
 use crate::surface::otlp::{self, Exporter, Host, SpanQueue, SpanSink};
+use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
 use crate::{control, memory};
@@ -176,6 +177,7 @@ impl Components<'_> {
             live: Arc::new(api::Live::new(config.history)),
             library,
             viewers: sources.viewers,
+            ros2_daemon: sources.ros2_daemon,
             page: Arc::new(api::Page::new(self.addresses)),
             reloader,
             stop: self.stop,
@@ -215,6 +217,7 @@ pub fn run(options: Options) -> Result<()> {
     let worker = worker(&mut source)?;
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
+    let ros2_daemon = ros2_daemon(&config, options.report)?;
     let exporter = export.map(|export| Exporter::start(export, &sources, Arc::clone(&spans)));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
@@ -254,6 +257,7 @@ pub fn run(options: Options) -> Result<()> {
         stop,
         log,
         exporter,
+        ros2_daemon,
     };
     let surfaces = Surfaces {
         metrics: server,
@@ -296,6 +300,15 @@ fn overridden(configured: &Config, options: &Options) -> Config {
         options.report,
     );
     config
+}
+
+/// The thread of the ros2 daemon, if it is configured. A report ends before a client could ask.
+fn ros2_daemon(config: &Config, is_report: bool) -> Result<Option<Ros2Daemon>> {
+    if !config.ros2_daemon.is_on || is_report {
+        return Ok(None);
+    }
+    let daemon = Ros2Daemon::start().context("cannot start the thread of the ros2 daemon")?;
+    Ok(Some(daemon))
 }
 
 /// Settings of exports, from the configuration and the environment.

@@ -20,12 +20,13 @@ use crate::surface::api::reload::{NotReloaded, Reloads};
 use crate::surface::foxglove;
 use crate::surface::http::Server;
 use crate::surface::otlp::Exporter;
+use crate::surface::ros2_daemon::{Ros2Daemon, Task};
 use crate::watches::Watches;
 use anyhow::{Context as _, Result, anyhow};
 use ros2probe_api::health::Reloaded;
 use sd_notify::NotifyState;
 use tokio::signal::unix::{Signal, SignalKind, signal};
-use tokio::sync::oneshot;
+use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
@@ -51,6 +52,8 @@ pub(crate) struct Supervisor {
     pub(crate) log: Log,
     /// Exporter of metrics, if one is configured.
     pub(crate) exporter: Option<Exporter>,
+    /// Thread of the ros2 daemon, if it is configured.
+    pub(crate) ros2_daemon: Option<Ros2Daemon>,
 }
 
 /// Bound listeners that do not answer yet.
@@ -62,6 +65,9 @@ pub(crate) struct Surfaces {
     /// Proof that the serving thread has no privilege.
     pub(crate) powerless: Unprivileged,
 }
+
+/// End of a thread; an error if it panicked.
+type Ended = Result<Result<()>, oneshot::error::RecvError>;
 
 /// Signals, registered before the working thread starts.
 struct Signals {
@@ -106,6 +112,7 @@ impl Supervisor {
         let mut worker = worker.begin(run);
         let snapshots = Arc::clone(&surfaces.context.snapshots);
         let mut serving = responder.begin(surfaces);
+        let (mut ros2_daemon, reloaded) = self.begin_ros2_daemon();
         let mut watchdog = Watchdog::new();
         let mut tick = ticks(STARTING_TICK);
         let (mut working, mut answering) = (true, true);
@@ -115,12 +122,23 @@ impl Supervisor {
                 _ = signals.terminate.recv() => break Ok("SIGTERM"),
                 _ = signals.interrupt.recv() => break Ok("SIGINT"),
                 _ = signals.hangup.recv() => {
-                    let _ = self.reload();
+                    if self.reload().is_ok() {
+                        reloaded.notify_one();
+                    }
                 }
                 _ = signals.snapshot.recv() => snapshots.write_all(),
                 Some(answer) = self.reloads.next() => {
+                    let outcome = self.reload();
+                    if outcome.is_ok() {
+                        reloaded.notify_one();
+                    }
                     // The client may have disconnected.
-                    let _ = answer.send(self.reload());
+                    let _ = answer.send(outcome);
+                }
+                ended = &mut ros2_daemon => {
+                    let died = |_| Err(anyhow!("the thread of the ros2 daemon died"));
+                    let ended = ended.unwrap_or_else(died);
+                    break Err(ended.err().unwrap_or_else(|| anyhow!("the ros2 daemon ended unexpectedly")));
                 }
                 ended = &mut serving => {
                     answering = false;
@@ -173,6 +191,29 @@ impl Supervisor {
             }
             Err(error) => Err(error),
         }
+    }
+
+    /// Lets the ros2 daemon answer, if it is configured. Returns a future that resolves if its thread
+    /// ends, and the notification of reloads.
+    fn begin_ros2_daemon(&mut self) -> (impl Future<Output = Ended> + Unpin + use<>, Arc<Notify>) {
+        let reloaded = Arc::<Notify>::default();
+        let ended = self.ros2_daemon.take().map(|daemon| {
+            daemon.begin(Task {
+                latest: Arc::clone(&self.sources.latest),
+                watches: Arc::clone(&self.watches),
+                figures: Arc::clone(&self.sources.ros2_daemon),
+                distro: self.config.ros2_daemon.distro,
+                reloaded: Arc::clone(&reloaded),
+                stop: self.stop.clone(),
+            })
+        });
+        let ended = async move {
+            match ended {
+                Some(ended) => ended.await,
+                None => std::future::pending().await,
+            }
+        };
+        (Box::pin(ended), reloaded)
     }
 
     /// Reloads the configuration. A mistake leaves everything unchanged.

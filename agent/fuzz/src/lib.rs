@@ -24,6 +24,7 @@ use ros2probe_capture::shm::segment::{Buffer, Message};
 use ros2probe_capture::uprobe::library;
 use ros2probe_daemon::config::{Config, Watch, Watchlist};
 use ros2probe_daemon::surface::foxglove::protocol;
+use ros2probe_daemon::surface::ros2_daemon::call::{self, Argument, Call};
 use ros2probe_message::filter::{Filter, Subject};
 use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decode, yaml};
 use ros2probe_model::input::Input;
@@ -72,6 +73,19 @@ pub fn viewer(bytes: &[u8]) {
         Ok(protocol::Request::Unsupported(op)) => assert!(op.len() <= text.len()),
         Ok(_) | Err(protocol::Malformed) => {}
     }
+}
+
+/// Reads a request of the `ros2` command line. An accepted one has no more text than the request.
+pub fn ros2_daemon(bytes: &[u8]) {
+    let Ok(Call { method, arguments }) = call::parse(bytes) else {
+        return;
+    };
+    let length = |argument: &Argument| match argument {
+        Argument::Text(text) => text.len(),
+        _ => 0,
+    };
+    assert!(arguments.len() <= 8);
+    assert!(method.len() + arguments.iter().map(length).sum::<usize>() <= bytes.len());
 }
 
 /// Reads a block of the packet ring, through reassembly and walk.

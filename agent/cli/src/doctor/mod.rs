@@ -16,6 +16,7 @@ pub mod kernel;
 pub mod privileges;
 pub mod processes;
 pub mod report;
+pub mod ros2_daemon;
 pub mod shell;
 pub mod text;
 pub mod variables;
@@ -85,6 +86,9 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
     findings.extend(interfaces::check(host, health, is_local));
     findings.extend(shell::check(host));
     findings.extend(processes.check(host));
+    let ports = health.map_or(&[][..], |health| &health.ros2_daemon);
+    let daemons: Vec<_> = processes.ros2_daemons().collect();
+    findings.extend(ros2_daemon::check(ports, &daemons));
     findings.extend(
         answers
             .map(|answers| graph::check(answers, Some(processes.count())))
@@ -102,6 +106,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
 pub fn examine_remote(answers: &Answers, place: &str) -> Report {
     let mut findings = agent::check(answers, place, env!("CARGO_PKG_VERSION"));
     findings.extend(visibility::check(&Visibility::of_agent(&answers.health)));
+    findings.extend(ros2_daemon::check(&answers.health.ros2_daemon, &[]));
     findings.extend(graph::check(answers, None));
     Report::new(place, findings)
 }

@@ -22,6 +22,8 @@ const MAX_LINE: u64 = 64 << 10;
 const MAX_COMMAND: usize = 40;
 /// Most processes named in one sentence, per group.
 const NAMED: usize = 4;
+/// Name of the daemon of the `ros2` command line.
+const ROS2_DAEMON: &str = "ros2 daemon";
 /// Most ROS processes inspected.
 const MAX_PROCESSES: usize = 2000;
 
@@ -91,6 +93,13 @@ impl Processes {
     #[must_use]
     pub fn count(&self) -> usize {
         self.found.len()
+    }
+
+    /// Returns process id and domain of the daemons of the `ros2` command line.
+    pub fn ros2_daemons(&self) -> impl Iterator<Item = (u32, Option<u32>)> {
+        let found = self.found.iter();
+        let daemons = found.filter(|process| process.command.starts_with(ROS2_DAEMON));
+        daemons.map(|process| (process.id, process.domain_id()))
     }
 
     /// Returns whether some process is limited to its own host.
@@ -345,7 +354,7 @@ fn command(host: &HostState, id: u32) -> String {
     let is_interpreter = first.starts_with("python") || matches!(first, "bash" | "sh" | "node");
     let has_no_file = words.get(1).is_some_and(|word| word == "-c");
     let name = match script {
-        Some(code) if is_interpreter && code.contains("ros2cli.daemon") => "ros2 daemon",
+        Some(code) if is_interpreter && code.contains("ros2cli.daemon") => ROS2_DAEMON,
         Some(_) if is_interpreter && has_no_file => first,
         Some(script) if is_interpreter && !script.is_empty() => base_name(script),
         _ => first,

@@ -12,4 +12,5 @@ mod incident;
 mod installed;
 mod learn;
 mod robot;
+mod ros2_daemon;
 mod services;

@@ -2,6 +2,8 @@
 //! that this source can see, keeps only the privileges that it needs, and reports which ones it
 //! lacks. An agent that root starts changes its user, and serves nothing before.
 
+mod ros2_daemon;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::Permissions;
 use std::io;

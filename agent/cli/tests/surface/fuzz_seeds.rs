@@ -89,6 +89,11 @@ fn messages_of_viewers_survive() {
 }
 
 #[test]
+fn requests_of_ros2_survive() {
+    run("fuzz/seeds/ros2_daemon", entry::ros2_daemon);
+}
+
+#[test]
 fn libraries_survive() {
     run("fuzz/seeds/library", entry::library);
 }

@@ -32,6 +32,7 @@ mod otlp_tls;
 mod page;
 mod recordings;
 mod ros2;
+mod ros2_daemon;
 mod rules;
 mod samples;
 mod top;

@@ -14,6 +14,7 @@ use ros2probe_daemon::recording::SnapshotFigures;
 use ros2probe_daemon::settings_cell::Settings;
 use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe_daemon::surface::otlp::Signal;
+use ros2probe_daemon::surface::ros2_daemon::PortState;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
@@ -44,6 +45,7 @@ fn page(snapshot: Snapshot, settings: Settings, format: Format) -> String {
     let state = sources.latest.publish(snapshot, sample_robot::agent());
     sources.limits.note(&state);
     sources.exports.enable(Signal::Metrics);
+    sources.ros2_daemon.set_port(0, PortState::Listening);
     sources
         .recordings
         .snapshot("incident", SnapshotFigures::default());

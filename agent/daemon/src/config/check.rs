@@ -33,12 +33,12 @@ const RENAMED: &[(&str, &str)] = &[
 /// Adds the mistakes of `node` at `path` under `schema`; `root` holds the definitions.
 pub(super) fn check(node: &Node, path: &str, schema: &Value, root: &Value, found: &mut Mistakes) {
     let schema = resolve(schema, root);
-    if let Some(choices) = any_of(schema) {
-        let fitting = choices.iter().map(|choice| resolve(choice, root));
-        match fitting.clone().find(|choice| allows(choice, node)) {
+    if any_of(schema).is_some() {
+        let choices = choices(schema, root);
+        match choices.iter().find(|choice| allows(choice, node)) {
             Some(choice) => check(node, path, choice, root, found),
             None => {
-                let expected: Vec<&str> = fitting.flat_map(expected).collect();
+                let expected: Vec<&str> = choices.into_iter().flat_map(expected).collect();
                 wrong_kind(node, path, &expected, found);
             }
         }
@@ -177,6 +177,18 @@ fn resolve<'a>(schema: &'a Value, root: &'a Value) -> &'a Value {
 
 fn any_of(schema: &Value) -> Option<&Vec<Value>> {
     schema.get("anyOf").and_then(Value::as_array)
+}
+
+/// Alternatives of a schema; an optional value with alternatives nests them.
+fn choices<'a>(schema: &'a Value, root: &'a Value) -> Vec<&'a Value> {
+    let schema = resolve(schema, root);
+    match any_of(schema) {
+        Some(all) => all
+            .iter()
+            .flat_map(|choice| choices(choice, root))
+            .collect(),
+        None => vec![schema],
+    }
 }
 
 /// JSON types that a schema allows.

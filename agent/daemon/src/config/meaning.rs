@@ -14,13 +14,13 @@ use super::mistake::{Mistakes, Position};
 use super::otlp_endpoint::otlp_endpoint;
 use super::shape::{
     ApiShape, CaptureShape, ConfigShape, FoxgloveShape, MetricsShape, OtlpShape, RecordingsShape,
-    SnapshotShape, WatchEntryShape, WatchShape,
+    Ros2DaemonShape, SnapshotShape, Switch, WatchEntryShape, WatchShape,
 };
 use super::watch::{ExpectationValues, Expectations, Retain, Watch, check_globs, check_pattern};
 use super::{
     ApiSettings, CaptureSettings, Config, Endpoint, FoxgloveSettings, Limits, MetricsSettings,
-    OtlpSettings, RecordingLimits, RecordingSettings, ShmSettings, SnapshotSettings, SocketChoice,
-    SourceChoice, StateChoice,
+    OtlpSettings, RecordingLimits, RecordingSettings, Ros2DaemonSettings, ShmSettings,
+    SnapshotSettings, SocketChoice, SourceChoice, StateChoice,
 };
 use crate::events::Trigger;
 
@@ -139,6 +139,7 @@ impl Reader {
             metrics: metrics(shape.metrics.unwrap_or_default()),
             api,
             foxglove: self.foxglove(shape.foxglove.unwrap_or_default(), has_token),
+            ros2_daemon: ros2_daemon(shape.ros2_daemon.unwrap_or_default()),
             history: Duration::from_secs(shape.page.unwrap_or_default().history_s.into()),
             otlp: otlp(shape.otlp.unwrap_or_default()),
             recordings: self.recordings(shape.recordings.unwrap_or_default()),
@@ -507,6 +508,17 @@ fn state(text: &str) -> StateChoice {
         "auto" => StateChoice::Auto,
         "off" => StateChoice::Off,
         path => StateChoice::At(PathBuf::from(path)),
+    }
+}
+
+fn ros2_daemon(shape: Ros2DaemonShape) -> Ros2DaemonSettings {
+    let (switch, distro) = match shape {
+        Ros2DaemonShape::Choice(switch) => (switch, None),
+        Ros2DaemonShape::Settings(settings) => (settings.enabled, settings.distro),
+    };
+    Ros2DaemonSettings {
+        is_on: switch == Switch::On,
+        distro: distro.map(Into::into),
     }
 }
 

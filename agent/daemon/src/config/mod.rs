@@ -27,6 +27,7 @@ pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
     CaptureSettings, ExactChoice, ShmMode, ShmSettings, SourceChoice,
 };
+use ros2probe_message::Dialect;
 pub use ros2probe_model::glob;
 pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
 pub use ros2probe_model::rehearsal;
@@ -53,6 +54,8 @@ pub struct Config {
     pub api: ApiSettings,
     /// The WebSocket server for Foxglove and other viewers.
     pub foxglove: FoxgloveSettings,
+    /// Whether the agent answers as the daemon of the `ros2` command line.
+    pub ros2_daemon: Ros2DaemonSettings,
     /// Time for which figures of measured topics are kept for charts; zero = none.
     pub history: Duration,
     /// Exports to an OpenTelemetry receiver.
@@ -158,6 +161,15 @@ pub struct FoxgloveSettings {
     pub listen: Option<SocketAddr>,
     /// Origins of web pages that may connect without a token, besides those of this host.
     pub origins: Vec<String>,
+}
+
+/// The daemon of the `ros2` command line.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Ros2DaemonSettings {
+    /// Whether the agent answers in its place.
+    pub is_on: bool,
+    /// Distribution of the clients whose process cannot be inspected; `None` = guessed.
+    pub distro: Option<Dialect>,
 }
 
 /// Unix socket of the control API.
@@ -374,6 +386,7 @@ impl Config {
             ),
             ("api", self.api != new.api),
             ("foxglove", self.foxglove != new.foxglove),
+            ("ros2_daemon", self.ros2_daemon != new.ros2_daemon),
             ("page", self.history != new.history),
             ("otlp", self.otlp != new.otlp),
             ("recordings", self.recordings != new.recordings),
@@ -438,6 +451,7 @@ impl Default for Config {
                 listen: defaults::FOXGLOVE.parse().ok(),
                 origins: defaults::ORIGINS.map(str::to_owned).into(),
             },
+            ros2_daemon: Ros2DaemonSettings::default(),
             history: Duration::from_secs(defaults::HISTORY_S.into()),
             otlp: OtlpSettings::default(),
             recordings: RecordingSettings::default(),
@@ -465,6 +479,8 @@ impl Level {
 
 /// Defaults of missing keys.
 mod defaults {
+    use super::shape::Switch;
+
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;
@@ -484,6 +500,10 @@ mod defaults {
 
     pub(super) const fn service_timeout_s() -> f64 {
         5.0
+    }
+
+    pub(super) const fn ros2_daemon_in_a_map() -> Switch {
+        Switch::On
     }
 
     pub(super) const fn snapshot_seconds() -> u64 {

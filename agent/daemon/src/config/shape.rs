@@ -5,6 +5,7 @@
 
 use std::collections::BTreeMap;
 
+use ros2probe_message::Dialect;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -34,6 +35,9 @@ pub(super) struct ConfigShape {
     pub(super) api: Option<ApiShape>,
     /// The WebSocket server for Foxglove, Lichtblick and PlotJuggler.
     pub(super) foxglove: Option<FoxgloveShape>,
+    /// Whether the agent answers in place of the daemon of the `ros2` command line, so that
+    /// `ros2 topic list` and its like create no participant.
+    pub(super) ros2_daemon: Option<Ros2DaemonShape>,
     /// Content of the web page.
     pub(super) page: Option<PageShape>,
     /// Pushes metrics, events and traces to an OpenTelemetry receiver over gRPC. The standard
@@ -239,6 +243,78 @@ pub(super) struct FoxgloveShape {
     /// Origins of web pages that may connect without a token, as in `https://app.foxglove.dev`;
     /// `file://` for desktop applications. Pages of this host always may.
     pub(super) origins: Option<Vec<String>>,
+}
+
+/// `on`, `off`, or a map with the distribution.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(untagged)]
+pub(super) enum Ros2DaemonShape {
+    /// On or off.
+    Choice(Switch),
+    /// On or off, with the distribution.
+    Settings(Ros2DaemonSettingsShape),
+}
+
+/// The ros2 daemon with the distribution of its clients.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Ros2DaemonSettingsShape {
+    /// Whether the agent answers.
+    #[serde(default = "defaults::ros2_daemon_in_a_map")]
+    pub(super) enabled: Switch,
+    /// Distribution of the clients whose process the agent cannot inspect; default: guessed from
+    /// their Python release and from the robot.
+    pub(super) distro: Option<DistroShape>,
+}
+
+/// On or off.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[schemars(rename = "Switch")]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Switch {
+    /// Enabled.
+    On,
+    /// Disabled.
+    #[default]
+    Off,
+}
+
+/// A ROS distribution.
+#[derive(Clone, Copy, Debug, Deserialize, JsonSchema)]
+#[schemars(rename = "Distro")]
+#[serde(rename_all = "lowercase")]
+pub(super) enum DistroShape {
+    /// Humble.
+    Humble,
+    /// Iron, which writes endpoints as Jazzy does.
+    Iron,
+    /// Jazzy.
+    Jazzy,
+    /// Kilted.
+    Kilted,
+    /// Lyrical.
+    Lyrical,
+    /// Rolling, which writes endpoints as Lyrical does.
+    Rolling,
+}
+
+impl From<DistroShape> for Dialect {
+    fn from(shape: DistroShape) -> Self {
+        match shape {
+            DistroShape::Humble => Self::Humble,
+            DistroShape::Iron | DistroShape::Jazzy => Self::Jazzy,
+            DistroShape::Kilted => Self::Kilted,
+            DistroShape::Lyrical | DistroShape::Rolling => Self::Rolling,
+        }
+    }
+}
+
+impl Default for Ros2DaemonShape {
+    fn default() -> Self {
+        Self::Choice(Switch::default())
+    }
 }
 
 /// The web page; `api.page` disables it.

@@ -202,6 +202,9 @@ const CONNECT: &[c_long] = &[libc::SYS_connect, libc::SYS_sendmsg, libc::SYS_sen
 /// DNS queries: several questions at once, and musl binds before it sends.
 const RESOLVE: &[c_long] = &[libc::SYS_bind, libc::SYS_recvmmsg, libc::SYS_sendmmsg];
 
+/// Listening for connections.
+const LISTEN: &[c_long] = &[libc::SYS_bind, libc::SYS_listen];
+
 /// inotify.
 const NOTICE: &[c_long] = &[
     libc::SYS_inotify_add_watch,
@@ -246,6 +249,11 @@ impl Allowed {
                     }
                 }
                 allowed.always(RESOLVE);
+            }
+            Role::Ros2Daemon => {
+                allowed.always(LOOK).open_for_reading()?;
+                allowed.always(SERVE).always(LISTEN).connections()?;
+                allowed.socket(libc::AF_INET, libc::SOCK_STREAM)?;
             }
             Role::Capture { .. } => {
                 allowed.always(LOOK).open_for_reading()?;
@@ -331,6 +339,11 @@ impl Allowed {
         let thread = SeccompCmpOp::MaskedEq(wide(kinds));
         let thread = condition(0, thread, wide(libc::CLONE_THREAD))?;
         self.when(libc::SYS_clone, &[thread])?;
+        self.connections()
+    }
+
+    /// Allows what a runtime does with its signals and connections.
+    fn connections(&mut self) -> Result<(), BackendError> {
         self.when(libc::SYS_socketpair, &[equal(0, libc::AF_UNIX)?])?;
         for request in request::ORDINARY {
             self.when(libc::SYS_ioctl, &[equal(1, request)?])?;

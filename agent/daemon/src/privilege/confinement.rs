@@ -40,6 +40,9 @@ pub enum Role {
     Serve,
     /// OTLP. As [`Role::Service`], with connections to the collector.
     Export,
+    /// The ros2 daemon. No capability. Binds TCP ports, whose domains are known only later, and reads
+    /// `/proc`; creates no outgoing connection, no thread, and opens no file for writing.
+    Ros2Daemon,
     /// Packets, the model and the kernel's maps. No capability if the kernel lets the owner of maps
     /// change them, otherwise `CAP_BPF`. Opens no socket, and no file for writing.
     Capture {
@@ -143,7 +146,7 @@ impl Role {
             }
         };
         match self {
-            Self::Service | Self::Serve | Self::Export => nothing,
+            Self::Service | Self::Serve | Self::Export | Self::Ros2Daemon => nothing,
             Self::Capture { needs_bpf } => bpf(needs_bpf),
             Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
             Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,

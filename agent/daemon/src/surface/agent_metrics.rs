@@ -10,6 +10,7 @@ use super::foxglove::Viewers;
 use super::metric_sink::{Label, MetricSink};
 use super::otlp::{Exports, Outcome, Reason};
 use super::process::Process;
+use super::ros2_daemon::{PortState, Ros2DaemonFigures};
 use super::ros2_metrics::TopicRows;
 use crate::agent_facts::{Ability, InterfaceFacts, SharedMemoryFacts};
 use crate::events::EventLog;
@@ -237,6 +238,36 @@ pub(super) fn subscriptions(sink: &mut MetricSink<'_>, state: &State) -> fmt::Re
     })?;
     sink.single(&metric::SAMPLES_QUEUED, facts.queued_bytes)?;
     sink.single(&metric::SAMPLES_RETAINED, facts.retained_bytes)
+}
+
+/// Writes the metrics of the ros2 daemon. Without it, its families have no samples.
+pub(super) fn ros2_daemon(sink: &mut MetricSink<'_>, figures: &Ros2DaemonFigures) -> fmt::Result {
+    let ports = figures.ports();
+    let is_on = !ports.is_empty();
+    sink.family(&metric::ROS2_DAEMON_PORTS, |family| {
+        PortState::LABELS
+            .into_iter()
+            .filter(|_| is_on)
+            .try_for_each(|label| {
+                let count = ports
+                    .values()
+                    .filter(|state| state.label() == label)
+                    .count();
+                family.sample(&[Label::Text(label)], count)
+            })
+    })?;
+    sink.family(&metric::ROS2_DAEMON_CLIENTS, |family| match is_on {
+        true => family.sample(&[], figures.clients()),
+        false => Ok(()),
+    })?;
+    sink.family(&metric::ROS2_DAEMON_REQUESTS, |family| {
+        let mut requests = figures.requests().filter(|_| is_on);
+        requests.try_for_each(|(function, count)| family.sample(&[Label::Text(function)], count))
+    })?;
+    sink.family(&metric::ROS2_DAEMON_REFUSED, |family| {
+        let mut refused = figures.refused().filter(|_| is_on);
+        refused.try_for_each(|(reason, count)| family.sample(&[Label::Text(reason)], count))
+    })
 }
 
 /// Writes the metrics of viewers.

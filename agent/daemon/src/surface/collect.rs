@@ -12,6 +12,7 @@ use super::diagnosis_metrics;
 use super::foxglove::Viewers;
 use super::metric_sink::MetricSink;
 use super::otlp::Exports;
+use super::ros2_daemon::Ros2DaemonFigures;
 use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
 use crate::agent_facts::SourceKind;
@@ -40,6 +41,8 @@ pub struct MetricSources {
     pub exports: Arc<Exports>,
     /// Viewers.
     pub viewers: Arc<Viewers>,
+    /// Ports and requests of the ros2 daemon.
+    pub ros2_daemon: Arc<Ros2DaemonFigures>,
     /// Lines of the log that standard error did not accept.
     pub lost_lines: Arc<AtomicU64>,
 }
@@ -58,6 +61,7 @@ impl MetricSources {
             recordings: Arc::default(),
             exports: Arc::default(),
             viewers: Arc::default(),
+            ros2_daemon: Arc::default(),
             lost_lines: Arc::default(),
         }
     }
@@ -92,6 +96,7 @@ pub(super) fn collect(
     agent_metrics::kept(sink, &state)?;
     agent_metrics::subscriptions(sink, &state)?;
     agent_metrics::viewers(sink, &sources.viewers)?;
+    agent_metrics::ros2_daemon(sink, &sources.ros2_daemon)?;
     agent_metrics::events(
         sink,
         &sources.events,

@@ -20,6 +20,7 @@ mod listen;
 mod metric_sink;
 pub mod otlp;
 mod process;
+pub mod ros2_daemon;
 mod ros2_metrics;
 mod service_metrics;
 mod serving;

@@ -3,6 +3,48 @@
 /// Constant, its file, the test's file, and the test.
 pub const FIXED: &[[&str; 4]] = &[
     [
+        "MAX_CLIENTS",
+        "agent/daemon/src/surface/ros2_daemon/connection.rs",
+        "agent/cli/tests/surface/ros2_daemon.rs",
+        "connections_beyond_the_cap_replace_the_longest_idle_one",
+    ],
+    [
+        "MAX_PORTS",
+        "agent/daemon/src/surface/ros2_daemon/ports.rs",
+        "agent/daemon/src/surface/ros2_daemon/ports.rs",
+        "so_many_domains_have_a_port_and_the_next_has_none",
+    ],
+    [
+        "MAX_BODY",
+        "agent/daemon/src/surface/ros2_daemon/request.rs",
+        "agent/cli/tests/surface/ros2_daemon.rs",
+        "web_pages_and_what_is_no_call_are_refused",
+    ],
+    [
+        "MAX_ARGUMENTS",
+        "agent/daemon/src/surface/ros2_daemon/call.rs",
+        "agent/daemon/src/surface/ros2_daemon/call.rs",
+        "a_request_has_at_most_so_many_arguments",
+    ],
+    [
+        "MAX_ANSWER",
+        "agent/daemon/src/surface/ros2_daemon/value.rs",
+        "agent/daemon/src/surface/ros2_daemon/value.rs",
+        "an_answer_beyond_the_cap_is_a_fault",
+    ],
+    [
+        "MAX_ENDPOINTS",
+        "agent/daemon/src/surface/ros2_daemon/function.rs",
+        "agent/daemon/src/surface/ros2_daemon/tests.rs",
+        "an_answer_has_at_most_so_many_endpoints",
+    ],
+    [
+        "MAX_PROCESSES",
+        "agent/daemon/src/surface/ros2_daemon/peer.rs",
+        "agent/daemon/src/surface/ros2_daemon/peer.rs",
+        "so_many_processes_are_inspected",
+    ],
+    [
         "INTEREST_CAPACITY",
         "wire/src/filter.rs",
         "agent/capture/tests/kernel/caps.rs",

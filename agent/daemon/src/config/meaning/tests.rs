@@ -1,5 +1,7 @@
 use std::fmt::Write as _;
 
+use ros2probe_message::Dialect;
+
 use super::*;
 
 fn report(source: &str) -> String {
@@ -21,6 +23,43 @@ fn an_empty_file_means_the_defaults() {
     assert_eq!(
         Config::default().metrics.listen.unwrap().to_string(),
         "127.0.0.1:17400"
+    );
+}
+
+#[test]
+fn the_ros2_daemon_is_a_word_or_a_map() {
+    let read = |text: &str| parse(text.as_bytes()).unwrap().ros2_daemon;
+    let setting = |is_on, distro| Ros2DaemonSettings { is_on, distro };
+    for (text, expected) in [
+        ("{}", setting(false, None)),
+        ("ros2_daemon:\n", setting(false, None)),
+        ("ros2_daemon: off", setting(false, None)),
+        ("ros2_daemon: on", setting(true, None)),
+        ("ros2_daemon: {}", setting(true, None)),
+        ("ros2_daemon: {enabled: off}", setting(false, None)),
+        (
+            "ros2_daemon: {distro: lyrical}",
+            setting(true, Some(Dialect::Rolling)),
+        ),
+        (
+            "ros2_daemon: {enabled: on, distro: iron}",
+            setting(true, Some(Dialect::Jazzy)),
+        ),
+    ] {
+        assert_eq!(read(text), expected, "{text}");
+    }
+    assert_eq!(
+        report("ros2_daemon: yes"),
+        "f:1:14: ros2_daemon: is the text `yes`, must be one of on, off"
+    );
+    assert_eq!(
+        report("ros2_daemon: 3"),
+        "f:1:14: ros2_daemon: is `3`, must be text or a map of keys"
+    );
+    assert_eq!(
+        report("ros2_daemon: {distro: noetic}"),
+        "f:1:23: ros2_daemon.distro: is the text `noetic`, must be one of humble, iron, jazzy, \
+         kilted, lyrical, rolling"
     );
 }
 

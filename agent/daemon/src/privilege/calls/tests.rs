@@ -10,10 +10,11 @@ use seccompiler::TargetArch;
 use super::super::{Unprivileged, confine};
 use super::*;
 
-const ROLES: [Role; 7] = [
+const ROLES: [Role; 8] = [
     Role::Service,
     Role::Serve,
     Role::Export,
+    Role::Ros2Daemon,
     Role::Capture { needs_bpf: false },
     Role::Reattach { needs_bpf: false },
     Role::SharedMemory { needs_nice: false },
@@ -147,7 +148,9 @@ fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
             let speaks = connects || role == Role::Service;
             for kind in [STREAM, DATAGRAM] {
                 assert_eq!(socket(libc::AF_UNIX, kind).is_none(), speaks, "{role:?}");
-                assert_eq!(socket(libc::AF_INET, kind) != refused, connects, "{role:?}");
+                let binds = role == Role::Ros2Daemon && kind == STREAM;
+                let has_socket = socket(libc::AF_INET, kind) != refused;
+                assert_eq!(has_socket, connects || binds, "{role:?}");
                 assert_eq!(
                     socket(libc::AF_INET6, kind) != refused,
                     connects,
@@ -155,7 +158,7 @@ fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
                 );
             }
             let listen = call(libc::SYS_listen, [-1, 0, 0, 0, 0, 0]);
-            assert_eq!(listen, refused, "{role:?}");
+            assert_eq!(listen != refused, role == Role::Ros2Daemon, "{role:?}");
         });
     }
 }
@@ -163,12 +166,18 @@ fn only_threads_with_connections_create_sockets_and_of_no_other_kind() {
 /// Ways to redirect a connection: `connect` after a disconnect, and messages with an address.
 #[test]
 fn an_accepted_connection_cannot_be_led_elsewhere() {
+    for role in [Role::Serve, Role::Ros2Daemon] {
+        cannot_lead_elsewhere(role);
+    }
+}
+
+fn cannot_lead_elsewhere(role: Role) {
     let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let elsewhere = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let _client = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
     let (accepted, _) = listener.accept().unwrap();
     let port = elsewhere.local_addr().unwrap().port();
-    let led = confined(Role::Serve, move || {
+    let led = confined(role, move || {
         let socket = c_long::from(accepted.as_raw_fd());
         let family = |family: i32| u16::try_from(family).unwrap().to_ne_bytes();
         let mut nowhere = [0_u8; 16];
@@ -209,7 +218,7 @@ fn an_accepted_connection_cannot_be_led_elsewhere() {
         )
     });
     let refused = Some(libc::EPERM);
-    assert_eq!(led, (refused, refused, true, refused, true));
+    assert_eq!(led, (refused, refused, true, refused, true), "{role:?}");
     elsewhere.set_nonblocking(true).unwrap();
     assert!(elsewhere.accept().is_err());
 }

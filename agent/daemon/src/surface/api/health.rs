@@ -15,6 +15,7 @@ use crate::privilege;
 use crate::surface::foxglove::{ViewerListener, Viewers};
 use crate::surface::otlp::Host;
 use crate::surface::process::Process;
+use crate::surface::ros2_daemon::{PortState, Ros2DaemonFigures, port};
 use ros2probe_api::health::{self, Health, Interface, Limit, Table, Thread};
 
 /// Read once, because the host's name rarely changes while the agent runs.
@@ -98,6 +99,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         threads: threads.collect(),
         unfiltered_reason: agent.sandbox.reason().map(Into::into),
         foxglove: foxglove(&context.viewers),
+        ros2_daemon: ros2_daemon(&context.ros2_daemon),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
     })
@@ -127,6 +129,23 @@ fn foxglove(viewers: &Viewers) -> Option<health::Foxglove> {
         access: access.map(|access| access.name().into()),
         clients: clients.collect(),
     })
+}
+
+/// Returns the ports of the ros2 daemon.
+fn ros2_daemon(figures: &Ros2DaemonFigures) -> Vec<health::Ros2DaemonPort> {
+    let ports = figures.ports().into_iter();
+    let ports = ports.filter_map(|(domain_id, state)| {
+        Some(health::Ros2DaemonPort {
+            domain_id,
+            port: port(domain_id)?,
+            state: state.label().into(),
+            reason: match state {
+                PortState::Failed(reason) => Some(reason),
+                _ => None,
+            },
+        })
+    });
+    ports.collect()
 }
 
 fn abilities(agent: &AgentFacts) -> Vec<health::Ability> {

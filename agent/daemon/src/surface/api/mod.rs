@@ -55,6 +55,7 @@ use utoipa_axum::router::OpenApiRouter;
 
 use super::foxglove::Viewers;
 use super::large_responses::LargeResponses;
+use super::ros2_daemon::Ros2DaemonFigures;
 use crate::config::{Access, Limit};
 use crate::events::EventLog;
 use crate::limit_facts::LimitFigures;
@@ -101,6 +102,8 @@ pub struct Context {
     pub library: Arc<Library>,
     /// The viewers.
     pub viewers: Arc<Viewers>,
+    /// Ports of the ros2 daemon.
+    pub ros2_daemon: Arc<Ros2DaemonFigures>,
     /// The web page.
     pub page: Arc<Page>,
     /// Reloads the configuration.

@@ -307,6 +307,34 @@ pub(in crate::surface) const FOXGLOVE_DROPPED: Metric = Metric::counter(
      ros2probe_missed_messages_total, too.",
 )
 .experimental();
+pub(in crate::surface) const ROS2_DAEMON_PORTS: Metric = Metric::gauge(
+    "ros2probe_ros2_daemon_ports",
+    &["state"],
+    "Domains by the state of their port as the ros2 daemon: listening (the agent answers), \
+     occupied (another process has the port), released (by ros2 daemon stop), failed, limit (more \
+     domains than ports).",
+)
+.experimental();
+pub(in crate::surface) const ROS2_DAEMON_CLIENTS: Metric = Metric::gauge(
+    "ros2probe_ros2_daemon_clients",
+    &[],
+    "Connections of the ros2 command line.",
+)
+.experimental();
+pub(in crate::surface) const ROS2_DAEMON_REQUESTS: Metric = Metric::counter(
+    "ros2probe_ros2_daemon_requests_total",
+    &["function"],
+    "Requests of the ros2 command line, by function; unknown functions share one value.",
+)
+.experimental();
+pub(in crate::surface) const ROS2_DAEMON_REFUSED: Metric = Metric::counter(
+    "ros2probe_ros2_daemon_refused_total",
+    &["reason"],
+    "Requests refused as the ros2 daemon: full (too many connections), host (another Host \
+     header), origin (from a web page), path (another path or method), size, malformed (not a \
+     call), memory (slow readers).",
+)
+.experimental();
 pub(in crate::surface) const RECORDINGS: Metric = Metric::gauge(
     "ros2probe_recordings",
     &[],

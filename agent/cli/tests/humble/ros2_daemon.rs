@@ -1,0 +1,322 @@
+//! The `ros2` command line of ROS 2 Humble with the agent as its daemon, beside real nodes: it prints
+//! what it prints with its own daemon, and sends nothing on the network.
+//!
+//! Needs root and ROS 2 Humble: `make test-ros2`.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::process::{Command, Output};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::shared_memory::SharedMemory;
+use ros2probe_testing::harness::wait_until;
+use tempfile::TempDir;
+
+const RP: &str = env!("CARGO_BIN_EXE_rp");
+const PATIENCE: Duration = Duration::from_secs(60);
+/// The kernel keeps the address of a closed connection of the real daemon for a minute at most. The
+/// daemon does not let others reuse it.
+const TIME_WAIT: Duration = Duration::from_secs(75);
+/// Nodes of the robot, without those of tools.
+const NODES: f64 = 6.0;
+const LISTENING: [(&str, &str); 1] = [("state", "listening")];
+/// Every command that needs no participant, in each of its forms.
+const FREE: &[&str] = &[
+    "topic list",
+    "topic list -t",
+    "topic list -v",
+    "topic list -c",
+    "topic list --include-hidden-topics",
+    "topic info /chatter",
+    "topic info -v /chatter",
+    "topic info -v /fibonacci/_action/status",
+    "topic info /nope",
+    "topic type /chatter",
+    "topic type /nope",
+    "topic find std_msgs/msg/String",
+    "topic find -c rcl_interfaces/msg/Log",
+    "node list",
+    "node list -a",
+    "node info /talker",
+    "node info --include-hidden /robot1/server",
+    "node info /client",
+    "node info /nope",
+    "service list",
+    "service list -t",
+    "service list -c",
+    "service list --include-hidden-services",
+    "service type /robot1/add",
+    "service find example_interfaces/srv/AddTwoInts",
+    "action list",
+    "action list -t",
+    "action list -c",
+    "action info /fibonacci",
+    "action info -t /fibonacci",
+    "lifecycle nodes",
+    "component list",
+];
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn with_fast_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
+    answers_as_the_real_daemon("rmw_fastrtps_cpp")
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn with_cyclone_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
+    answers_as_the_real_daemon("rmw_cyclonedds_cpp")
+}
+
+fn answers_as_the_real_daemon(rmw: &'static str) -> Result<()> {
+    let network = Namespace::alone()?;
+    let robot = Robot::start(&network, rmw)?;
+    let agent = robot.agent()?;
+    let nodes = robot.nodes()?;
+    agent.scrape_until("all nodes are known", |page| {
+        page.sum("ros2_nodes", &[]) == NODES
+            && page.sum("ros2_topic_subscriptions", &[("topic", "/chatter")]) == 1.0
+            && page.sum("ros2probe_ros2_daemon_ports", &LISTENING) == 1.0
+    })?;
+    robot.prints("daemon status", "The daemon is running")?;
+    robot.prints("daemon start", "The daemon is already running")?;
+
+    let sniffer = Sniffer::start(&robot)?;
+    let with_agent = robot.all()?;
+    let senders = sniffer.finish()?;
+    let own = ports(&nodes)?;
+    ensure!(senders.is_subset(&own), "{senders:?} sent, of {own:?}");
+    ensure!(!senders.is_empty(), "the nodes sent nothing");
+    let participants = agent.scrape()?.sum("ros2_participants", &[]);
+    ensure!(participants == nodes.len() as f64, "{participants}");
+    // A command that uses no daemon is seen.
+    let sniffer = Sniffer::start(&robot)?;
+    robot.ros2("topic list --no-daemon")?;
+    let senders = sniffer.finish()?;
+    ensure!(!senders.is_subset(&own), "{senders:?} sent, of {own:?}");
+
+    robot.prints("daemon stop", "The daemon has been stopped")?;
+    robot.prints("daemon status", "The daemon is not running")?;
+    robot.prints("daemon start", "The daemon has been started")?;
+    wait_until("the real daemon knows the robot", || {
+        let text = robot.ros2("topic info -v /chatter")?;
+        let text = String::from_utf8_lossy(&text.stdout).into_owned();
+        let nodes = robot.ros2("node list")?;
+        let count = nodes.stdout.iter().filter(|byte| **byte == b'\n').count();
+        Ok(text.contains("Node name: listener") && count == NODES as usize)
+    })?;
+    // Discovery of the last endpoints.
+    std::thread::sleep(Duration::from_secs(2));
+    let with_daemon = robot.all()?;
+    for ((command, real), ours) in FREE.iter().zip(&with_daemon).zip(&with_agent) {
+        let (real, ours) = (Printed::of(real), Printed::of(ours));
+        ensure!(
+            real == ours,
+            "ros2 {command}:\n{real:#?}\nwith the agent:\n{ours:#?}"
+        );
+    }
+    takes_over(&robot, &agent)
+}
+
+/// The agent waits while a real daemon has the port, and answers when it has ended.
+fn takes_over(robot: &Robot<'_>, agent: &Agent<'_>) -> Result<()> {
+    agent.process.signal("HUP")?;
+    agent.scrape_until("the port is occupied", |page| {
+        page.sum("ros2probe_ros2_daemon_ports", &[("state", "occupied")]) == 1.0
+    })?;
+    robot.prints("daemon stop", "The daemon has been stopped")?;
+    let deadline = Instant::now() + TIME_WAIT;
+    while agent
+        .scrape()?
+        .sum("ros2probe_ros2_daemon_ports", &LISTENING)
+        != 1.0
+    {
+        ensure!(Instant::now() < deadline, "the agent does not take over");
+        std::thread::sleep(Duration::from_millis(200));
+    }
+    robot.prints("daemon start", "The daemon is already running")?;
+    robot.prints("topic type /chatter", "std_msgs/msg/String")
+}
+
+/// The host of the nodes, with its own `/dev/shm`.
+struct Robot<'n> {
+    network: &'n Namespace,
+    shared_memory: SharedMemory,
+    directory: TempDir,
+    rmw: &'static str,
+}
+
+/// What a command printed, without the order of lines and without the real daemon's own node.
+#[derive(Debug, PartialEq, Eq)]
+struct Printed {
+    status: Option<i32>,
+    output: Vec<String>,
+    errors: Vec<String>,
+}
+
+/// tcpdump on every interface of the namespace.
+struct Sniffer<'r> {
+    process: Process,
+    robot: &'r Robot<'r>,
+}
+
+impl<'n> Robot<'n> {
+    fn start(network: &'n Namespace, rmw: &'static str) -> Result<Robot<'n>> {
+        crate::installed::prefix();
+        Ok(Robot {
+            network,
+            shared_memory: SharedMemory::of(network, 128)?,
+            directory: tempfile::tempdir()?,
+            rmw,
+        })
+    }
+
+    fn agent(&self) -> Result<Agent<'n>> {
+        let path = self.directory.path().display();
+        let capture = at_the_sockets_of(self.network);
+        let text = format!(
+            "{capture}api: {{socket: {path}/api.sock}}\nstate_directory: {path}\nwatch: ['/**']\n\
+             ros2_daemon: on\n"
+        );
+        let configuration = self.directory.path().join("ros2probe.yaml");
+        fs::write(&configuration, text)?;
+        Agent::start(self.network, RP, &configuration)
+    }
+
+    /// Starts the robot's nodes, each a process.
+    fn nodes(&self) -> Result<Vec<Process>> {
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble/graph.py");
+        let lines = [
+            "exec /opt/ros/humble/lib/demo_nodes_cpp/talker".to_owned(),
+            "exec /opt/ros/humble/lib/demo_nodes_cpp/listener".to_owned(),
+            "exec /opt/ros/humble/lib/demo_nodes_cpp/add_two_ints_server".to_owned(),
+            "exec /opt/ros/humble/lib/lifecycle/lifecycle_talker".to_owned(),
+            format!("exec python3 {script}"),
+        ];
+        lines
+            .iter()
+            .map(|line| Process::start(&self.enter(), "bash", ["-c", &shell(line)]))
+            .collect()
+    }
+
+    /// Returns the prefix that runs a program of ROS on this host.
+    fn enter(&self) -> Vec<String> {
+        let mut enter = self.shared_memory.inside(self.network);
+        enter.push("env".to_owned());
+        enter.extend([
+            format!("RMW_IMPLEMENTATION={}", self.rmw),
+            "ROS_DOMAIN_ID=0".to_owned(),
+            format!("ROS_LOG_DIR={}", self.directory.path().display()),
+        ]);
+        enter
+    }
+
+    /// Runs `ros2` with these words.
+    fn ros2(&self, words: &str) -> Result<Output> {
+        let enter = self.enter();
+        let (program, arguments) = enter.split_first().context("no prefix")?;
+        let mut command = Command::new(program);
+        command
+            .args(arguments)
+            .args(["bash", "-c", &shell(&format!("exec ros2 {words}"))]);
+        command.output().with_context(|| words.to_owned())
+    }
+
+    /// Returns what each command of [`FREE`] prints.
+    fn all(&self) -> Result<Vec<Output>> {
+        FREE.iter().map(|words| self.ros2(words)).collect()
+    }
+
+    fn prints(&self, words: &str, expected: &str) -> Result<()> {
+        let output = self.ros2(words)?;
+        let text = String::from_utf8_lossy(&output.stdout);
+        let errors = String::from_utf8_lossy(&output.stderr);
+        ensure!(text.trim() == expected, "ros2 {words}: {text}{errors}");
+        Ok(())
+    }
+}
+
+impl Printed {
+    fn of(output: &Output) -> Self {
+        let lines = |bytes: &[u8]| -> Vec<String> {
+            let text = String::from_utf8_lossy(bytes);
+            let mut lines: Vec<_> = text.lines().filter_map(without_daemon).collect();
+            lines.sort_unstable();
+            lines
+        };
+        Self {
+            status: output.status.code(),
+            output: lines(&output.stdout),
+            errors: lines(&output.stderr),
+        }
+    }
+}
+
+/// Returns a line without the real daemon's node, which publishes `/rosout` and `/parameter_events`.
+/// The numbers of their publishers differ by one, and are left out.
+fn without_daemon(line: &str) -> Option<String> {
+    if line.starts_with("/_ros2cli_daemon_") {
+        return None;
+    }
+    let is_of_all = line.starts_with(" * /rosout ") || line.starts_with(" * /parameter_events ");
+    match line.rsplit_once("] ") {
+        Some((name, count)) if is_of_all && count.contains("publisher") => Some(name.to_owned()),
+        _ => Some(line.to_owned()),
+    }
+}
+
+impl<'r> Sniffer<'r> {
+    fn start(robot: &'r Robot<'r>) -> Result<Self> {
+        let file = robot.directory.path().join("ros2.pcap");
+        let errors = robot.directory.path().join("tcpdump.txt");
+        let file = file.display().to_string();
+        let words = ["-i", "any", "-n", "-U", "-Z", "root", "-w", &file, "udp"];
+        let enter = robot.network.inside();
+        let said = fs::File::create(&errors)?.into();
+        let process = Process::start_with(&enter, "tcpdump", words, said)?;
+        wait_until("tcpdump listens", || {
+            Ok(fs::read_to_string(&errors)?.contains("listening on"))
+        })?;
+        Ok(Self { process, robot })
+    }
+
+    /// Returns the source ports of all datagrams.
+    fn finish(mut self) -> Result<BTreeSet<u16>> {
+        // tcpdump reads the kernel's buffer each second.
+        std::thread::sleep(Duration::from_millis(1_500));
+        self.process.signal("INT")?;
+        self.process.wait(PATIENCE)?;
+        let file = self.robot.directory.path().join("ros2.pcap");
+        let output = Command::new("tcpdump")
+            .args(["-n", "-r"])
+            .arg(file)
+            .output()?;
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        // TIME INTERFACE DIRECTION IP SOURCE.PORT > DESTINATION.PORT: UDP
+        let sources = text.lines().filter_map(|line| {
+            let (source, _) = line.split_once(" > ")?;
+            source.rsplit_once('.')?.1.parse().ok()
+        });
+        Ok(sources.collect())
+    }
+}
+
+/// Returns the UDP ports of these processes.
+fn ports(nodes: &[Process]) -> Result<BTreeSet<u16>> {
+    let mut ports = BTreeSet::new();
+    for node in nodes {
+        ports.extend(node.udp_ports()?);
+    }
+    Ok(ports)
+}
+
+fn shell(line: &str) -> String {
+    format!(
+        ". {}/env.sh && {line}",
+        crate::installed::prefix().display()
+    )
+}

@@ -1,0 +1,216 @@
+//! A connection of a client: its time limit, and a close that leaves the port free.
+//!
+//! The side that closes a TCP connection first keeps its address for a minute (TIME_WAIT). A real
+//! daemon could not bind the port during that minute, so the agent resets connections that it ends.
+
+use std::io;
+use std::pin::Pin;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use rustix::net::sockopt;
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
+use tokio::time::{Instant, sleep_until};
+use tokio_util::sync::CancellationToken;
+
+/// Longest time from an answer to the end of the next request and its answer.
+pub(super) const IDLE: Duration = Duration::from_secs(10);
+/// Most connections to all ports.
+pub(super) const MAX_CLIENTS: usize = 16;
+
+/// The stream of a connection.
+#[derive(Debug)]
+pub(super) struct Stream {
+    inner: TcpStream,
+    /// Whether the connection was closed in order.
+    is_shut: bool,
+    resets: Arc<AtomicBool>,
+}
+
+/// State of a connection that its requests and the listener share.
+#[derive(Debug)]
+pub(super) struct ConnectionState {
+    /// Time of the last answer.
+    since: Mutex<Instant>,
+    is_working: AtomicBool,
+    end: CancellationToken,
+    resets: Arc<AtomicBool>,
+}
+
+/// All connections.
+#[derive(Debug, Default)]
+pub(super) struct Connections(Vec<Arc<ConnectionState>>);
+
+impl Stream {
+    /// Takes over a stream.
+    pub(super) fn new(inner: TcpStream, state: &ConnectionState) -> Self {
+        Self {
+            inner,
+            is_shut: false,
+            resets: Arc::clone(&state.resets),
+        }
+    }
+}
+
+impl ConnectionState {
+    /// Creates the state of a connection that ends with `end`.
+    pub(super) fn new(end: CancellationToken) -> Self {
+        Self {
+            since: Mutex::new(Instant::now()),
+            is_working: AtomicBool::new(false),
+            end,
+            resets: Arc::default(),
+        }
+    }
+
+    /// Records that a request arrived.
+    pub(super) fn requested(&self) {
+        self.is_working.store(true, Ordering::Relaxed);
+    }
+
+    /// Records that its answer is ready.
+    pub(super) fn answered(&self) {
+        self.is_working.store(false, Ordering::Relaxed);
+        *self.since.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
+    }
+
+    /// Lets the connection end with a reset, behind the answer in progress.
+    pub(super) fn reset(&self) {
+        self.resets.store(true, Ordering::Relaxed);
+    }
+
+    /// Returns when the connection must end: on request, or after [`IDLE`] without an answer.
+    pub(super) async fn ended(&self) {
+        loop {
+            let deadline = self.since() + IDLE;
+            tokio::select! {
+                () = self.end.cancelled() => return,
+                () = sleep_until(deadline) => {}
+            }
+            if self.since() + IDLE <= Instant::now() {
+                return;
+            }
+        }
+    }
+
+    fn since(&self) -> Instant {
+        *self.since.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Connections {
+    /// Adds a connection. If all are in use, the one without a request for longest makes room;
+    /// returns `false` if all have one.
+    pub(super) fn join(&mut self, state: &Arc<ConnectionState>) -> bool {
+        if self.0.len() >= MAX_CLIENTS {
+            let idle = self.0.iter().enumerate();
+            let idle = idle.filter(|(_, each)| !each.is_working.load(Ordering::Relaxed));
+            let Some((at, _)) = idle.min_by_key(|(_, each)| each.since()) else {
+                return false;
+            };
+            self.0.swap_remove(at).end.cancel();
+        }
+        self.0.push(Arc::clone(state));
+        true
+    }
+
+    /// Removes a connection.
+    pub(super) fn leave(&mut self, state: &Arc<ConnectionState>) {
+        self.0.retain(|each| !Arc::ptr_eq(each, state));
+    }
+}
+
+impl Drop for Stream {
+    fn drop(&mut self) {
+        if !self.is_shut {
+            // A failure leaves the kernel's default, an orderly close.
+            let _ = sockopt::set_socket_linger(&self.inner, Some(Duration::ZERO));
+        }
+    }
+}
+
+impl AsyncRead for Stream {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        buffer: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.inner).poll_read(context, buffer)
+    }
+}
+
+impl AsyncWrite for Stream {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.inner).poll_write(context, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.inner).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        if self.resets.load(Ordering::Relaxed) {
+            return Poll::Ready(Ok(()));
+        }
+        self.is_shut = true;
+        Pin::new(&mut self.inner).poll_shutdown(context)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        slices: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.inner).poll_write_vectored(context, slices)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.inner.is_write_vectored()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state() -> Arc<ConnectionState> {
+        Arc::new(ConnectionState::new(CancellationToken::new()))
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn connections_beyond_the_cap_replace_the_longest_idle_one_and_no_busy_one() {
+        let mut connections = Connections::default();
+        let all: Vec<_> = std::iter::repeat_with(state).take(MAX_CLIENTS).collect();
+        for each in &all {
+            assert!(connections.join(each));
+            tokio::time::advance(Duration::from_millis(1)).await;
+        }
+        all[0].requested();
+        let next = state();
+        assert!(connections.join(&next));
+        assert!(all[1].end.is_cancelled() && !all[0].end.is_cancelled());
+        all[2..].iter().for_each(|each| each.requested());
+        next.requested();
+        assert!(!connections.join(&state()));
+        connections.leave(&next);
+        assert!(connections.join(&state()));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_connection_without_an_answer_ends_after_a_time() {
+        let state = state();
+        let start = Instant::now();
+        tokio::time::advance(IDLE / 2).await;
+        state.requested();
+        state.answered();
+        state.ended().await;
+        assert_eq!(start.elapsed().as_secs(), 15);
+    }
+}
