@@ -191,7 +191,7 @@ impl Services {
             let until = at + SUSPENDED;
             writer.suspended = Some(until);
             let key = writer.service.key.clone();
-            self.suspend(&key, until);
+            self.suspend(&key, until, at);
             return Ok(true);
         }
         if sample.is_message()
@@ -454,8 +454,11 @@ impl Services {
     }
 
     /// Drops the open calls of a service, since one of its writers is no longer captured.
-    fn suspend(&mut self, key: &Key, until: Timestamp) {
+    fn suspend(&mut self, key: &Key, until: Timestamp, at: Timestamp) {
         self.evictions += 1;
+        if !self.services.contains_key(key) && !self.has_place(at) {
+            return;
+        }
         let service = self.services.entry(key.clone()).or_default();
         service.suspended = Some(until);
         self.open -= service.open();
