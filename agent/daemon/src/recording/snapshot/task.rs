@@ -42,7 +42,8 @@ pub(super) struct SnapshotTask {
 
 struct OpenBag {
     bag: SnapshotBag,
-    /// Time after which no message belongs to the bag.
+    /// First and last time of its messages. In a replay, both may lie ahead.
+    since: Timestamp,
     end: Timestamp,
     deadline: Instant,
 }
@@ -109,7 +110,8 @@ impl SnapshotTask {
         let is_end = matches!(item, Item::End(_));
         if let Some(open) = &mut self.open {
             let is_late = now.is_some_and(|now| now > open.end);
-            let taken = if is_late {
+            let is_early = now.is_some_and(|now| now < open.since);
+            let taken = if is_early || is_late {
                 Ok(())
             } else {
                 open.bag.take(&item)
@@ -145,9 +147,12 @@ impl SnapshotTask {
 
     /// Begins a bag, unless one is open or the last one is too recent.
     fn trigger(&mut self, name: &'static str, record: Record) {
+        // Events of the agent have the time of this host, which differs in a replay.
+        let is_of_agent = record.definition.name.starts_with("ros2probe.");
+        let at = if is_of_agent { self.clock } else { record.at };
         let min_interval = self.settings.min_interval;
-        let is_early = |last: Timestamp| self.clock.distance(last) < min_interval;
-        if self.open.is_some() || self.triggered.is_some_and(is_early) {
+        let is_recent = |last: Timestamp| at.distance(last) < min_interval;
+        if self.open.is_some() || self.triggered.is_some_and(is_recent) {
             self.figures.suppressed += 1;
             return;
         }
@@ -155,10 +160,7 @@ impl SnapshotTask {
         if self.ring.is_empty() && self.settings.after.is_zero() {
             return;
         }
-        self.triggered = Some(self.clock);
-        // Events of the agent have the time of this host, which differs in a replay.
-        let is_of_agent = record.definition.name.starts_with("ros2probe.");
-        let at = if is_of_agent { self.clock } else { record.at };
+        self.triggered = Some(at);
         let cause = Cause::Event {
             trigger: name,
             id: self.recordings.events.id(record.number),
@@ -171,10 +173,11 @@ impl SnapshotTask {
         };
         self.open = Some(OpenBag {
             bag,
+            since,
             end: at + self.settings.after,
             deadline: Instant::now() + self.settings.after + SOURCE_DELAY,
         });
-        if self.settings.after.is_zero() {
+        if self.settings.after.is_zero() && self.clock >= at {
             self.complete(None);
         }
     }

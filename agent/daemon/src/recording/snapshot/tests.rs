@@ -268,6 +268,21 @@ fn the_delay_of_an_event_does_not_shorten_the_time_before() {
     assert_eq!(robot.only_bag(), expected);
 }
 
+/// In a replay, the log of events may be ahead of the messages.
+#[test]
+fn an_event_ahead_of_the_messages_selects_the_same_messages() {
+    let mut robot = Robot::new(settings(&["message_lost"], 3, 2));
+    robot.run(20);
+    let early = robot.now;
+    robot.now += 100;
+    let incident = robot.now;
+    robot.lose_messages();
+    robot.now = early;
+    robot.run(150);
+    let expected: Vec<u64> = (incident - 30..=incident + 20).collect();
+    assert_eq!(robot.only_bag(), expected);
+}
+
 #[test]
 fn only_problems_of_the_domain_meet_a_short_name_and_every_event_meets_its_full_name() {
     let mut robot = Robot::new(settings(&["participant_lost"], 1, 0));
