@@ -90,6 +90,7 @@ fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<(
         "topic",
         "echo",
         "/chatter",
+        "std_msgs/msg/String",
         "--qos-reliability",
         "best_effort",
     ];
@@ -97,7 +98,14 @@ fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<(
     agent.scrape_until("messages in memory", |page| {
         page.sum("ros2probe_snapshot_messages", &[]) > 80.0
     })?;
-    let reliable = ["topic", "echo", "/chatter", "--qos-reliability", "reliable"];
+    let reliable = [
+        "topic",
+        "echo",
+        "/chatter",
+        "std_msgs/msg/String",
+        "--qos-reliability",
+        "reliable",
+    ];
     let _incompatible = robot.ros2("incompatible", &reliable)?;
     agent.scrape_until("a bag", |page| {
         page.sum("ros2probe_snapshots_written_total", &[]) == 1.0
@@ -158,6 +166,7 @@ fn plays(robot: &Robot<'_>, bag: &Path, count: usize) -> Result<()> {
         "topic",
         "echo",
         "/chatter",
+        "std_msgs/msg/String",
         "--qos-reliability",
         "best_effort",
     ];
