@@ -102,6 +102,11 @@ dist: ## release both binaries, packages, bills of materials and checksums into 
 	packaging/dist.sh
 	ROS2PROBE_DIST=$(TARGET)/dist ROS2PROBE_PACKAGES=$(TARGET)/dist cargo test --package ros2probe --test dist -- --include-ignored
 
+vm: ## boot whole systems, install the package in each and check it; VM="arm64-6.1 ..." chooses (needs root)
+	@.ci/prerequisites.sh vm
+	@[ -f $(TARGET)/dist/SHA256SUMS ] || $(MAKE) --no-print-directory dist
+	@$(SUDO) packaging/vm.sh $(VM)
+
 distcheck: ## repeat the build of make dist in another directory and compare every byte
 	packaging/dist.sh --again
 
@@ -152,4 +157,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist vm distcheck bench soak fuzz miri book deny prerequisites

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs the missing tools of a Makefile target, printing each of them first.
 #
-#   prerequisites.sh demo|test|fast|dist|ebpf|fuzz|miri|book|deny...   install the tools of those targets
+#   prerequisites.sh demo|test|fast|dist|vm|ebpf|fuzz|miri|book|deny...   install the tools of those targets
 #   prerequisites.sh types                    install the type checker of the dashboards
 #   prerequisites.sh page                     install the browser of the page's tests
 #   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
@@ -384,6 +384,11 @@ for need; do
         qemu
         debian
         cargo_deb
+        ;;
+    vm)
+        packages mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs
+        rust
+        musl x86_64 aarch64
         ;;
     types) types ;;
     page) page ;;
