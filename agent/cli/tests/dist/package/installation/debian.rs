@@ -143,12 +143,12 @@ impl Debian {
             }
             let text = std::fs::read_to_string(&children)?;
             self.first = text.split_whitespace().next().map_or(Ok(0), str::parse)?;
-            let is_there = self.first != 0 && self.attempt("test -d /packages")?.status.success();
-            let is_up = || -> Result<bool> {
-                let said = self.text("systemctl is-system-running")?;
-                Ok(matches!(said.trim(), "running" | "degraded"))
+            // A process that prepares the container precedes its first one, and soon ends.
+            let (is_up, said): (_, &[_]) = match start {
+                Start::Systemd => ("systemctl is-system-running", &["running", "degraded"]),
+                Start::Nothing => ("cat /proc/1/comm", &["(sd-stubinit)"]),
             };
-            Ok(is_there && (start == Start::Nothing || is_up()?))
+            Ok(self.first != 0 && said.contains(&self.text(is_up)?.trim()))
         })
     }
 }
