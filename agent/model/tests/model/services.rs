@@ -128,6 +128,19 @@ impl Robot {
         self.domain.put(message);
     }
 
+    /// Sends one DATA_FRAG of so many bytes of Cyclone DDS' reply number 1 to call 1.
+    fn part_of_a_reply(&mut self, from: Party, to: Party, body: &[u8], start: u32, bytes: u16) {
+        let payload = [
+            &[0, 1, 0, 0],
+            &to.identity[..8],
+            &1_u64.to_le_bytes()[..],
+            body,
+        ];
+        let message = Message::from(from.writer.prefix);
+        let message = message.fragment(from.writer.entity, 1, start, bytes, &payload.concat());
+        self.domain.put(message);
+    }
+
     fn wait(&mut self, milliseconds: u64) {
         self.domain.wait(milliseconds);
     }

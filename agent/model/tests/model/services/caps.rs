@@ -112,18 +112,7 @@ fn a_reply_in_too_many_parts_keeps_within_its_runs() {
     let client = robot.client(1, ADD);
     let server = robot.server(2, ADD);
     robot.request(client, 1);
-    let payload = [
-        &[0, 1, 0, 0],
-        &client.identity[..8],
-        &1_u64.to_le_bytes()[..],
-        &[5; 10_000],
-    ];
-    let payload = payload.concat();
-    let mut fragment = |start: u32| {
-        let message = Message::from(server.writer.prefix);
-        let message = message.fragment(server.writer.entity, 1, start, 100, &payload);
-        robot.domain.put(message);
-    };
+    let mut fragment = |start| robot.part_of_a_reply(server, client, &[5; 10_000], start, 100);
     (0..50).for_each(|part| fragment(2 * part + 1));
     (0..50).for_each(|part| fragment(2 * part + 2));
     assert_eq!(size(&robot, "services.runs"), (16, 16));

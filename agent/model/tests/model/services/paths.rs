@@ -197,17 +197,8 @@ fn a_fragmented_reply_is_an_answer_when_all_of_it_has_arrived() {
     let client = robot.client(1, ADD);
     let server = robot.server(2, ADD);
     robot.request(client, 1);
-    let payload = [
-        &[0, 1, 0, 0],
-        &client.identity[..8],
-        &1_u64.to_le_bytes()[..],
-        &[5; 2_500],
-    ];
-    let payload = payload.concat();
-    let fragment = |robot: &mut Robot, start: u32| {
-        let message = Message::from(server.writer.prefix);
-        let message = message.fragment(server.writer.entity, 1, start, 1_000, &payload);
-        robot.domain.put(message);
+    let fragment = |robot: &mut Robot, start| {
+        robot.part_of_a_reply(server, client, &[5; 2_500], start, 1_000);
         robot.wait(1);
     };
     for start in [1, 3, 3, 1] {
