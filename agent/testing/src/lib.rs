@@ -16,6 +16,7 @@
 )]
 #![allow(missing_docs, reason = "fields and short methods of test code say it")]
 
+pub mod bag_messages;
 pub mod bag_readers;
 pub mod dashboard;
 pub mod forged;

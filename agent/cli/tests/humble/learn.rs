@@ -8,15 +8,13 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use anyhow::{Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::harness::agent::Scrape;
 use ros2probe_testing::harness::network::Namespace;
-use ros2probe_testing::harness::process::Process;
-use ros2probe_testing::harness::shared_memory::SharedMemory;
 use ros2probe_testing::harness::{run, wait_until};
 
+use crate::host::{Host, Middleware, RP};
 use crate::installed;
 
-const RP: &str = env!("CARGO_BIN_EXE_rp");
 const VIOLATED: &str = "ros2_watch_expectation_violated";
 /// Longer than the 20 s with a publisher that the numbers of endpoints need.
 const LEARNS: Duration = Duration::from_secs(40);
@@ -24,36 +22,23 @@ const LEARNS: Duration = Duration::from_secs(40);
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn fast_dds_with_shared_memory_meets_what_was_learnt_from_it() -> Result<()> {
-    meets_what_was_learnt("rmw_fastrtps_cpp")
+    meets_what_was_learnt(Middleware::FastSampled)
 }
 
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn cyclone_dds_meets_what_was_learnt_from_it() -> Result<()> {
-    meets_what_was_learnt("rmw_cyclonedds_cpp")
+    meets_what_was_learnt(Middleware::Cyclone)
 }
 
-fn meets_what_was_learnt(middleware: &str) -> Result<()> {
-    let host = Namespace::alone()?;
-    let shared_memory = SharedMemory::of(&host, 64)?;
-    let directory = tempfile::tempdir()?;
-    let file = |name: &str| directory.path().join(name);
-    let settings = format!(
-        "{}api: {{socket: {}}}\n",
-        at_the_sockets_of(&host),
-        file("api.sock").display()
-    );
-    fs::write(file("ros2probe.yaml"), &settings)?;
-    let agent = Agent::start(&host, RP, &file("ros2probe.yaml"))?;
-    let node = |name: &str| -> Result<Process> {
-        let mut enter = shared_memory.inside(&host);
-        let rmw = format!("RMW_IMPLEMENTATION={middleware}");
-        let logs = format!("ROS_LOG_DIR={}", directory.path().display());
-        enter.extend(["env".to_owned(), rmw, logs, "ROS_DOMAIN_ID=0".to_owned()]);
+fn meets_what_was_learnt(middleware: Middleware) -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network, middleware)?;
+    let agent = host.agent("")?;
+    let node = |name: &str| {
         let prefix = installed::prefix();
-        let prefix = prefix.display();
-        let shell = format!(". {prefix}/env.sh && exec {prefix}/lib/demo_nodes_cpp/{name}");
-        Process::start_with(&enter, "bash", ["-c", &shell], Stdio::null())
+        let line = format!("exec {}/lib/demo_nodes_cpp/{name}", prefix.display());
+        host.run(&line, &[], Stdio::null())
     };
     let mut listener = node("listener")?;
     let _talker = node("talker")?;
@@ -65,16 +50,16 @@ fn meets_what_was_learnt(middleware: &str) -> Result<()> {
     let learning = Command::new(RP)
         .env_remove("ROS_DOMAIN_ID")
         .args(["learn", "--socket"])
-        .arg(file("api.sock"))
+        .arg(host.socket())
         .arg("-o")
-        .arg(file("watchlist.yaml"))
+        .arg(host.file("watchlist.yaml"))
         .stdin(Stdio::null())
         .spawn()?;
     std::thread::sleep(LEARNS);
     run(&format!("kill -INT {}", learning.id()))?;
     ensure!(learning.wait_with_output()?.status.success());
-    let learnt = fs::read_to_string(file("watchlist.yaml"))?;
-    fs::write(file("ros2probe.yaml"), settings + &learnt)?;
+    let learnt = fs::read_to_string(host.file("watchlist.yaml"))?;
+    fs::write(host.file("ros2probe.yaml"), host.settings(&learnt))?;
     agent.process.signal("HUP")?;
     let is_violated = |page: &Scrape, topic: &str, expectation: &str| {
         page.value(VIOLATED, &[("topic", topic), ("expectation", expectation)])

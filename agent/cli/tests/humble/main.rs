@@ -8,6 +8,7 @@
 )]
 
 mod echo;
+mod host;
 mod incident;
 mod installed;
 mod learn;

@@ -10,16 +10,16 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of};
+use ros2probe_testing::bag_messages::for_each_message;
+use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
-use ros2probe_testing::harness::shared_memory::SharedMemory;
 use ros2probe_testing::harness::wait_until;
 use serde::Deserialize;
 use serde_json::Value;
-use tempfile::TempDir;
 
-const RP: &str = env!("CARGO_BIN_EXE_rp");
+use crate::host::{Host, Middleware, RP};
+
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Topics of `humble/robot.py` with the number of messages that it publishes on each.
 const TOPICS: [(&str, u64); 6] = [
@@ -36,38 +36,16 @@ const ECHOED: [&str; 3] = ["/imu", "/cam", "/odom"];
 /// Large messages are seldom captured: their pieces reuse the same memory. The rest is always counted.
 const CAPTURED: f64 = 0.7;
 const LARGE: [&str; 2] = ["/cam", "/points"];
-pub(super) const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
-<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
-  <transport_descriptors>
-    <transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type></transport_descriptor>
-  </transport_descriptors>
-  <participant profile_name="udp" is_default_profile="true"><rtps>
-    <userTransports><transport_id>udp</transport_id></userTransports>
-    <useBuiltinTransports>false</useBuiltinTransports>
-  </rtps></participant>
-</profiles>
-"#;
-
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Middleware {
-    /// Shared memory, polled.
-    FastLookedAt,
-    /// Shared memory, with `capture.shm.exact: auto`.
-    FastExact,
-    FastUdp,
-    Cyclone,
-}
-
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn fast_dds_with_shared_memory_is_recorded_or_counted_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::FastLookedAt)
+    holds_what_was_published(Middleware::FastSampled)
 }
 
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn fast_dds_with_shared_memory_and_the_uprobe_is_recorded_to_the_message() -> Result<()> {
-    holds_what_was_published(Middleware::FastExact)
+    holds_what_was_published(Middleware::FastExact("auto"))
 }
 
 #[test]
@@ -84,8 +62,10 @@ fn cyclone_dds_is_recorded_to_the_message() -> Result<()> {
 
 fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     let network = Namespace::alone()?;
-    let robot = Robot::start(&network, middleware)?;
-    let agent = robot.agent()?;
+    let robot = Robot {
+        host: Host::new(&network, middleware)?,
+    };
+    let agent = robot.host.agent("watch: ['/**']\n")?;
     let mut subscriber = robot.node("subscribe")?;
     subscriber.wait_for("ready", PATIENCE)?;
     let mut publisher = robot.node("publish")?;
@@ -98,14 +78,14 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
         })
     })?;
 
-    let bag = robot.directory.path().join("bag");
+    let bag = robot.host.file("bag");
     let Commands {
         mut recorder,
         mut echoes,
         mut hz,
     } = robot.commands(&bag)?;
     robot.wait_for_subscriptions(&agent, 2 + ECHOED.len())?;
-    if middleware == Middleware::FastExact {
+    if middleware == Middleware::FastExact("auto") {
         let ability = [("ability", "shared_memory_exact")];
         agent.scrape_until("the uprobe is attached", |page| {
             page.sum("ros2probe_capture_ability", &ability) == 1.0
@@ -133,7 +113,7 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     );
     println!("{}", recorder.errors());
 
-    let is_looked_at = middleware == Middleware::FastLookedAt;
+    let is_looked_at = middleware == Middleware::FastSampled;
     let unknown_of = bag_holds_or_names_each_message(&bag, &published, &page, is_looked_at)?;
     for (topic, echo) in &echoes {
         let sent = published.get(*topic).context("not published")?;
@@ -227,12 +207,8 @@ struct Commands {
     hz: Rp,
 }
 
-/// The host of the nodes, with its own `/dev/shm`.
 struct Robot<'n> {
-    network: &'n Namespace,
-    shared_memory: SharedMemory,
-    directory: TempDir,
-    middleware: Middleware,
+    host: Host<'n>,
 }
 
 /// An `rp` command with what it printed.
@@ -250,80 +226,10 @@ struct Event {
     t: u64,
 }
 
-impl<'n> Robot<'n> {
-    fn start(network: &'n Namespace, middleware: Middleware) -> Result<Robot<'n>> {
-        ensure!(
-            Path::new("/opt/ros/humble/env.sh").exists(),
-            "ROS 2 Humble is missing: `make test-ros2` says where it comes from"
-        );
-        let directory = tempfile::tempdir()?;
-        fs::write(directory.path().join("udp.xml"), UDP_ONLY)?;
-        Ok(Robot {
-            network,
-            shared_memory: SharedMemory::of(network, 128)?,
-            directory,
-            middleware,
-        })
-    }
-
-    fn agent(&self) -> Result<Agent<'n>> {
-        let path = self.directory.path();
-        let capture = match self.middleware {
-            Middleware::FastExact => format!(
-                "capture: {{source: host, cgroup: {}, shm: {{exact: auto}}}}\n",
-                self.network.cgroup().display()
-            ),
-            _ => at_the_sockets_of(self.network),
-        };
-        let text = format!(
-            "{capture}api: {{socket: {}}}\nstate_directory: {}\nwatch: ['/**']\n",
-            self.socket(),
-            path.display()
-        );
-        let configuration = path.join("ros2probe.yaml");
-        fs::write(&configuration, text)?;
-        Agent::start(self.network, RP, &configuration)
-    }
-
-    fn socket(&self) -> String {
-        self.directory.path().join("api.sock").display().to_string()
-    }
-
+impl Robot<'_> {
     /// A node of `humble/robot.py` in a separate process.
     fn node(&self, role: &str) -> Result<Process> {
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/humble/robot.py");
-        let mut enter = self.shared_memory.inside(self.network);
-        let rmw = match self.middleware {
-            Middleware::FastLookedAt | Middleware::FastExact | Middleware::FastUdp => {
-                "rmw_fastrtps_cpp"
-            }
-            Middleware::Cyclone => "rmw_cyclonedds_cpp",
-        };
-        let mut variables = vec![
-            format!("RMW_IMPLEMENTATION={rmw}"),
-            "ROS_DOMAIN_ID=0".to_owned(),
-        ];
-        variables.push(format!("ROS_LOG_DIR={}", self.directory.path().display()));
-        if self.middleware == Middleware::FastUdp {
-            let profile = self.directory.path().join("udp.xml");
-            variables.push(format!(
-                "FASTRTPS_DEFAULT_PROFILES_FILE={}",
-                profile.display()
-            ));
-        }
-        enter.push("env".to_owned());
-        enter.extend(variables);
-        let shell = r#". /opt/ros/humble/env.sh && exec python3 "$@""#;
-        let log = self.log_of(role);
-        let arguments = [
-            "-c",
-            shell,
-            "robot",
-            &script.display().to_string(),
-            role,
-            &log,
-        ];
-        Process::start(&enter, "bash", arguments)
+        self.host.python("robot.py", &[role, &self.log_of(role)])
     }
 
     /// Starts all commands, and waits until the recorder has subscribed to each topic.
@@ -350,8 +256,7 @@ impl<'n> Robot<'n> {
     }
 
     fn log_of(&self, role: &str) -> String {
-        let log = self.directory.path().join(format!("{role}.jsonl"));
-        log.display().to_string()
+        self.host.path(&format!("{role}.jsonl"))
     }
 
     fn events(&self, role: &str) -> Result<Vec<Event>> {
@@ -395,13 +300,13 @@ impl<'n> Robot<'n> {
     fn rp(&self, name: &str, arguments: &[&str]) -> Result<Rp> {
         let file = |kind| {
             let name = format!("{}.{kind}", name.replace('/', "-"));
-            self.directory.path().join(name)
+            self.host.file(&name)
         };
         let (output, errors) = (file("out"), file("err"));
-        let mut enter = self.network.on_network();
+        let mut enter = self.host.network.on_network();
         enter.extend(["env", "-u", "ROS_DOMAIN_ID", "ROS_DISTRO=humble"].map(str::to_owned));
         let shell = r#"out=$1; shift; exec "$0" "$@" >"$out""#;
-        let socket = self.socket();
+        let socket = self.host.socket();
         let path = output.display().to_string();
         let mut words = vec!["-c", shell, RP, &path];
         words.extend(arguments);
@@ -494,31 +399,24 @@ impl Rp {
 /// Application numbers in a bag by topic: one below the writer's sequence number.
 fn numbers(bag: &Path) -> Result<Numbers> {
     let mut numbers: Numbers = BTreeMap::new();
-    for file in fs::read_dir(bag)? {
-        let path = file?.path();
-        if path.extension().is_none_or(|extension| extension != "mcap") {
-            continue;
+    let mut last = BTreeMap::new();
+    for_each_message(bag, |message| {
+        let topic = message.channel.topic.clone();
+        let number = u64::from(message.sequence) - 1;
+        let delay = message.log_time.saturating_sub(message.publish_time);
+        if TOPICS.iter().any(|(name, _)| *name == topic) {
+            let before = last.insert(topic.clone(), (number, message.log_time, delay));
+            let is_next =
+                before.is_none_or(|(at, time, _)| at < number && time <= message.log_time);
+            ensure!(
+                is_next,
+                "{topic}: {number} at {}, {delay} ns after it was sent, comes behind {before:?}",
+                message.log_time
+            );
         }
-        let bytes = fs::read(&path)?;
-        let mut last = BTreeMap::new();
-        for message in mcap::MessageStream::new(&bytes)? {
-            let message = message.with_context(|| path.display().to_string())?;
-            let topic = message.channel.topic.clone();
-            let number = u64::from(message.sequence) - 1;
-            let delay = message.log_time.saturating_sub(message.publish_time);
-            if TOPICS.iter().any(|(name, _)| *name == topic) {
-                let before = last.insert(topic.clone(), (number, message.log_time, delay));
-                let is_next =
-                    before.is_none_or(|(at, time, _)| at < number && time <= message.log_time);
-                ensure!(
-                    is_next,
-                    "{topic}: {number} at {}, {delay} ns after it was sent, comes behind {before:?}",
-                    message.log_time
-                );
-            }
-            numbers.entry(topic).or_default().insert(number);
-        }
-    }
+        numbers.entry(topic).or_default().insert(number);
+        Ok(())
+    })?;
     Ok(numbers)
 }
 

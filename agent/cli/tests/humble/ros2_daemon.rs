@@ -5,18 +5,18 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, ensure};
-use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
-use ros2probe_testing::harness::shared_memory::SharedMemory;
 use ros2probe_testing::harness::wait_until;
-use tempfile::TempDir;
 
-const RP: &str = env!("CARGO_BIN_EXE_rp");
+use crate::host::{Host, Middleware, in_environment};
+use crate::installed;
+
 const PATIENCE: Duration = Duration::from_secs(60);
 /// The kernel keeps the address of a closed connection of the real daemon for a minute at most. The
 /// daemon does not let others reuse it.
@@ -63,19 +63,21 @@ const FREE: &[&str] = &[
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn with_fast_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
-    answers_as_the_real_daemon("rmw_fastrtps_cpp")
+    answers_as_the_real_daemon(Middleware::FastSampled)
 }
 
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn with_cyclone_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
-    answers_as_the_real_daemon("rmw_cyclonedds_cpp")
+    answers_as_the_real_daemon(Middleware::Cyclone)
 }
 
-fn answers_as_the_real_daemon(rmw: &'static str) -> Result<()> {
+fn answers_as_the_real_daemon(middleware: Middleware) -> Result<()> {
     let network = Namespace::alone()?;
-    let robot = Robot::start(&network, rmw)?;
-    let agent = robot.agent()?;
+    let robot = Robot {
+        host: Host::new(&network, middleware)?,
+    };
+    let agent = robot.host.agent("watch: ['/**']\nros2_daemon: on\n")?;
     let nodes = robot.nodes()?;
     agent.scrape_until("all nodes are known", |page| {
         page.sum("ros2_nodes", &[]) == NODES
@@ -142,12 +144,8 @@ fn takes_over(robot: &Robot<'_>, agent: &Agent<'_>) -> Result<()> {
     robot.prints("topic type /chatter", "std_msgs/msg/String")
 }
 
-/// The host of the nodes, with its own `/dev/shm`.
 struct Robot<'n> {
-    network: &'n Namespace,
-    shared_memory: SharedMemory,
-    directory: TempDir,
-    rmw: &'static str,
+    host: Host<'n>,
 }
 
 /// What a command printed, without the order of lines and without the real daemon's own node.
@@ -164,65 +162,35 @@ struct Sniffer<'r> {
     robot: &'r Robot<'r>,
 }
 
-impl<'n> Robot<'n> {
-    fn start(network: &'n Namespace, rmw: &'static str) -> Result<Robot<'n>> {
-        crate::installed::prefix();
-        Ok(Robot {
-            network,
-            shared_memory: SharedMemory::of(network, 128)?,
-            directory: tempfile::tempdir()?,
-            rmw,
-        })
-    }
-
-    fn agent(&self) -> Result<Agent<'n>> {
-        let path = self.directory.path().display();
-        let capture = at_the_sockets_of(self.network);
-        let text = format!(
-            "{capture}api: {{socket: {path}/api.sock}}\nstate_directory: {path}\nwatch: ['/**']\n\
-             ros2_daemon: on\n"
-        );
-        let configuration = self.directory.path().join("ros2probe.yaml");
-        fs::write(&configuration, text)?;
-        Agent::start(self.network, RP, &configuration)
-    }
-
+impl Robot<'_> {
     /// Starts the robot's nodes, each a process.
     fn nodes(&self) -> Result<Vec<Process>> {
-        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble/graph.py");
-        let lines = [
-            "exec /opt/ros/humble/lib/demo_nodes_cpp/talker".to_owned(),
-            "exec /opt/ros/humble/lib/demo_nodes_cpp/listener".to_owned(),
-            "exec /opt/ros/humble/lib/demo_nodes_cpp/add_two_ints_server".to_owned(),
-            "exec /opt/ros/humble/lib/lifecycle/lifecycle_talker".to_owned(),
-            format!("exec python3 {script}"),
+        let prefix = installed::prefix();
+        let programs = [
+            "demo_nodes_cpp/talker",
+            "demo_nodes_cpp/listener",
+            "demo_nodes_cpp/add_two_ints_server",
+            "lifecycle/lifecycle_talker",
         ];
-        lines
-            .iter()
-            .map(|line| Process::start(&self.enter(), "bash", ["-c", &shell(line)]))
-            .collect()
-    }
-
-    /// Returns the prefix that runs a program of ROS on this host.
-    fn enter(&self) -> Vec<String> {
-        let mut enter = self.shared_memory.inside(self.network);
-        enter.push("env".to_owned());
-        enter.extend([
-            format!("RMW_IMPLEMENTATION={}", self.rmw),
-            "ROS_DOMAIN_ID=0".to_owned(),
-            format!("ROS_LOG_DIR={}", self.directory.path().display()),
-        ]);
-        enter
+        let mut nodes = Vec::new();
+        for program in programs {
+            let line = format!("exec {}/lib/{program}", prefix.display());
+            nodes.push(self.host.run(&line, &[], Stdio::inherit())?);
+        }
+        nodes.push(self.host.python("graph.py", &[])?);
+        Ok(nodes)
     }
 
     /// Runs `ros2` with these words.
     fn ros2(&self, words: &str) -> Result<Output> {
-        let enter = self.enter();
+        let enter = self.host.enter();
         let (program, arguments) = enter.split_first().context("no prefix")?;
         let mut command = Command::new(program);
-        command
-            .args(arguments)
-            .args(["bash", "-c", &shell(&format!("exec ros2 {words}"))]);
+        command.args(arguments).args([
+            "bash",
+            "-c",
+            &in_environment(&format!("exec ros2 {words}")),
+        ]);
         command.output().with_context(|| words.to_owned())
     }
 
@@ -271,11 +239,11 @@ fn without_daemon(line: &str) -> Option<String> {
 
 impl<'r> Sniffer<'r> {
     fn start(robot: &'r Robot<'r>) -> Result<Self> {
-        let file = robot.directory.path().join("ros2.pcap");
-        let errors = robot.directory.path().join("tcpdump.txt");
+        let file = robot.host.file("ros2.pcap");
+        let errors = robot.host.file("tcpdump.txt");
         let file = file.display().to_string();
         let words = ["-i", "any", "-n", "-U", "-Z", "root", "-w", &file, "udp"];
-        let enter = robot.network.inside();
+        let enter = robot.host.network.inside();
         let said = fs::File::create(&errors)?.into();
         let process = Process::start_with(&enter, "tcpdump", words, said)?;
         wait_until("tcpdump listens", || {
@@ -290,7 +258,7 @@ impl<'r> Sniffer<'r> {
         std::thread::sleep(Duration::from_millis(1_500));
         self.process.signal("INT")?;
         self.process.wait(PATIENCE)?;
-        let file = self.robot.directory.path().join("ros2.pcap");
+        let file = self.robot.host.file("ros2.pcap");
         let output = Command::new("tcpdump")
             .args(["-n", "-r"])
             .arg(file)
@@ -312,11 +280,4 @@ fn ports(nodes: &[Process]) -> Result<BTreeSet<u16>> {
         ports.extend(node.udp_ports()?);
     }
     Ok(ports)
-}
-
-fn shell(line: &str) -> String {
-    format!(
-        ". {}/env.sh && {line}",
-        crate::installed::prefix().display()
-    )
 }

@@ -4,37 +4,26 @@
 //! Needs root and ROS 2 Humble: `make test-ros2`.
 
 use std::fs;
-use std::path::Path;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
-use ros2probe_testing::harness::shared_memory::SharedMemory;
 use ros2probe_testing::harness::{run, wait_until};
 use serde::Deserialize;
-use tempfile::TempDir;
 
-use crate::robot::UDP_ONLY;
+use crate::host::{Host, Middleware, RP};
 
-const RP: &str = env!("CARGO_BIN_EXE_rp");
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Log of the client, in the directory of the host.
+const LOG: &str = "calls.jsonl";
+const EXACT: Middleware = Middleware::FastExact("uprobe");
 const CALLS: usize = 1000;
 /// Largest difference between the agent's and the client's median and mean.
 const CLOSE: f64 = 0.000_1;
 /// Largest difference of the 99th percentile, which a delay of ten calls changes.
 const TAIL: f64 = 0.000_2;
-
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Middleware {
-    Cyclone,
-    FastUdp,
-    /// Shared memory with `capture.shm.exact: uprobe`.
-    FastExact,
-    /// Shared memory, which is sampled.
-    FastSampled,
-}
 
 /// One call or goal of the client's log, in nanoseconds.
 #[derive(Deserialize)]
@@ -62,7 +51,7 @@ fn calls_over_fast_dds_and_udp_take_as_long_as_the_client_logs() -> Result<()> {
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn calls_over_shared_memory_with_the_uprobe_take_as_long_as_the_client_logs() -> Result<()> {
-    agrees_with_the_client(Middleware::FastExact)
+    agrees_with_the_client(EXACT)
 }
 
 #[test]
@@ -94,7 +83,7 @@ fn agrees_with_the_client(middleware: Middleware) -> Result<()> {
     })?;
     robot.compare(&page)?;
     hang(&robot, &agent, &mut client)?;
-    if middleware != Middleware::FastExact {
+    if middleware != EXACT {
         lose(&network, &agent, &mut client)?;
     }
     let text = robot.rp(&["service", "info", "-v", "/add"])?;
@@ -141,93 +130,31 @@ fn count(page: &Scrape, name: &str, service: &str) -> f64 {
     page.sum(name, &[("ros_service", service)])
 }
 
-/// The host of client and server, with its own `/dev/shm`.
 struct Robot<'n> {
-    network: &'n Namespace,
-    shared_memory: SharedMemory,
-    directory: TempDir,
-    middleware: Middleware,
+    host: Host<'n>,
 }
 
 impl<'n> Robot<'n> {
     fn start(network: &'n Namespace, middleware: Middleware) -> Result<Self> {
-        let directory = tempfile::tempdir()?;
-        fs::write(directory.path().join("udp.xml"), UDP_ONLY)?;
-        Ok(Self {
-            network,
-            shared_memory: SharedMemory::of(network, 128)?,
-            directory,
-            middleware,
-        })
+        let host = Host::new(network, middleware)?;
+        Ok(Self { host })
     }
 
     /// Starts agent, server and client.
     fn ready(&self) -> Result<(Agent<'n>, Process, Process)> {
-        let agent = self.agent()?;
-        let mut server = self.node(&["serve"])?;
+        let agent = self.host.agent("service_timeout_s: 2\n")?;
+        let mut server = self.host.python("services.py", &["serve"])?;
         server.wait_for("ready", PATIENCE)?;
-        if self.middleware == Middleware::FastExact {
+        if self.host.middleware == EXACT {
             agent.scrape_until("the uprobe is attached", |page| {
                 let ability = [("ability", "shared_memory_exact")];
                 page.sum("ros2probe_capture_ability", &ability) == 1.0
             })?;
         }
-        let log = self.log().display().to_string();
-        let mut client = self.node(&["call", &log, &CALLS.to_string()])?;
+        let arguments = ["call", &self.host.path(LOG), &CALLS.to_string()];
+        let mut client = self.host.python("services.py", &arguments)?;
         client.wait_for("ready", PATIENCE)?;
         Ok((agent, server, client))
-    }
-
-    fn agent(&self) -> Result<Agent<'n>> {
-        let exact = match self.middleware {
-            Middleware::FastExact => ", shm: {exact: uprobe}",
-            _ => "",
-        };
-        let path = self.directory.path();
-        let text = format!(
-            "capture: {{source: host, cgroup: {}{exact}}}\napi: {{socket: {}}}\n\
-             state_directory: {}\nservice_timeout_s: 2\n",
-            self.network.cgroup().display(),
-            self.socket(),
-            path.display()
-        );
-        let configuration = path.join("ros2probe.yaml");
-        fs::write(&configuration, text)?;
-        Agent::start(self.network, RP, &configuration)
-    }
-
-    fn socket(&self) -> String {
-        self.directory.path().join("api.sock").display().to_string()
-    }
-
-    fn log(&self) -> std::path::PathBuf {
-        self.directory.path().join("calls.jsonl")
-    }
-
-    /// A process of `humble/services.py`.
-    fn node(&self, arguments: &[&str]) -> Result<Process> {
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/humble/services.py");
-        let rmw = match self.middleware {
-            Middleware::Cyclone => "rmw_cyclonedds_cpp",
-            _ => "rmw_fastrtps_cpp",
-        };
-        let path = self.directory.path();
-        let mut enter = self.shared_memory.inside(self.network);
-        enter.extend(["env".to_owned(), "ROS_DOMAIN_ID=0".to_owned()]);
-        enter.push(format!("RMW_IMPLEMENTATION={rmw}"));
-        enter.push(format!("ROS_LOG_DIR={}", path.display()));
-        if self.middleware == Middleware::FastUdp {
-            let profile = path.join("udp.xml");
-            enter.push(format!(
-                "FASTRTPS_DEFAULT_PROFILES_FILE={}",
-                profile.display()
-            ));
-        }
-        let shell = r#". /opt/ros/humble/env.sh && exec python3 "$@""#;
-        let script = script.display().to_string();
-        let mut words = vec!["-c", shell, "services", &script];
-        words.extend(arguments);
-        Process::start(&enter, "bash", words)
     }
 
     fn obey(&self, client: &mut Process, command: &str) -> Result<()> {
@@ -275,7 +202,7 @@ impl<'n> Robot<'n> {
     fn logged(&self) -> Result<Vec<Logged>> {
         let mut logged = Vec::new();
         wait_until("the log is complete", || {
-            let text = fs::read_to_string(self.log())?;
+            let text = fs::read_to_string(self.host.file(LOG))?;
             let lines = text.lines().map(serde_json::from_str::<Logged>);
             logged = lines.flatten().collect();
             Ok(logged.len() > CALLS)
@@ -286,7 +213,7 @@ impl<'n> Robot<'n> {
     fn rp(&self, arguments: &[&str]) -> Result<String> {
         let output = std::process::Command::new(RP)
             .args(arguments)
-            .args(["--socket", &self.socket()])
+            .args(["--socket", &self.host.socket()])
             .env_remove("ROS_DOMAIN_ID")
             .output()?;
         ensure!(output.status.success(), "{output:?}");

@@ -8,12 +8,13 @@ use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader};
 use std::net::SocketAddr;
 use std::os::unix::net::UnixListener;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use crate::rp;
+use ros2probe_testing::bag_messages::for_each_message;
 use ros2probe_testing::local_agent::{self, LocalAgent, PATIENCE, ask};
 use ros2probe_testing::model::capture::{Capture, ETHERNET, reader, writer};
 use ros2probe_wire::GuidPrefix;
@@ -66,24 +67,13 @@ fn wait_for(api: SocketAddr, name: &str, wanted: impl Fn(&Value) -> bool) -> Val
 
 /// Sequence numbers in a bag, by topic.
 fn messages(directory: &Path) -> BTreeMap<String, Vec<u32>> {
-    let mut files: Vec<PathBuf> = std::fs::read_dir(directory)
-        .unwrap()
-        .map(|file| file.unwrap().path())
-        .filter(|path| {
-            path.extension()
-                .is_some_and(|extension| extension == "mcap")
-        })
-        .collect();
-    files.sort();
     let mut found = BTreeMap::<_, Vec<_>>::new();
-    for file in files {
-        let bytes = std::fs::read(file).unwrap();
-        for message in mcap::MessageStream::new(&bytes).unwrap() {
-            let message = message.unwrap();
-            let topic = message.channel.topic.clone();
-            found.entry(topic).or_default().push(message.sequence);
-        }
-    }
+    for_each_message(directory, |message| {
+        let topic = message.channel.topic.clone();
+        found.entry(topic).or_default().push(message.sequence);
+        Ok(())
+    })
+    .unwrap();
     found
 }
 

@@ -1,6 +1,7 @@
 //! A robot that publishes, a program that records it, and the content of its bags.
 
 use super::*;
+use ros2probe_testing::bag_messages::for_each_message;
 
 /// An agent with a place for bags.
 pub(super) struct Robot<'a> {
@@ -195,22 +196,11 @@ pub(super) fn sent(publisher: &Peer) -> Result<BTreeSet<u64>> {
 /// Numbers in a bag by topic, each once, as another reader finds them.
 pub(super) fn numbers(bag: &Path) -> Result<BTreeMap<String, BTreeSet<u64>>> {
     let mut numbers: BTreeMap<String, BTreeSet<u64>> = BTreeMap::new();
-    for file in fs::read_dir(bag)? {
-        let path = file?.path();
-        if path.extension().is_none_or(|extension| extension != "mcap") {
-            continue;
-        }
-        let bytes = fs::read(&path)?;
-        for message in mcap::MessageStream::new(&bytes)? {
-            let message = message.with_context(|| path.display().to_string())?;
-            let topic = numbers.entry(message.channel.topic.clone()).or_default();
-            ensure!(
-                topic.insert(message.sequence.into()),
-                "{} twice in {}",
-                message.sequence,
-                path.display()
-            );
-        }
-    }
+    for_each_message(bag, |message| {
+        let topic = numbers.entry(message.channel.topic.clone()).or_default();
+        let is_new = topic.insert(message.sequence.into());
+        ensure!(is_new, "{} twice in {}", message.sequence, bag.display());
+        Ok(())
+    })?;
     Ok(numbers)
 }

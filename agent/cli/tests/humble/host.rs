@@ -1,0 +1,136 @@
+//! A host of real ROS 2 nodes with one middleware, and of the agent that observes them.
+
+use std::fs;
+use std::path::PathBuf;
+use std::process::Stdio;
+
+use anyhow::Result;
+use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::shared_memory::SharedMemory;
+use tempfile::TempDir;
+
+use crate::installed;
+
+pub const RP: &str = env!("CARGO_BIN_EXE_rp");
+const UDP_ONLY: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
+<profiles xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <transport_descriptors>
+    <transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type></transport_descriptor>
+  </transport_descriptors>
+  <participant profile_name="udp" is_default_profile="true"><rtps>
+    <userTransports><transport_id>udp</transport_id></userTransports>
+    <useBuiltinTransports>false</useBuiltinTransports>
+  </rtps></participant>
+</profiles>
+"#;
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Middleware {
+    /// Shared memory, which the agent samples.
+    FastSampled,
+    /// Shared memory, with this value of `capture.shm.exact`.
+    FastExact(&'static str),
+    FastUdp,
+    Cyclone,
+}
+
+/// The host, with its own `/dev/shm` and a directory for files.
+pub struct Host<'n> {
+    pub network: &'n Namespace,
+    pub middleware: Middleware,
+    shared_memory: SharedMemory,
+    directory: TempDir,
+}
+
+impl<'n> Host<'n> {
+    pub fn new(network: &'n Namespace, middleware: Middleware) -> Result<Self> {
+        let directory = tempfile::tempdir()?;
+        fs::write(directory.path().join("udp.xml"), UDP_ONLY)?;
+        Ok(Self {
+            network,
+            middleware,
+            shared_memory: SharedMemory::of(network, 128)?,
+            directory,
+        })
+    }
+
+    /// Returns the path of a file in the host's directory.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    /// Returns the same path as text.
+    pub fn path(&self, name: &str) -> String {
+        self.file(name).display().to_string()
+    }
+
+    /// Returns the path of the API's socket.
+    pub fn socket(&self) -> String {
+        self.path("api.sock")
+    }
+
+    /// Starts an agent at the host's sockets, with these further lines of configuration.
+    pub fn agent(&self, lines: &str) -> Result<Agent<'n>> {
+        let configuration = self.file("ros2probe.yaml");
+        fs::write(&configuration, self.settings(lines))?;
+        Agent::start(self.network, RP, &configuration)
+    }
+
+    /// Returns the configuration of [`Self::agent`].
+    pub fn settings(&self, lines: &str) -> String {
+        let capture = match self.middleware {
+            Middleware::FastExact(choice) => format!(
+                "capture: {{source: host, cgroup: {}, shm: {{exact: {choice}}}}}\n",
+                self.network.cgroup().display()
+            ),
+            _ => at_the_sockets_of(self.network),
+        };
+        let directory = self.directory.path().display();
+        format!(
+            "{capture}api: {{socket: {directory}/api.sock}}\nstate_directory: {directory}\n{lines}"
+        )
+    }
+
+    /// Returns the prefix that runs a program of ROS on this host.
+    pub fn enter(&self) -> Vec<String> {
+        let rmw = match self.middleware {
+            Middleware::Cyclone => "rmw_cyclonedds_cpp",
+            _ => "rmw_fastrtps_cpp",
+        };
+        let mut enter = self.shared_memory.inside(self.network);
+        enter.extend([
+            "env".to_owned(),
+            format!("RMW_IMPLEMENTATION={rmw}"),
+            "ROS_DOMAIN_ID=0".to_owned(),
+            format!("ROS_LOG_DIR={}", self.directory.path().display()),
+        ]);
+        if self.middleware == Middleware::FastUdp {
+            let profile = self.path("udp.xml");
+            enter.push(format!("FASTRTPS_DEFAULT_PROFILES_FILE={profile}"));
+        }
+        enter
+    }
+
+    /// Runs a line of the shell in ROS's environment, with these arguments from `$1` on.
+    pub fn run(&self, line: &str, arguments: &[&str], errors: Stdio) -> Result<Process> {
+        let line = in_environment(line);
+        let words = ["-c", &line, "bash"]
+            .into_iter()
+            .chain(arguments.iter().copied());
+        Process::start_with(&self.enter(), "bash", words, errors)
+    }
+
+    /// Runs a script of this directory with Python.
+    pub fn python(&self, script: &str, arguments: &[&str]) -> Result<Process> {
+        let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble");
+        let line = format!("exec python3 {directory}/{script} \"$@\"");
+        self.run(&line, arguments, Stdio::inherit())
+    }
+}
+
+/// Returns a line of the shell behind the one that sets ROS's environment.
+pub fn in_environment(line: &str) -> String {
+    format!(". {}/env.sh && {line}", installed::prefix().display())
+}
