@@ -491,16 +491,29 @@ impl Truth {
     }
 }
 
-/// Of one reader.
+/// Of one reader. Samples that arrived before it was known whose socket it is are his.
 pub(crate) fn sums(seen: &Snapshot, writer: &str, reader: &str) -> Delivered {
+    let sockets = sockets_of(seen, reader);
     let mut sums = Delivered::default();
     for delivery in seen.topics.iter().flat_map(|topic| &topic.deliveries) {
-        let of_reader = delivery.readers.iter().any(|guid| is(*guid, reader));
+        let of_reader = delivery.readers.iter().any(|guid| is(*guid, reader))
+            || delivery.readers.is_empty()
+                && delivery
+                    .sockets
+                    .iter()
+                    .any(|socket| sockets.contains(socket));
         if delivery.direction == Direction::Received && of_reader && is(delivery.writer, writer) {
             sums.add(&delivery.delivered);
         }
     }
     sums
+}
+
+/// Sockets at which a reader is known to receive.
+fn sockets_of(seen: &Snapshot, reader: &str) -> BTreeSet<u64> {
+    let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
+    of_reader.flat_map(|each| each.sockets.clone()).collect()
 }
 
 /// Lost numbers of one reader with their cause, each named once. A loss that was settled before it
@@ -511,9 +524,7 @@ pub(crate) fn reported(
     writer: &str,
     reader: &str,
 ) -> Result<BTreeMap<u64, LossCause>> {
-    let deliveries = seen.topics.iter().flat_map(|topic| &topic.deliveries);
-    let of_reader = deliveries.filter(|each| each.readers.iter().any(|guid| is(*guid, reader)));
-    let sockets: BTreeSet<u64> = of_reader.flat_map(|each| each.sockets.clone()).collect();
+    let sockets = sockets_of(seen, reader);
     let is_prefix = |prefix| {
         let participant = Guid::new(prefix, EntityId::PARTICIPANT).to_string();
         participant.get(..24) == reader.get(..24)
