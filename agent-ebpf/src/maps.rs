@@ -16,7 +16,9 @@ use ros2probe_wire::{
     walk::Walk,
 };
 
-/// `BPF_F_NO_PREALLOC`: user space alone fills these maps, and they are mostly empty.
+/// `BPF_F_NO_PREALLOC`: user space alone fills this map, and it is mostly empty. No map of a
+/// tracepoint or uprobe has it: before Linux 6.1 the kernel warns of that, and with PREEMPT_RT it
+/// refuses the program.
 const NO_PREALLOC: u32 = 1;
 
 /// Most records that the filter writes for one datagram; a datagram with more is captured.
@@ -77,11 +79,11 @@ pub static WIRE: ProgramArray = ProgramArray::with_max_entries(1, 0);
 /// Writers and readers that user space has classified: GUID to `Verdict`.
 #[map]
 pub static INTEREST: HashMap<[u32; 4], u32> =
-    HashMap::with_max_entries(INTEREST_CAPACITY, NO_PREALLOC);
+    HashMap::with_max_entries(INTEREST_CAPACITY, 0);
 /// Participants that user space knows: GUID prefix to the time of their last message.
 #[map]
 pub static PARTICIPANTS: HashMap<[u32; 3], u64> =
-    HashMap::with_max_entries(PARTICIPANT_CAPACITY, NO_PREALLOC);
+    HashMap::with_max_entries(PARTICIPANT_CAPACITY, 0);
 /// Unclassified writers: bytes captured so far.
 #[map]
 pub static UNKNOWN: LruHashMap<[u32; 4], Shared<u32>> =

@@ -13,3 +13,4 @@ mod filter;
 mod handed;
 mod host_hook;
 mod inside;
+mod maps;

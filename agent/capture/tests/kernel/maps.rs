@@ -1,0 +1,71 @@
+//! The maps of tracepoints and uprobes: before Linux 6.1 the kernel warns of a program of this kind
+//! whose hash table allocates as it grows, and with PREEMPT_RT it refuses the program.
+
+use std::fs::{self, File};
+use std::os::fd::AsRawFd as _;
+use std::path::Path;
+
+use anyhow::{Context as _, Result, ensure};
+use aya::maps::MapInfo;
+use aya::programs::loaded_programs;
+use ros2probe_capture::filter::{Filter, FilterSettings};
+use ros2probe_testing::harness;
+use ros2probe_testing::harness::network::Namespace;
+
+/// `BPF_MAP_TYPE_HASH`.
+const HASH: &str = "1";
+/// `BPF_F_NO_PREALLOC`.
+const NO_PREALLOC: u32 = 1;
+
+#[test]
+fn tables_of_tracepoints_and_uprobes_are_allocated_beforehand() -> Result<()> {
+    harness::require()?;
+    let host = Namespace::alone()?;
+    let mut filter = Filter::load_host(&FilterSettings::default())?;
+    filter.attach(&File::open(host.cgroup())?)?;
+    let _uprobe = Filter::load_uprobe(&FilterSettings::default(), None)?;
+    let mut checked = Vec::new();
+    for program in loaded_programs() {
+        // Programs of other tests come and go.
+        let Ok(program) = program else { continue };
+        let name = program.name_as_str().unwrap_or_default().to_owned();
+        let prefixes = ["socket_full", "no_room", "not_reassemble", "shm_handed"];
+        let Ok(Some(maps)) = program.map_ids() else {
+            continue;
+        };
+        if prefixes.iter().any(|prefix| name.starts_with(prefix)) {
+            for map in maps {
+                let Ok(map) = MapInfo::from_id(map) else {
+                    continue;
+                };
+                ensure_allocated(&map).with_context(|| name.clone())?;
+            }
+            checked.push(name);
+        }
+    }
+    for kind in ["socket_full", "shm_handed"] {
+        ensure!(
+            checked.iter().any(|name| name.starts_with(kind)),
+            "{checked:?}"
+        );
+    }
+    Ok(())
+}
+
+fn ensure_allocated(map: &MapInfo) -> Result<()> {
+    let descriptor = map.fd()?;
+    let number = std::os::fd::AsFd::as_fd(&descriptor).as_raw_fd();
+    let facts = fs::read_to_string(Path::new("/proc/self/fdinfo").join(number.to_string()))?;
+    let value = |key: &str| {
+        let line = facts.lines().find_map(|line| line.strip_prefix(key));
+        line.map(str::trim).context("no such line")
+    };
+    let flags = value("map_flags:")?.trim_start_matches("0x");
+    let grows = u32::from_str_radix(flags, 16)? & NO_PREALLOC != 0;
+    ensure!(
+        value("map_type:")? != HASH || !grows,
+        "{}",
+        map.name_as_str().unwrap_or_default()
+    );
+    Ok(())
+}
