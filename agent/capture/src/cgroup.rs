@@ -20,7 +20,7 @@ pub enum CgroupError {
     #[error("cannot read {MOUNTS}")]
     Mounts(#[source] io::Error),
     /// Only v1 is mounted, or no hierarchy at all.
-    #[error("no cgroup v2 hierarchy is mounted: `mount -t cgroup2 none /sys/fs/cgroup`")]
+    #[error("no cgroup v2 hierarchy is mounted (`rp doctor` shows how)")]
     NotMounted,
     /// The directory cannot be opened.
     #[error("cannot open the control group {}", path.display())]

@@ -22,9 +22,9 @@ const NO_MEMLOCK: (u32, u32) = (5, 11);
 /// Bytes of rings and tables of one source, with a margin.
 const LOCKED_BYTES: u64 = 64 << 20;
 
-/// Findings of all kernel checks.
+/// Findings of all kernel checks. `is_agent_running`: an agent of this host answers.
 #[must_use]
-pub fn check(host: &HostState) -> Vec<Finding> {
+pub fn check(host: &HostState, is_agent_running: bool) -> Vec<Finding> {
     let release = host.files.text(RELEASE);
     let mut findings = vec![
         version(&release),
@@ -37,7 +37,7 @@ pub fn check(host: &HostState) -> Vec<Finding> {
     findings.extend(lockdown(host));
     let is_old = |release: &String| parse(release).is_some_and(|own| own < NO_MEMLOCK);
     if release.as_ref().is_ok_and(is_old) {
-        findings.push(locked_memory(host));
+        findings.push(locked_memory(host, is_agent_running));
     }
     findings
 }
@@ -155,9 +155,22 @@ fn control_groups(host: &HostState) -> Finding {
         CgroupHierarchy::NotMounted => {
             let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
                 only, not sockets";
-            return report(Severity::Warning, sentence.to_owned())
-                .seen("no cgroup2", MOUNTS)
-                .remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
+            let finding = report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS);
+            // A mount at the usual place would hide the controllers of version 1.
+            let has_version_1 = mounts.windows(10).any(|window| window == b" - cgroup ");
+            return if has_version_1 {
+                finding
+                    .remedy(
+                        "sudo mkdir -p /run/cgroup2 && sudo mount -t cgroup2 none /run/cgroup2    \
+                         # beside version 1; then sudo systemctl restart ros2probe",
+                    )
+                    .elsewhere(
+                        "systemd.unified_cgroup_hierarchy=1    # on the kernel's command line, \
+                         for good",
+                    )
+            } else {
+                finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup")
+            };
         }
         CgroupHierarchy::WholeHost(point) => {
             let at = point.display();
@@ -203,7 +216,12 @@ fn pages(host: &HostState) -> Finding {
 }
 
 /// Finding for the limit on locked memory, on kernels that charge BPF maps to it.
-fn locked_memory(host: &HostState) -> Finding {
+/// A running agent has a limit of its own.
+fn locked_memory(host: &HostState, is_agent_running: bool) -> Finding {
+    let severity = match is_agent_running {
+        true => Severity::Note,
+        false => Severity::Problem,
+    };
     let report = |severity, sentence: String| Finding::new(AREA, "memlock", severity, sentence);
     let limits = host.files.text(LIMITS).unwrap_or_default();
     let line = limits
@@ -217,10 +235,10 @@ fn locked_memory(host: &HostState) -> Finding {
             format!("{soft} bytes may be locked, enough for the agent"),
         ),
         Some(soft) => report(
-            Severity::Problem,
+            severity,
             format!(
                 "this kernel counts BPF maps as locked memory, but only {soft} bytes may be \
-                 locked here"
+                 locked in this shell"
             ),
         )
         .remedy("ulimit -l unlimited    # the unit has LimitMEMLOCK=infinity"),
@@ -261,7 +279,7 @@ mod tests {
         files.retain(|(path, _)| changes.iter().all(|(changed, _)| changed != path));
         files.extend(changes.iter().filter(|(_, text)| *text != "gone"));
         let (_directory, host) = host(&files);
-        let findings = check(&host);
+        let findings = check(&host, false);
         for finding in &findings {
             assert!(!finding.evidence.is_empty(), "{finding:?}");
             let is_bad = finding.severity > Severity::Unknown;
@@ -335,6 +353,34 @@ mod tests {
                 severity,
                 "{release} {limit}"
             );
+        }
+    }
+
+    #[test]
+    fn a_limit_of_locked_memory_is_no_problem_of_a_running_agent() {
+        let (_directory, host) = host(&[
+            (RELEASE, "5.10.0"),
+            (
+                LIMITS,
+                "Max locked memory         65536    65536    bytes\n",
+            ),
+        ]);
+        assert_eq!(locked_memory(&host, true).severity, Severity::Note);
+    }
+
+    #[test]
+    fn a_mount_beside_version_1_hides_none_of_its_controllers() {
+        for (mounts, place) in [
+            (
+                "24 18 0:22 / /sys/fs/cgroup/cpu rw - cgroup cgroup rw,cpu",
+                "/run/cgroup2",
+            ),
+            ("24 18 0:22 / / rw - ext4 /dev/vda rw", "/sys/fs/cgroup"),
+        ] {
+            let (_directory, host) = host(&[(MOUNTS, mounts)]);
+            let remedies = control_groups(&host).remedies;
+            let mount = format!("mount -t cgroup2 none {place}");
+            assert!(remedies[0].line.ends_with(&mount), "{}", remedies[0].line);
         }
     }
 

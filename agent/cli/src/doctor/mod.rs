@@ -81,7 +81,7 @@ pub fn examine(host: &HostState, configured: &Configured, reach: &Reach) -> Repo
         Some(health) => visibility::check(&Visibility::of_agent(health)),
         None => tried(host, &config.capture),
     });
-    findings.extend(kernel::check(host));
+    findings.extend(kernel::check(host, answers.is_some()));
     findings.extend(privileges::check(host, &config.capture, answers));
     findings.extend(interfaces::check(host, health, is_local));
     findings.extend(shell::check(host));
