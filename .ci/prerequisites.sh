@@ -386,7 +386,8 @@ for need; do
         cargo_deb
         ;;
     vm)
-        packages mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs
+        packages mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs make \
+            g++-x86-64-linux-gnu g++-aarch64-linux-gnu libfastrtps-dev cyclonedds-dev cyclonedds-tools
         rust
         musl x86_64 aarch64
         ;;

@@ -6,8 +6,9 @@
 #                                           --disks only builds the disks.
 #
 # Needs root, the packages of `make dist`, and the tools that `.ci/prerequisites.sh vm` installs. Root
-# file systems come from Debian's packages and are kept in target/vm. Guests have no network. While it
-# builds for another architecture, binfmt_misc runs that architecture's programs with qemu.
+# file systems come from Debian's packages and are kept in target/vm. Guests have no network, but the two
+# of `pair` have one with each other. While it builds for another architecture, binfmt_misc runs that
+# architecture's programs with qemu.
 set -euo pipefail
 root=$(cd "$(dirname "$0")/.." && pwd -P)
 cd "$root"
@@ -16,22 +17,26 @@ out=$target/vm
 # Seconds that a guest may take.
 patience=${VM_SECONDS:-1800}
 
-# name, architecture, suite and meta package of the kernel, expected source, kernel options
+# name, architecture, suite and meta package of the kernel, expected source, kernel options; `nobtf`
+# removes the kernel's type information
 systems() {
     cat <<'END'
 arm64-5.10 arm64 bullseye linux-image-arm64 host
-arm64-5.10-cgroup1 arm64 bullseye linux-image-arm64 wire systemd.unified_cgroup_hierarchy=0
+arm64-5.10-cgroup1 arm64 bullseye linux-image-arm64 wire systemd.unified_cgroup_hierarchy=0 systemd.legacy_systemd_cgroup_controller=1
 arm64-6.1 arm64 bookworm linux-image-arm64 host
+arm64-6.1-nobtf arm64 bookworm linux-image-arm64 host nobtf
 arm64-6.1-rt arm64 bookworm linux-image-rt-arm64 host
-arm64-6.12 arm64 trixie linux-image-arm64 host
 arm64-6.12-16k arm64 trixie linux-image-arm64-16k host
+arm64-newest arm64 trixie-backports linux-image-arm64 host
 amd64-5.10 amd64 bullseye linux-image-amd64 host
 amd64-6.1 amd64 bookworm linux-image-amd64 host
 amd64-6.1-rt amd64 bookworm linux-image-rt-amd64 host
-amd64-6.12 amd64 trixie linux-image-amd64 host
+amd64-newest amd64 trixie-backports linux-image-amd64 host
 END
 }
-packages=systemd,systemd-sysv,dbus,udev,adduser,iproute2,nftables,curl,kmod,initramfs-tools,rt-tests,procps
+packages=systemd,systemd-sysv,dbus,udev,adduser,iproute2,nftables,curl,kmod,initramfs-tools,rt-tests,procps,jq
+# Middlewares of the peers in C++.
+packages+=,libfastrtps2.9,libddsc0debian
 
 step() { printf '\n== %s\n' "$*" >&2; }
 die() {
@@ -77,9 +82,31 @@ base() {
     mv "$archive.part" "$archive"
 }
 
-# kernel ARCHITECTURE SUITE PACKAGE: downloads the kernel of a meta package and prints its file.
+# peers ARCHITECTURE: builds the test peers in C++ against the libraries of the root file system, into
+# a directory that it prints.
+peers() {
+    local place=$out/peers-$1 libraries=$out/libraries-$1 gnu headers
+    gnu=$(machine "$1")-linux-gnu
+    # The generated ones of this machine's packages are the same for all architectures.
+    headers="-idirafter /usr/include/$(gcc -print-multiarch)"
+    if [ ! -d "$libraries" ]; then
+        mkdir -p "$libraries.part"
+        tar x -f "$out/base-$1.tar" -C "$libraries.part" --wildcards "./usr/lib/$gnu/*.so*"
+        ln -s libfastrtps.so.2.9 "$libraries.part/usr/lib/$gnu/libfastrtps.so"
+        ln -s libfastcdr.so.1 "$libraries.part/usr/lib/$gnu/libfastcdr.so"
+        ln -s "$(basename "$(find "$libraries.part" -name 'libddsc.so.*' | head -1)")" "$libraries.part/usr/lib/$gnu/libddsc.so"
+        mv "$libraries.part" "$libraries"
+    fi
+    make --silent -C agent/cli/tests/peers OUT="$place" CC="$gnu-gcc" CXX="$gnu-g++" \
+        CFLAGS="-O2 $headers" \
+        CXXFLAGS="-std=c++17 -O2 $headers -L$libraries/usr/lib/$gnu -Wl,-rpath-link,$libraries/usr/lib/$gnu" \
+        "$place/fastdds" "$place/cyclonedds" >&2
+    echo "$place"
+}
+
+# kernel ARCHITECTURE SUITE PACKAGE: downloads the kernel of a meta package and prints its files.
 kernel() {
-    local place=$out/kernels/$2-$1 name file
+    local place=$out/kernels/$2-$1 image name file
     mkdir -p "$place"/{lists,archives}/partial
     echo "deb $(mirror) $2 main" >"$place/sources.list"
     cat >"$place/apt.conf" <<END
@@ -96,35 +123,44 @@ APT::Sandbox::User "root";
 END
     export APT_CONFIG=$place/apt.conf
     apt-get update -qq
-    name=$(apt-cache show "$3" | sed -n 's/^Depends: *\(linux-image-[^ ,]*\).*/\1/p' | head -1)
-    [ -n "$name" ] || die "$2 has no $3 for $1"
-    file=$(find "$place" -maxdepth 1 -name "${name}_*.deb" | head -1)
-    if [ -z "$file" ]; then
-        (cd "$place" && apt-get download -qq "$name")
+    dependency() { apt-cache show "$1" | sed -n 's/^Depends: *//p' | grep -oE "$2[0-9][^ ,]*" | head -1 || true; }
+    image=$(dependency "$3" linux-image-)
+    [ -n "$image" ] || die "$2 has no $3 for $1"
+    # Newer ones are several packages.
+    for name in "$image" $(for part in modules binary base; do dependency "$image" linux-$part-; done); do
         file=$(find "$place" -maxdepth 1 -name "${name}_*.deb" | head -1)
-    fi
+        if [ -z "$file" ]; then
+            (cd "$place" && apt-get download -qq "$name")
+            file=$(find "$place" -maxdepth 1 -name "${name}_*.deb" | head -1)
+        fi
+        echo "$file"
+    done
     unset APT_CONFIG
-    echo "$file"
 }
 
 # disk NAME ARCHITECTURE SUITE PACKAGE: a disk with its kernel and initial file system beside it.
 disk() {
-    local place=$out/$1 tree file release
-    file=$(kernel "$2" "$3" "$4")
-    [ "$(cat "$place/kernel" 2>/dev/null)" = "$file" ] && return
-    step "disk of $1 with $(basename "$file")"
+    local place=$out/$1 tree files file release
+    files=$(kernel "$2" "$3" "$4")
+    [ "$(cat "$place/kernel" 2>/dev/null)" = "$files" ] && return
+    step "disk of $1 with $(basename "${files%%$'\n'*}")"
     rm -rf "$place"
     mkdir -p "$place"
     tree=$(mktemp -d -p "$out")
     cleanup+=("umount '$tree/proc' '$tree/sys' '$tree/dev' 2>/dev/null || true" "rm -rf --one-file-system '$tree'")
     tar xf "$out/base-$2.tar" -C "$tree"
-    dpkg-deb --fsys-tarfile "$file" | tar x -C "$tree" --keep-directory-symlink
+    for file in $files; do dpkg-deb --fsys-tarfile "$file" | tar x -C "$tree" --keep-directory-symlink; done
     release=$(ls "$tree/lib/modules")
+    # Where newer packages have them.
+    for file in config vmlinuz; do
+        [ -e "$tree/boot/$file-$release" ] || cp "$tree/lib/modules/$release/$file" "$tree/boot/$file-$release"
+    done
     sed -i 's/^MODULES=.*/MODULES=list/' "$tree/etc/initramfs-tools/initramfs.conf"
     printf '%s\n' virtio_pci virtio_blk ext4 >"$tree/etc/initramfs-tools/modules"
     for directory in proc sys dev; do mount --bind "/$directory" "$tree/$directory"; done
     chroot "$tree" depmod "$release"
-    chroot "$tree" mkinitramfs -o /boot/initrd "$release" 2>"$place/mkinitramfs.log"
+    chroot "$tree" mkinitramfs -o /boot/initrd "$release" 2>"$place/mkinitramfs.log" ||
+        die "no initial file system: $(tail -1 "$place/mkinitramfs.log")"
     umount "$tree/proc" "$tree/sys" "$tree/dev"
     mv "$tree/boot/initrd" "$place/initrd"
     cp "$tree/boot/vmlinuz-$release" "$place/vmlinuz"
@@ -138,13 +174,13 @@ Type=oneshot
 StandardOutput=tty
 StandardError=tty
 TTYPath=/dev/console
-ExecStart=/bin/sh -c 'mkdir /opt/vm && tar x -f /dev/vdb -C /opt/vm && . /opt/vm/settings && sh /opt/vm/check.sh'
+ExecStart=/bin/sh -c 'mkdir /opt/vm && tar x -f /dev/vdb -C /opt/vm && . /opt/vm/settings && sh /opt/vm/main.sh'
 ExecStopPost=/bin/systemctl poweroff --force
 END
     ln -s ../vm-check.service "$tree/etc/systemd/system/multi-user.target.wants/"
     mkfs.ext4 -q -d "$tree" "$place/disk" 3G
     rm -rf --one-file-system "$tree"
-    echo "$file" >"$place/kernel"
+    echo "$files" >"$place/kernel"
 }
 
 # robot ARCHITECTURE: prints the demo robot, built static.
@@ -158,16 +194,24 @@ robot() {
     echo "$target/$triple/release/examples/robot"
 }
 
-# boot NAME ARCHITECTURE SOURCE [KERNEL OPTION...]: runs the checks. Prints nothing.
-boot() {
-    local name=$1 architecture=$2 place=$out/$1 payload console options program
+# payload NAME ARCHITECTURE SCRIPT [SETTING=VALUE...]: what a guest reads from its second disk.
+payload() {
+    local place=$out/$1 architecture=$2 script=$3 tree program
     program=$(robot "$architecture")
-    payload=$(mktemp -d -p "$out")
-    cleanup+=("rm -rf '$payload'")
-    cp packaging/vm/check.sh "$target/dist"/ros2probe_*_"$architecture.deb" "$payload"
-    cp "$program" "$payload/robot"
-    printf 'export SOURCE=%s\n' "$3" >"$payload/settings"
-    tar cf "$place/payload" -C "$payload" .
+    tree=$(mktemp -d -p "$out")
+    cleanup+=("rm -rf '$tree'")
+    cp packaging/vm/*.sh "$target/dist"/ros2probe_*_"$architecture.deb" "$tree"
+    cp "$program" "$tree/robot"
+    cp "$(peers "$architecture")"/{fastdds,cyclonedds} "$tree"
+    mv "$tree/$script" "$tree/main.sh"
+    shift 3
+    printf 'export %s\n' "$@" >"$tree/settings"
+    tar cf "$place/payload" -C "$tree" .
+}
+
+# boot NAME ARCHITECTURE NETWORK [KERNEL OPTION...]: runs the payload. Prints nothing.
+boot() {
+    local name=$1 architecture=$2 network=$3 place=$out/$1 kernel=vmlinuz console options
     shift 3
     case $architecture in
     arm64) console=ttyAMA0 options=(qemu-system-aarch64 -M virt -cpu "max,pauth-impdef=on") ;;
@@ -177,9 +221,11 @@ boot() {
         if [ -n "${VM_KVM-}" ]; then options+=(-accel kvm -cpu host); fi
         ;;
     esac
+    case " $* " in *" nobtf "*) kernel=vmlinuz-without-btf && without_btf "$place" ;; esac
     step "booting $name (at most $patience s; its console is in $place/console.log)"
-    timeout "$patience" "${options[@]}" -smp "${VM_CPUS:-2}" -m 1536 -nographic -nic none -no-reboot \
-        -kernel "$place/vmlinuz" -initrd "$place/initrd" \
+    # shellcheck disable=SC2086
+    timeout "$patience" "${options[@]}" -smp "${VM_CPUS:-2}" -m 1536 -nographic $network -no-reboot \
+        -kernel "$place/$kernel" -initrd "$place/initrd" \
         -append "root=/dev/vda rw quiet console=$console $*" \
         -drive if=none,id=disk,file="$place/disk",format=raw,snapshot=on -device virtio-blk-pci,drive=disk \
         -drive if=none,id=payload,file="$place/payload",format=raw,readonly=on \
@@ -187,39 +233,75 @@ boot() {
         printf 'CHECK\tend of the guest\tFAILED\tqemu ended with %s\n' $? >>"$place/console.log"
 }
 
-# Prints the checks of one system as rows of a table.
+# Destroys the header of the kernel's type information, so that it has none.
+without_btf() {
+    local found
+    found=$(LC_ALL=C grep -caP '\x9f\xeb\x01\x00\x18\x00\x00\x00' "$1/vmlinuz") || true
+    [ "$found" -gt 0 ] || die "no type information in $1/vmlinuz"
+    perl -0777 -pe 's/\x9f\xeb\x01\x00\x18\x00\x00\x00/\0\0\0\0\0\0\0\0/g' "$1/vmlinuz" >"$1/vmlinuz-without-btf"
+}
+
+# Two robots of different architectures on one network.
+pair() {
+    local systems=("arm64-6.1 arm64" "amd64-6.1 amd64") number=0 system name architecture wire=$out/wire
+    rm -f "$wire"
+    for system in "${systems[@]}"; do
+        read -r name architecture <<<"$system"
+        number=$((number + 1))
+        mkdir -p "$out/pair-$architecture"
+        ln -sf "../$name"/{disk,vmlinuz,initrd} "$out/pair-$architecture"
+        payload "pair-$architecture" "$architecture" pair.sh NUMBER=$number
+        boot "pair-$architecture" "$architecture" "-netdev stream,id=net,server=$([ $number = 1 ] && echo on || echo off),addr.type=unix,addr.path=$wire -device virtio-net-pci,netdev=net,mac=52:54:00:00:00:0$number" &
+        while [ ! -e "$wire" ]; do sleep 0.2; done
+    done
+    wait
+}
+
+# table NAME CHECK: writes and shows the checks of one system as rows of a table. Fails if one failed, or
+# if the last one did not run.
 table() {
-    tr -d '\r' <"$out/$1/console.log" | awk -F '\t' -v system="$1" '
-        $1 ~ /CHECK$/ { printf "| %s | %s | %s | %s |\n", system, $2, $3, $4 }'
+    tr -d '\r' <"$out/$1/console.log" | awk -F '\t' -v guest="$1" '
+        $1 ~ /CHECK$/ { printf "| %s | %s | %s | %s |\n", guest, $2, $3, $4 }' >"$out/$1/table.md"
+    cat "$out/$1/table.md" >&2
+    grep -q "| $2 |" "$out/$1/table.md" && ! grep -q FAILED "$out/$1/table.md"
 }
 
 main() {
-    local chosen name architecture suite package source options failed=0 disks=
+    local chosen all name architecture suite package source options failed=0 disks=
     [ "$(id -u)" = 0 ] || die "root is needed: it makes file systems"
     mkdir -p "$out"
     [ "${1-}" != --disks ] || { disks=yes && shift; }
-    chosen=${*:-$(systems | cut -d' ' -f1)}
+    all="$(systems | cut -d' ' -f1 | paste -sd ' ') pair"
+    chosen=${*:-$all}
     for name in $chosen; do
-        systems | grep -q "^$name " || die "no system $name; the systems are: $(systems | cut -d' ' -f1 | paste -sd ' ')"
+        case " $all " in *" $name "*) ;; *) die "no system $name; the systems are: $all" ;; esac
     done
     while read -r name architecture suite package source options; do
-        case " $chosen " in *" $name "*) ;; *) continue ;; esac
+        case " ${chosen/pair/pair arm64-6.1 amd64-6.1} " in *" $name "*) ;; *) continue ;; esac
         [ -n "$disks" ] || ls "$target/dist"/ros2probe_*_"$architecture.deb" >/dev/null 2>&1 ||
             die "no package for $architecture in $target/dist: run make dist"
         emulate "$architecture"
         base "$architecture"
         disk "$name" "$architecture" "$suite" "$package"
         [ -z "$disks" ] || continue
+        # Only a disk for the pair.
+        case " $chosen " in *" $name "*) ;; *) continue ;; esac
+        payload "$name" "$architecture" check.sh "SOURCE=$source" \
+            "HIDE_BTF=$(case $options in *nobtf*) echo yes ;; esac)" "REAL_TIME=$(case $name in *-rt) echo yes ;; esac)"
         # shellcheck disable=SC2086
-        boot "$name" "$architecture" "$source" $options
-        table "$name" >"$out/$name/table.md"
-        cat "$out/$name/table.md" >&2
-        grep -q 'FAILED' "$out/$name/table.md" && failed=1
-        grep -q '| purge |' "$out/$name/table.md" || failed=1
+        boot "$name" "$architecture" "-nic none" $options
+        table "$name" purge || failed=1
     done < <(systems)
     [ -z "$disks" ] || return 0
+    case " $chosen " in
+    *" pair "*)
+        pair
+        table pair-arm64 "messages from the other" || failed=1
+        table pair-amd64 "messages to the other" || failed=1
+        ;;
+    esac
     printf '\n| system | check | outcome | figure |\n| --- | --- | --- | --- |\n'
-    for name in $chosen; do cat "$out/$name/table.md"; done
+    for name in ${chosen/pair/pair-arm64 pair-amd64}; do cat "$out/$name/table.md"; done
     return $failed
 }
 
