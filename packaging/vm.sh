@@ -17,12 +17,13 @@ out=$target/vm
 # Seconds that a guest may take.
 patience=${VM_SECONDS:-1800}
 
-# name, architecture, suite and meta package of the kernel, expected source, kernel options; `nobtf`
-# removes the kernel's type information
+# name, architecture, suite and meta package of the kernel, expected source, kernel options; with
+# `nobtf`, the guest hides the kernel's type information, since no packaged kernel lacks it
 systems() {
     cat <<'END'
 arm64-5.10 arm64 bullseye linux-image-arm64 host
 arm64-5.10-cgroup1 arm64 bullseye linux-image-arm64 wire systemd.unified_cgroup_hierarchy=0 systemd.legacy_systemd_cgroup_controller=1
+arm64-5.10-rt arm64 bullseye linux-image-rt-arm64 host
 arm64-6.1 arm64 bookworm linux-image-arm64 host
 arm64-6.1-nobtf arm64 bookworm linux-image-arm64 host nobtf
 arm64-6.1-rt arm64 bookworm linux-image-rt-arm64 host
@@ -211,7 +212,7 @@ payload() {
 
 # boot NAME ARCHITECTURE NETWORK [KERNEL OPTION...]: runs the payload. Prints nothing.
 boot() {
-    local name=$1 architecture=$2 network=$3 place=$out/$1 kernel=vmlinuz console options
+    local name=$1 architecture=$2 network=$3 place=$out/$1 console options
     shift 3
     case $architecture in
     arm64) console=ttyAMA0 options=(qemu-system-aarch64 -M virt -cpu "max,pauth-impdef=on") ;;
@@ -221,24 +222,15 @@ boot() {
         if [ -n "${VM_KVM-}" ]; then options+=(-accel kvm -cpu host); fi
         ;;
     esac
-    case " $* " in *" nobtf "*) kernel=vmlinuz-without-btf && without_btf "$place" ;; esac
     step "booting $name (at most $patience s; its console is in $place/console.log)"
     # shellcheck disable=SC2086
     timeout "$patience" "${options[@]}" -smp "${VM_CPUS:-2}" -m 1536 -nographic $network -no-reboot \
-        -kernel "$place/$kernel" -initrd "$place/initrd" \
+        -kernel "$place/vmlinuz" -initrd "$place/initrd" \
         -append "root=/dev/vda rw quiet console=$console $*" \
         -drive if=none,id=disk,file="$place/disk",format=raw,snapshot=on -device virtio-blk-pci,drive=disk \
         -drive if=none,id=payload,file="$place/payload",format=raw,readonly=on \
         -device virtio-blk-pci,drive=payload </dev/null >"$place/console.log" 2>&1 ||
         printf 'CHECK\tend of the guest\tFAILED\tqemu ended with %s\n' $? >>"$place/console.log"
-}
-
-# Destroys the header of the kernel's type information, so that it has none.
-without_btf() {
-    local found
-    found=$(LC_ALL=C grep -caP '\x9f\xeb\x01\x00\x18\x00\x00\x00' "$1/vmlinuz") || true
-    [ "$found" -gt 0 ] || die "no type information in $1/vmlinuz"
-    perl -0777 -pe 's/\x9f\xeb\x01\x00\x18\x00\x00\x00/\0\0\0\0\0\0\0\0/g' "$1/vmlinuz" >"$1/vmlinuz-without-btf"
 }
 
 # Two robots of different architectures on one network.

@@ -65,8 +65,8 @@ pub fn freed(context: &RawTracePointContext) {
     }
 }
 
-/// `kfree_skb(skb, location)`. Without the kernel's types, only the immediate drop identifies the
-/// packet.
+/// `kfree_skb(skb, location)`, for IPv6. Without the kernel's types, only the immediate drop
+/// identifies the packet.
 #[inline(always)]
 pub fn unexplained(context: &RawTracePointContext) {
     let buffer: u64 = context.arg(0);
@@ -75,6 +75,10 @@ pub fn unexplained(context: &RawTracePointContext) {
         return;
     };
     let record = &scratch.get().walk.record;
+    // `refused` has seen a full buffer of IPv4: this is a later packet at the same address.
+    if record.flags & flag::IPV6 == 0 {
+        return;
+    }
     let mut limit = AT_ONCE_NANOSECONDS;
     if place(Layout::BufferTransportHeader) != Layout::ABSENT {
         if is_of(buffer, record).is_none() {

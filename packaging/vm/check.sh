@@ -71,7 +71,7 @@ END
     causes=$(page | awk -v a="$label" 'index($0, "ros2_topic_delivery_lost_messages_total{") == 1 && index($0, a) && $NF > 0 {
         match($0, /cause="[a-z_]*"/); print substr($0, RSTART + 7, RLENGTH - 8), $NF }' | paste -sd ' ' -)
     figure="$figure: ${causes}"
-    [ $status = 0 ] && [ "$delivered" = "$received" ] && [ $((published - received)) = "$lost" ] && [ "$lost" -gt 0 ]
+    [ $status = 0 ] && [ "$delivered" = "$received" ] && [ $((published - received)) = "$lost" ] && [ "$causes" = "before_host $lost" ]
 }
 
 # Every message in Fast DDS's shared memory, by a uprobe, with the lines of docs/shared-memory.md. Of
@@ -224,6 +224,10 @@ there=
 within lo
 describe
 check install installed
+if ! is_ready; then
+    journalctl -u ros2probe --no-pager -o cat | tail -30 | sed 's/^/LOG\t/'
+    exit 1
+fi
 check active active
 check "source" source_of "$source"
 check threads confined
