@@ -4,12 +4,18 @@
 use std::io::{self, Read as _, Write as _};
 use std::os::fd::{AsFd as _, BorrowedFd};
 use std::os::unix::net::UnixStream;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Most rings that one call of [`Bell::silence`] takes.
+const RINGS: usize = 64;
 
 /// A bell that any thread may ring or wait for.
 #[derive(Debug)]
 pub struct Bell {
     ringer: UnixStream,
     listener: UnixStream,
+    /// Set after each ring is written, so that a bell that rings is never taken for a silent one.
+    rung: AtomicBool,
 }
 
 impl Bell {
@@ -21,7 +27,11 @@ impl Bell {
         let (ringer, listener) = UnixStream::pair()?;
         ringer.set_nonblocking(true)?;
         listener.set_nonblocking(true)?;
-        Ok(Self { ringer, listener })
+        Ok(Self {
+            ringer,
+            listener,
+            rung: AtomicBool::new(false),
+        })
     }
 
     /// Returns a descriptor that is readable while the bell rings.
@@ -33,10 +43,45 @@ impl Bell {
     /// Rings. If its buffer is full, it rings already.
     pub fn ring(&self) {
         let _ = (&self.ringer).write(&[1]);
+        self.rung.store(true, Ordering::Release);
     }
 
     /// Silences the bell after at most 64 rings; after more it keeps ringing.
     pub fn silence(&self) {
-        let _ = (&self.listener).read(&mut [0; 64]);
+        if !self.rung.swap(false, Ordering::AcqRel) {
+            return;
+        }
+        if (&self.listener)
+            .read(&mut [0; RINGS])
+            .is_ok_and(|rings| rings == RINGS)
+        {
+            self.rung.store(true, Ordering::Release);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::system::wait;
+    use std::time::Duration;
+
+    #[test]
+    fn a_bell_that_rang_often_is_silent_after_some_rounds_and_rings_again() {
+        let bell = Bell::new().unwrap();
+        let rings = || wait(&[bell.descriptor()], Duration::ZERO).unwrap() == Some(0);
+        bell.silence();
+        assert!(!rings());
+        for _ in 0..3 * RINGS {
+            bell.ring();
+        }
+        for _ in 0..3 {
+            assert!(rings());
+            bell.silence();
+        }
+        assert!(!rings());
+        bell.silence();
+        bell.ring();
+        assert!(rings());
     }
 }

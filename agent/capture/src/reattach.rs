@@ -21,8 +21,11 @@ use super::filter::{FilterError, Links};
 use super::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
 
-/// Interval of checks. A group that appears in an existing directory is noticed at once.
+/// Interval of checks while the directory above the group is not watched.
 const EVERY: Duration = Duration::from_secs(1);
+/// The same while it is: a group that appears there or goes is noticed at once. Only the removal or
+/// the mount of a directory further up waits so long.
+const EVERY_WATCHED: Duration = Duration::from_secs(10);
 
 /// Device and inode of a directory, unique per control group.
 pub type Identity = (u64, u64);
@@ -118,20 +121,25 @@ impl Follow {
         // Without inotify, a recreated group is noticed within a second.
         let mut watch = DirectoryWatch::new().ok();
         loop {
-            if let (Some(watch), Some(above)) = (&mut watch, self.path.parent()) {
-                watch.add(above);
-            }
+            let watches_above = match (&mut watch, self.path.parent()) {
+                (Some(watch), Some(above)) => watch.add_with_removals(above),
+                _ => false,
+            };
             self.check();
             let ended = ended.as_fd();
+            let every = match watches_above && self.attached.is_some() {
+                true => EVERY_WATCHED,
+                false => EVERY,
+            };
             let is_over = match &watch {
-                Some(watch) => wait(&[ended, watch.as_fd()], EVERY),
-                None => wait(&[ended], EVERY),
+                Some(watch) => wait(&[ended, watch.as_fd()], every),
+                None => wait(&[ended], every),
             };
             if !matches!(is_over, Ok(None | Some(1))) {
                 return;
             }
             if let Some(watch) = &mut watch {
-                watch.wait(Duration::ZERO, |_| true);
+                watch.wait(Duration::ZERO, None, |_| true);
             }
         }
     }

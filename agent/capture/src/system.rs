@@ -70,30 +70,47 @@ impl DirectoryWatch {
         })
     }
 
-    /// Adds a directory, while it exists. A directory that cannot be watched is skipped.
-    pub fn add(&mut self, directory: &Path) {
-        let Ok(path) = CString::new(directory.as_os_str().as_bytes()) else {
-            return;
-        };
-        let (descriptor, mask) = (self.events.as_raw_fd(), libc::IN_CREATE | libc::IN_ONLYDIR);
-        // SAFETY: `path` ends in a zero and outlives the call.
-        unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) };
+    /// Adds a directory, while it exists. Returns whether it is watched.
+    pub fn add(&mut self, directory: &Path) -> bool {
+        self.add_with(directory, libc::IN_CREATE)
     }
 
-    /// Sleeps until a file is created or the timeout expires. Returns whether `matters` accepts a
-    /// created file's name.
-    pub fn wait(&mut self, timeout: Duration, matters: impl Fn(&str) -> bool) -> bool {
-        let mut poll = libc::pollfd {
-            fd: self.events.as_raw_fd(),
+    /// Adds a directory whose removed files and directories are reported too.
+    pub fn add_with_removals(&mut self, directory: &Path) -> bool {
+        let renames = libc::IN_MOVED_FROM | libc::IN_MOVED_TO;
+        self.add_with(directory, libc::IN_CREATE | libc::IN_DELETE | renames)
+    }
+
+    fn add_with(&mut self, directory: &Path, events: u32) -> bool {
+        let Ok(path) = CString::new(directory.as_os_str().as_bytes()) else {
+            return false;
+        };
+        let (descriptor, mask) = (self.events.as_raw_fd(), events | libc::IN_ONLYDIR);
+        // SAFETY: `path` ends in a zero and outlives the call.
+        unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) >= 0 }
+    }
+
+    /// Sleeps until a file is created, `end` is readable or closed, or the timeout expires. Returns
+    /// whether `matters` accepts a created file's name.
+    pub fn wait(
+        &mut self,
+        timeout: Duration,
+        end: Option<BorrowedFd<'_>>,
+        matters: impl Fn(&str) -> bool,
+    ) -> bool {
+        // The kernel skips an entry with a negative descriptor.
+        let end = end.map_or(-1, |end| end.as_raw_fd());
+        let mut poll = [self.events.as_raw_fd(), end].map(|fd| libc::pollfd {
+            fd,
             events: libc::POLLIN,
             revents: 0,
-        };
+        });
         let timeout = libc::timespec {
             tv_sec: timeout.as_secs().try_into().unwrap_or(i64::MAX),
             tv_nsec: timeout.subsec_nanos().into(),
         };
-        // SAFETY: one entry and the time, both of which outlive the call; no signal mask.
-        let ready = unsafe { libc::ppoll(&raw mut poll, 1, &raw const timeout, ptr::null()) };
+        // SAFETY: two entries and the time, all of which outlive the call; no signal mask.
+        let ready = unsafe { libc::ppoll(poll.as_mut_ptr(), 2, &raw const timeout, ptr::null()) };
         let (mut any, mut events) = (false, [0; 4096]);
         while ready > 0
             && let Ok(read @ 1..) = self.events.read(&mut events)
@@ -341,17 +358,38 @@ mod tests {
     fn a_created_file_ends_the_sleep_and_is_reported_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut watch = DirectoryWatch::new().unwrap();
-        watch.add(directory.path());
-        watch.add(Path::new("/nowhere"));
+        assert!(watch.add(directory.path()));
+        assert!(!watch.add(Path::new("/nowhere")));
         let short = Duration::from_micros(100);
-        assert!(!watch.wait(short, |_| true));
+        assert!(!watch.wait(short, None, |_| true));
         for name in ["one", "two"] {
             std::fs::write(directory.path().join(name), "").unwrap();
         }
-        assert!(watch.wait(Duration::from_secs(60), |name| name == "two"));
-        assert!(!watch.wait(short, |_| true));
+        assert!(watch.wait(Duration::from_secs(60), None, |name| name == "two"));
+        assert!(!watch.wait(short, None, |_| true));
         std::fs::write(directory.path().join("three"), "").unwrap();
-        assert!(!watch.wait(Duration::from_secs(60), |name| name == "two"));
+        assert!(!watch.wait(Duration::from_secs(60), None, |name| name == "two"));
+    }
+
+    #[test]
+    fn a_removed_directory_ends_the_sleep_where_removals_are_reported() {
+        let directory = tempfile::tempdir().unwrap();
+        let group = directory.path().join("group");
+        std::fs::create_dir(&group).unwrap();
+        let mut watch = DirectoryWatch::new().unwrap();
+        assert!(watch.add_with_removals(directory.path()));
+        std::fs::remove_dir(&group).unwrap();
+        assert!(watch.wait(Duration::from_secs(60), None, |name| name == "group"));
+    }
+
+    #[test]
+    fn a_closed_pipe_ends_the_sleep() {
+        let mut watch = DirectoryWatch::new().unwrap();
+        let (ended, end) = io::pipe().unwrap();
+        drop(end);
+        let start = Instant::now();
+        assert!(!watch.wait(Duration::from_secs(60), Some(ended.as_fd()), |_| true));
+        assert!(start.elapsed() < Duration::from_secs(30));
     }
 
     #[test]

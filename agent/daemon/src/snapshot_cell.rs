@@ -4,7 +4,7 @@
 //! for it within its timeout.
 
 use std::os::fd::BorrowedFd;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant};
 
@@ -18,12 +18,16 @@ use ros2probe_model::snapshot::Snapshot;
 
 /// Age above which the state no longer describes the robot.
 const FRESH: Duration = Duration::from_secs(5);
+/// Seconds after a reading of the last seconds in which each further one is published.
+const PAST_SECONDS: u8 = 5;
 
 /// The latest state and the last seconds.
 #[derive(Debug)]
 pub struct SnapshotCell {
     state: ArcSwap<State>,
     past: ArcSwap<Past>,
+    /// How many more seconds are published for a reader of the last seconds.
+    past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
     asked: AtomicBool,
     bell: Arc<CaptureBell>,
@@ -82,6 +86,7 @@ impl SnapshotCell {
                 agent,
             }),
             past: ArcSwap::default(),
+            past_wanted: AtomicU8::new(0),
             asked: AtomicBool::new(false),
             bell: Arc::new(CaptureBell::new()),
             news: Notify::new(),
@@ -100,14 +105,26 @@ impl SnapshotCell {
         state
     }
 
+    /// Counts one second, and returns whether the last seconds were read lately.
+    #[must_use]
+    pub fn wants_past(&self) -> bool {
+        let left = self.past_wanted.load(Ordering::Relaxed);
+        // A race with a reader only shifts the end of publishing by a second.
+        self.past_wanted
+            .store(left.saturating_sub(1), Ordering::Relaxed);
+        left > 0
+    }
+
     /// Replaces the measurements of the last seconds.
     pub fn publish_past(&self, past: Past) {
         self.past.store(Arc::new(past));
     }
 
-    /// Measurements of the last seconds.
+    /// Measurements of the last seconds, as of the last state that a reader waited for
+    /// ([`Self::refresh`]) or of a later one. A reader that returns every second gets each second.
     #[must_use]
     pub fn past(&self) -> Arc<Past> {
+        self.past_wanted.store(PAST_SECONDS, Ordering::Relaxed);
         self.past.load_full()
     }
 
@@ -280,6 +297,17 @@ mod tests {
         tokio::join!(cell.refresh(Duration::from_secs(3600)), writer);
         assert!(cell.state().snapshot.is_some() && !cell.is_asked());
         cell.refresh(Duration::from_millis(1)).await;
+    }
+
+    #[test]
+    fn the_last_seconds_are_wanted_for_some_seconds_after_they_were_read() {
+        let cell = SnapshotCell::new(SourceKind::Wire);
+        assert!(!cell.wants_past());
+        let _ = cell.past();
+        let wanted = (0..100).filter(|_| cell.wants_past()).count();
+        assert_eq!(wanted, usize::from(PAST_SECONDS));
+        let _ = cell.past();
+        assert!(cell.wants_past());
     }
 
     #[tokio::test]

@@ -32,6 +32,10 @@ const ROUNDS: u32 = 32;
 /// Levels of cgroups and processes of a scope that are visited.
 const DEPTH: usize = 8;
 const MAX_PROCESSES: usize = 8192;
+/// Rounds after a new process in which it may still move to a cgroup in scope.
+const MOVING_ROUNDS: u32 = 10;
+/// Most rounds without a new process that use the same list of processes.
+const SAME_ROUNDS: u32 = 5;
 
 /// Device and inode of a directory of shared memory.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
@@ -85,6 +89,9 @@ pub struct ShmDirectories {
     networks: Vec<u64>,
     /// Directories by identity.
     pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
+    /// The processes in scope when they were last listed.
+    listed: Vec<u32>,
+    newest: NewestProcess,
     /// Visited processes with their directory and the number of visits.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
     /// Directories and files skipped because of a cap.
@@ -163,6 +170,8 @@ impl ShmDirectories {
             scope,
             networks,
             directories: HashMap::new(),
+            listed: Vec::new(),
+            newest: NewestProcess::default(),
             processes: HashMap::new(),
             left_out: 0,
         }
@@ -179,16 +188,10 @@ impl ShmDirectories {
                     self.reach(&directory);
                 }
             }
-            Scope::Cgroup(cgroup) => {
-                let mut processes = Vec::new();
-                processes_of(&cgroup, DEPTH, &mut processes);
-                // The agent itself may be in scope, but shares nothing.
-                processes.retain(|pid| *pid != std::process::id());
-                self.go_through(processes);
-            }
+            Scope::Cgroup(_) => self.go_through_processes(),
             Scope::AllProcesses | Scope::Networks(_) => {
                 self.reach(Path::new(SHARED_MEMORY));
-                self.go_through(all_processes());
+                self.go_through_processes();
             }
         }
         self.directories.retain(|_, directory| directory.seen);
@@ -203,9 +206,23 @@ impl ShmDirectories {
         any
     }
 
-    fn go_through(&mut self, processes: Vec<u32>) {
+    /// Visits the processes in scope. They are listed again if there may be others.
+    fn go_through_processes(&mut self) {
+        if self.newest.may_have_changed(newest_process()) {
+            self.listed = self.scope.processes();
+            // The agent itself may be in a cgroup in scope, but shares nothing.
+            if matches!(self.scope, Scope::Cgroup(_)) {
+                self.listed.retain(|pid| *pid != std::process::id());
+            }
+        }
+        let processes = std::mem::take(&mut self.listed);
+        self.go_through(&processes);
+        self.listed = processes;
+    }
+
+    fn go_through(&mut self, processes: &[u32]) {
         let before = std::mem::take(&mut self.processes);
-        for pid in processes {
+        for &pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
             let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
@@ -360,6 +377,41 @@ impl ShmDirectory {
     }
 }
 
+/// Tracks the newest process, so that processes are listed only if there may be others.
+#[derive(Debug, Default)]
+struct NewestProcess {
+    id: Option<u32>,
+    /// Rounds since another one was seen, and since the processes were listed.
+    rounds: u32,
+    same: u32,
+}
+
+impl NewestProcess {
+    /// Returns whether the processes are to be listed, given the id of the newest one.
+    fn may_have_changed(&mut self, newest: Option<u32>) -> bool {
+        let is_new = newest.is_none() || newest != self.id;
+        self.id = newest;
+        self.rounds = if is_new {
+            0
+        } else {
+            self.rounds.saturating_add(1)
+        };
+        self.same += 1;
+        let lists = self.rounds <= MOVING_ROUNDS || self.same >= SAME_ROUNDS;
+        if lists {
+            self.same = 0;
+        }
+        lists
+    }
+}
+
+/// Returns the id of the process or thread created last in this PID namespace or below, the last
+/// word of `/proc/loadavg` (proc_loadavg(5)); `None` if it is unknown.
+fn newest_process() -> Option<u32> {
+    let line = fs::read_to_string("/proc/loadavg").ok()?;
+    line.split_whitespace().last()?.parse().ok()
+}
+
 fn inode(path: &Path) -> Option<u64> {
     fs::metadata(path).ok().map(|metadata| metadata.ino())
 }
@@ -385,6 +437,22 @@ fn processes_of(cgroup: &Path, depth: usize, processes: &mut Vec<u32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn processes_are_listed_again_after_a_new_one_and_now_and_then() {
+        let mut newest = NewestProcess::default();
+        let mut lists = |id, rounds: u32| {
+            let rounds = (0..rounds).filter(|_| newest.may_have_changed(id));
+            rounds.count()
+        };
+        assert_eq!(lists(Some(7), MOVING_ROUNDS + 1), 11);
+        assert_eq!(lists(Some(7), 4 * SAME_ROUNDS), 4);
+        assert_eq!(lists(Some(8), 1), 1);
+        assert_eq!(lists(Some(8), MOVING_ROUNDS), 10);
+        // Unknown: always.
+        assert_eq!(lists(None, 40), 40);
+        assert!(newest_process().is_some());
+    }
 
     #[test]
     fn names_of_ports_and_segments_are_read_and_written() {

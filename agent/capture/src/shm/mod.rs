@@ -20,10 +20,10 @@ pub mod tap;
 #[cfg(test)]
 mod image;
 
-use std::collections::BTreeSet;
-use std::io;
-use std::os::fd::BorrowedFd;
-use std::path::Path;
+use std::collections::HashMap;
+use std::io::{self, PipeReader, PipeWriter};
+use std::os::fd::{AsFd as _, BorrowedFd};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -33,7 +33,7 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Guid, Record, Timestamp};
 
-use self::directories::{Name, ShmDirectories};
+use self::directories::{Name, ShmDirectories, ShmDirectoryId};
 use self::inbox::{Inbox, Item};
 use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
@@ -53,6 +53,8 @@ const ACCOUNT_EVERY: u64 = 16;
 /// Handle of the thread that polls shared memory.
 pub struct SharedMemory {
     shared: Arc<Shared>,
+    /// Closed to end the thread's sleep.
+    end: Option<PipeWriter>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -90,6 +92,7 @@ impl SharedMemory {
     /// # Errors
     /// Fails if the thread cannot be started.
     pub fn start(directories: ShmDirectories, budget: Budget, spawn: Spawn) -> io::Result<Self> {
+        let (ended, end) = io::pipe()?;
         let shared = Arc::new(Shared {
             inbox: Inbox::with_bell(),
             ..Shared::default()
@@ -99,10 +102,11 @@ impl SharedMemory {
         let thread = spawn(
             Task::SharedMemory,
             thread.stack_size(256 << 10),
-            Box::new(move || poll(&looks, directories, budget)),
+            Box::new(move || poll(&looks, directories, budget, &ended)),
         )?;
         Ok(Self {
             shared,
+            end: Some(end),
             thread: Some(thread),
         })
     }
@@ -180,6 +184,7 @@ impl SharedMemory {
 impl Drop for SharedMemory {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
+        self.end = None;
         if let Some(thread) = self.thread.take() {
             // The thread has ended in any case; its result has no user.
             let _ = thread.join();
@@ -202,13 +207,14 @@ impl Shared {
 }
 
 /// The thread's main function.
-fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget) {
+fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &PipeReader) {
     let mut tap = Tap::new(directories, calendar);
     let cpus = std::thread::available_parallelism().map_or(1, usize::from);
     let mut interval = PollInterval::new(budget).on(cpus);
     // Without inotify, a newcomer is noticed at the next listing.
     let mut watch = DirectoryWatch::new().ok();
-    let mut watched = BTreeSet::new();
+    let mut watched: HashMap<ShmDirectoryId, PathBuf> = HashMap::new();
+    let mut watches_all = false;
     let (mut is_first, mut may_be_first) = (false, true);
     let (mut found, mut looks, mut reported, mut cpu) = (Vec::new(), 0, 0, 0.0);
     while !shared.stop.load(Ordering::Acquire) {
@@ -266,15 +272,25 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget) {
             std::thread::sleep(sleep);
             continue;
         };
-        if tap.directory_count() != watched.len() {
-            let directories: BTreeSet<_> = tap.directories().map(Path::to_path_buf).collect();
-            for new in directories.difference(&watched) {
-                watch.add(new);
-            }
-            watched = directories;
+        let is_same = tap.directory_count() == watched.len()
+            && tap
+                .directories()
+                .all(|(id, path)| watched.get(&id).is_some_and(|known| known == path));
+        let idle = tap.idle(now).filter(|_| is_same && watches_all);
+        if !is_same {
+            // A file may have appeared just before: the next listing follows soon.
+            let paths = tap.directories();
+            watched = paths.map(|(id, path)| (id, path.to_path_buf())).collect();
+            // The kernel ignores a repeated addition.
+            let paths = watched.values();
+            watches_all = paths.filter(|path| !watch.add(path)).count() == 0;
         }
+        // Creation of a file ends the sleep, and nothing else is to be noticed.
+        let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
-        if watch.wait(sleep, |name| Name::parse(name).is_some()) {
+        if watch.wait(sleep, Some(ended.as_fd()), |name| {
+            Name::parse(name).is_some()
+        }) {
             tap.spend(thread_cpu().saturating_sub(before));
             tap.expect_participant();
             interval.newcomer(at);

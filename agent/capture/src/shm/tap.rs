@@ -200,12 +200,10 @@ impl Tap {
         std::mem::take(&mut self.met)
     }
 
-    /// Iterates over the observed directories.
-    pub fn directories(&self) -> impl Iterator<Item = &Path> {
-        self.directories
-            .directories
-            .values()
-            .map(|directory| directory.path.as_path())
+    /// Iterates over the observed directories and paths that reach them.
+    pub fn directories(&self) -> impl Iterator<Item = (ShmDirectoryId, &Path)> {
+        let directories = self.directories.directories.iter();
+        directories.map(|(id, directory)| (*id, directory.path.as_path()))
     }
 
     /// Returns the number of observed directories.
@@ -218,6 +216,14 @@ impl Tap {
     #[must_use]
     pub fn has_ports(&self) -> bool {
         !self.ports.is_empty()
+    }
+
+    /// Returns the nanoseconds from `now` to the next search for directories if nothing else is to
+    /// be done until a file is created: no port exists, and none waits to be opened.
+    #[must_use]
+    pub fn idle(&self, now: u64) -> Option<u64> {
+        let is_idle = self.ports.is_empty() && self.unborn.is_empty() && !self.is_hurried;
+        is_idle.then(|| (self.found + FIND_EVERY).saturating_sub(now))
     }
 
     /// Returns the counters.

@@ -282,7 +282,7 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
         }
         watched = directories;
         std::thread::sleep(GATHER);
-        somebody_came = watch.wait(EVERY, |name| Name::parse(name).is_some());
+        somebody_came = watch.wait(EVERY, None, |name| Name::parse(name).is_some());
     }
 }
 

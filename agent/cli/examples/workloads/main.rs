@@ -12,6 +12,7 @@
 mod caps;
 mod footprint;
 mod report;
+mod spread;
 mod tabs;
 mod window;
 
@@ -24,6 +25,7 @@ use clap::{Parser, ValueEnum};
 
 use crate::footprint::Footprint;
 use crate::report::{Row, Targets};
+use crate::spread::{Spread, Subject};
 use crate::window::{Observer, Window};
 use ros2probe_testing::harness::peer::{Stack, Stream};
 
@@ -46,6 +48,15 @@ struct Options {
     /// Only publishers and subscribers of this DDS
     #[arg(long, value_enum)]
     stack: Option<StackName>,
+    /// Prints minimum, median and maximum of each kind instead of the table
+    #[arg(long)]
+    spread: bool,
+    /// With `--spread`: another binary of the agent, whose windows alternate with the first one's
+    #[arg(long, requires = "spread")]
+    before: Option<PathBuf>,
+    /// With `--spread`: only these kinds
+    #[arg(long, value_enum, value_delimiter = ',', requires = "spread")]
+    observer: Vec<Observer>,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -116,7 +127,14 @@ fn main() -> Result<ExitCode> {
         "{} windows of {} s each; CPU seconds are per 20 s; workload = publisher, subscriber, observer and ksoftirqd\n",
         options.rounds, options.seconds
     );
-    println!("{}", report::HEAD);
+    println!(
+        "{}",
+        if options.spread {
+            spread::HEAD
+        } else {
+            report::HEAD
+        }
+    );
     for workload in WORKLOADS {
         for stack in workload.stacks {
             if !workload.name.contains(&options.only)
@@ -124,8 +142,13 @@ fn main() -> Result<ExitCode> {
             {
                 continue;
             }
-            let row = measure(&workload, *stack, &program, &options)
-                .with_context(|| format!("{} with {stack:?}", workload.name))?;
+            let context = || format!("{} with {stack:?}", workload.name);
+            if options.spread {
+                let spread = spread(&workload, *stack, &program, &options).with_context(context)?;
+                print!("{spread}");
+                continue;
+            }
+            let row = measure(&workload, *stack, &program, &options).with_context(context)?;
             println!("{row}");
             missed.extend(row.missed(&Targets::default()));
         }
@@ -144,14 +167,7 @@ fn main() -> Result<ExitCode> {
 /// Measures without an observer, with the agent, and with the subscriber, in turns, so that the
 /// machine's other work affects all alike.
 fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Row> {
-    let streams = workload.topics.iter().enumerate();
-    let streams: Vec<_> = streams
-        .map(|(number, (size, rate))| Stream {
-            topic: format!("/sensor{number}"),
-            rate: *rate,
-            ..Stream::point_cloud(*size, 0)
-        })
-        .collect();
+    let streams = workload.streams();
     let seconds = Duration::from_secs(options.seconds);
     let mut row = Row::new(workload.name, stack, workload.reference);
     for _ in 0..options.rounds {
@@ -164,6 +180,34 @@ fn measure(workload: &Workload, stack: Stack, program: &Path, options: &Options)
     Ok(row)
 }
 
+/// Measures as [`measure`] does, with each binary of the agent. Every round begins with another
+/// kind, so that none always follows the same one.
+fn spread(workload: &Workload, stack: Stack, program: &Path, options: &Options) -> Result<Spread> {
+    let streams = workload.streams();
+    let seconds = Duration::from_secs(options.seconds);
+    let chosen =
+        |observer: &Observer| options.observer.is_empty() || options.observer.contains(observer);
+    let mut subjects = Vec::new();
+    for observer in Observer::ALL.into_iter().filter(chosen) {
+        if let Some(before) = options.before.as_deref().filter(|_| observer.is_agent()) {
+            subjects.push(Subject::new(observer, before, ", before"));
+        }
+        subjects.push(Subject::new(observer, program, ""));
+    }
+    for _ in 0..options.rounds {
+        for subject in &mut subjects {
+            let observer = subject.observer();
+            let window = Window::measure(stack, &streams, observer, subject.program(), seconds)?;
+            eprintln!("{}: {}", workload.name, subject.add(&window));
+        }
+        subjects.rotate_left(1);
+    }
+    Ok(Spread::new(
+        format!("{}, {stack:?}", workload.name),
+        subjects,
+    ))
+}
+
 /// Returns the binary in the target directory for this machine's architecture.
 fn shipped() -> Result<PathBuf> {
     let program = std::env::current_exe().context("cannot tell where this program is")?;
@@ -174,6 +218,17 @@ fn shipped() -> Result<PathBuf> {
 }
 
 impl Workload {
+    fn streams(&self) -> Vec<Stream> {
+        let topics = self.topics.iter().enumerate();
+        topics
+            .map(|(number, (size, rate))| Stream {
+                topic: format!("/sensor{number}"),
+                rate: *rate,
+                ..Stream::point_cloud(*size, 0)
+            })
+            .collect()
+    }
+
     const fn of_all(
         name: &'static str,
         topics: &'static [(usize, f64)],

@@ -247,7 +247,8 @@ impl fmt::Display for Miss {
     }
 }
 
-fn median(values: impl Iterator<Item = f64>) -> f64 {
+/// Returns the median; NaN without values.
+pub(crate) fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
     let at = |index| values.get(index).copied().unwrap_or(f64::NAN);

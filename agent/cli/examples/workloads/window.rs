@@ -19,7 +19,7 @@ const SAMPLING: Duration = Duration::from_secs(1);
 pub(crate) const UNIT_SECONDS: f64 = 20.0;
 
 /// The observer.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
 pub(crate) enum Observer {
     Nobody,
     /// The agent with the host hook.
@@ -63,6 +63,11 @@ impl Observer {
         Observer::Wire,
         Observer::Subscriber,
     ];
+
+    /// Returns whether it is the agent.
+    pub(crate) const fn is_agent(self) -> bool {
+        matches!(self, Observer::Host | Observer::Wire)
+    }
 
     /// Returns the configuration if the observer is the agent. With the host hook it observes both
     /// hosts, as if all nodes ran on one, but nothing else on the machine.

@@ -228,7 +228,11 @@ impl Run {
             return;
         };
         history.take(now, self.observer.measured(now));
-        self.outputs.latest.publish_past(history.past());
+        let latest = &self.outputs.latest;
+        // Ten minutes are a list of 600 seconds, which may have no reader.
+        if latest.wants_past() || !matches!(self.source, Source::Live(_)) {
+            latest.publish_past(history.past());
+        }
     }
 
     /// Passes new items to the outputs. Slow readers do not block it.
@@ -298,6 +302,10 @@ impl Run {
         let mut snapshot = self.observer.snapshot(self.source.clock());
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
+            // A reader that waits for this state may read the last seconds next.
+            if self.outputs.latest.is_asked() {
+                self.outputs.latest.publish_past(history.past());
+            }
         }
         if let Source::Live(live) = &mut self.source {
             follow(live, &mut self.followed, &snapshot);

@@ -34,7 +34,7 @@ pub(super) async fn show(
     name: &str,
     domain: Domain,
 ) -> Result<Response, Problem> {
-    let state = context.latest.state();
+    let state = context.state().await;
     let topic = find(state.known(), name, domain.checked()?)?;
     let past = context.latest.past();
     let mut view = History {
