@@ -23,15 +23,23 @@ received() {
     dropping
     ./robot --role sub --topic "/$1" --size 1200 --best-effort --log sub.jsonl >sub.log 2>&1 &
     subscriber=$!
-    is_last() { grep '"ev":"sub"' sub.jsonl 2>/dev/null | tail -1 | jq -e '.seq >= 499' >/dev/null; }
+    is_last() {
+        last=$(grep '"ev":"sub"' sub.jsonl 2>/dev/null | tail -1 | jq .seq)
+        [ "${last:-0}" -ge 498 ]
+    }
     wait_until 600 is_last
     sleep 5
-    figure=$(grep '"ev":"sub"' sub.jsonl | jq -rs '[.[].seq] | "received \(length), missing \(max - min + 1 - length)"')
-    figure="$figure; delivered $(sum ros2_topic_delivered_messages_total "topic=\"/$1\""), lost $(sum ros2_topic_delivery_lost_messages_total "topic=\"/$1\""), before_host $(sum ros2_topic_delivery_lost_messages_total "topic=\"/$1\"" 'cause="before_host"')"
+    label="topic=\"/$1\""
+    got=$(grep '"ev":"sub"' sub.jsonl | jq -rs 'length')
+    missing=$(grep '"ev":"sub"' sub.jsonl | jq -rs '[.[].seq] | max - min + 1 - length')
+    delivered=$(sum ros2_topic_delivered_messages_total "$label")
+    lost=$(sum ros2_topic_delivery_lost_messages_total "$label")
+    before=$(sum ros2_topic_delivery_lost_messages_total "$label" 'cause="before_host"')
+    figure="received $got, missing $missing; delivered $delivered, lost $lost, of which before_host $before"
     kill -INT $subscriber
     wait $subscriber
     nft delete table netdev vm
-    echo "$figure" | sed 's/[^0-9;]*\([0-9]*\)[^0-9;]*/\1 /g' | awk '{ exit !($2 > 0 && $1 == $4 && $2 == $5 && $5 == $6) }'
+    [ "$missing" -gt 0 ] && [ "$got" = "$delivered" ] && [ "$missing" = "$lost" ] && [ "$lost" = "$before" ]
 }
 
 ip link set lo up
