@@ -1,5 +1,5 @@
-//! The maps of tracepoints and uprobes: before Linux 6.1 the kernel warns of a program of this kind
-//! whose hash table allocates as it grows, and with PREEMPT_RT it refuses the program.
+//! The maps of tracepoints and uprobes. Before Linux 6.1 the kernel warns of a program of this kind
+//! whose hash table allocates as it grows. With PREEMPT_RT it refuses the program.
 
 use std::fs::{self, File};
 use std::os::fd::AsRawFd as _;
