@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use anyhow::{Context as _, Result};
 use clap::Args;
 use jiff::{Timestamp, Unit};
-use ros2probe::client::{Agent, Next, Target};
+use ros2probe::client::{Agent, Lines, Next, Target};
 use ros2probe::learn::watchlist::{Source, is_expected, text};
 use ros2probe::learn::{Learner, Learnt, MAX_SECONDS, Selection};
 use ros2probe_api::path::encoded;
@@ -122,7 +122,7 @@ impl Session {
         let (query, domain_id) = (&self.query, self.domain_id);
         let path = format!("/samples?{query}&domain_id={domain_id}&queue_bytes={QUEUE_BYTES}");
         let mut lines = agent.stream(&path)?;
-        self.view(agent)?;
+        self.view_while(&mut lines, agent)?;
         let begin = Instant::now();
         let end = begin + Duration::from_secs(self.seconds.into());
         let mut due = begin + INTERVAL;
@@ -130,7 +130,7 @@ impl Session {
         while !self.is_over(Instant::now() >= end) {
             let left = due.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                self.view(agent)?;
+                self.view_while(&mut lines, agent)?;
                 due += INTERVAL;
                 if !std::mem::replace(&mut is_explained, true) {
                     self.explain_unseen();
@@ -138,14 +138,21 @@ impl Session {
                 continue;
             }
             match lines.line_within(left.min(POLL))? {
-                Next::Line(line) if !line.starts_with(br#"{"end""#) => {}
+                Next::Line(line) if !is_end(&line) => {}
                 Next::Nothing => {}
-                Next::Line(_) | Next::End => {
-                    return Err(UserError(format!("rp: {AGENT_ENDED}; nothing is written")).into());
-                }
+                Next::Line(_) | Next::End => return Err(agent_ended().into()),
             }
         }
         Ok(())
+    }
+
+    /// Views the topics. An agent that has just ended fails to answer before its stream ends.
+    fn view_while(&mut self, lines: &mut Lines<'_>, agent: &Agent) -> Result<()> {
+        let viewed = self.view(agent);
+        match viewed {
+            Err(_) if ends_soon(lines) => Err(agent_ended().into()),
+            viewed => viewed,
+        }
     }
 
     /// Views the topics at each whole second of a capture.
@@ -231,6 +238,27 @@ impl Session {
             output.phrase()
         );
     }
+}
+
+fn agent_ended() -> UserError {
+    UserError(format!("rp: {AGENT_ENDED}; nothing is written"))
+}
+
+fn is_end(line: &[u8]) -> bool {
+    line.starts_with(br#"{"end""#)
+}
+
+/// Returns whether the stream ends within a second.
+fn ends_soon(lines: &mut Lines<'_>) -> bool {
+    let deadline = Instant::now() + Duration::from_secs(1);
+    while let Some(left) = deadline.checked_duration_since(Instant::now()) {
+        match lines.line_within(left) {
+            Ok(Next::Line(line)) if !is_end(&line) => {}
+            Ok(Next::Nothing) => return false,
+            Ok(Next::Line(_) | Next::End) | Err(_) => return true,
+        }
+    }
+    false
 }
 
 /// Selection in the syntax of `/samples`.
