@@ -46,7 +46,7 @@ fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<(
         bags.display()
     ))?;
 
-    let words = "topic pub -r 20 /chatter std_msgs/msg/String --qos-reliability best_effort";
+    let words = "topic pub -r 20 --qos-reliability best_effort /chatter std_msgs/msg/String";
     let mut words: Vec<&str> = words.split(' ').collect();
     words.push("data: hello");
     let mut publisher = ros2(&host, "publisher", &words)?;

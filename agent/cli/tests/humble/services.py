@@ -9,7 +9,8 @@
 
 Both print `ready`; the client prints `done` after each line. The log has one line of JSON for each
 call: the times at which the call that sends the request began (`began`) and returned (`sent`), and
-at which the response was received by the middleware, if that reports it, and taken from it. Both
+at which the response was received by the middleware, if that reports it, and taken from it. It was
+not there yet at `absent`. Both
 processes have real-time priority, so that other programs do not delay what they log.
 """
 
@@ -89,7 +90,9 @@ class Client:
             began = time.time_ns()
             handle.send_request(request)
             sent = time.time_ns()
+            looks = sent
             while True:
+                absent, looks = looks, time.time_ns()
                 header, response = handle.take_response(AddTwoInts.Response)
                 taken = time.time_ns()
                 if response is not None:
@@ -98,7 +101,9 @@ class Client:
         assert response.sum == milliseconds + 1
         # Cyclone DDS does not report when it received a response.
         received = header.received_timestamp or taken
-        self.write({"began": began, "sent": sent, "received": received, "taken": taken})
+        absent = header.received_timestamp or absent
+        line = {"began": began, "sent": sent, "absent": absent, "received": received, "taken": taken}
+        self.write(line)
 
     def write(self, line):
         self.file.write(json.dumps(line) + "\n")
