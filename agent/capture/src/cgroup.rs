@@ -113,9 +113,16 @@ pub fn mount_point() -> Result<PathBuf, CgroupError> {
 pub fn topmost(mounts: &[u8]) -> Option<PathBuf> {
     let found = mounts
         .split(|byte| *byte == b'\n')
-        .filter_map(mount)
+        .filter_map(|line| mount(line, b"cgroup2"))
         .min_by_key(|mount| mount.root.len())?;
     Some(PathBuf::from(OsString::from_vec(found.point)))
+}
+
+/// Returns whether a hierarchy of version 1 is mounted.
+#[must_use]
+pub fn has_version_1(mounts: &[u8]) -> bool {
+    let mut lines = mounts.split(|byte| *byte == b'\n');
+    lines.any(|line| mount(line, b"cgroup").is_some())
 }
 
 struct Mount {
@@ -125,14 +132,14 @@ struct Mount {
     point: Vec<u8>,
 }
 
-/// Parses a line about `cgroup2`: number, parent, device, root, mount point, options, optional
-/// fields, a dash, type.
-fn mount(line: &[u8]) -> Option<Mount> {
+/// Parses a line about this type of file system: number, parent, device, root, mount point,
+/// options, optional fields, a dash, type.
+fn mount(line: &[u8], file_system: &[u8]) -> Option<Mount> {
     let mut fields = line.split(|byte| *byte == b' ');
     let root = unescape(fields.nth(3)?);
     let point = unescape(fields.next()?);
     fields.find(|field| *field == b"-")?;
-    (fields.next()? == b"cgroup2").then_some(Mount { root, point })
+    (fields.next()? == file_system).then_some(Mount { root, point })
 }
 
 /// Decodes space, tab, newline and backslash, which are written as three octal digits.

@@ -139,7 +139,7 @@ impl Follow {
                 return;
             }
             if let Some(watch) = &mut watch {
-                watch.wait(Duration::ZERO, None, |_| true);
+                watch.created(|_| true);
             }
         }
     }

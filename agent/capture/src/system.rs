@@ -9,7 +9,6 @@ use std::path::Path;
 use std::ptr;
 use std::time::Duration;
 
-use libc::c_int;
 use ros2probe_wire::Timestamp;
 
 /// Most attempts to read the clocks.
@@ -21,7 +20,7 @@ const CLOSE: u64 = 5_000;
 /// expires. Returns the index of the first such descriptor.
 ///
 /// # Errors
-/// Fails if `poll` itself fails.
+/// Fails if `ppoll` itself fails.
 pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Option<usize>> {
     let mut poll: Vec<_> = descriptors
         .iter()
@@ -31,10 +30,13 @@ pub fn wait(descriptors: &[BorrowedFd<'_>], timeout: Duration) -> io::Result<Opt
             revents: 0,
         })
         .collect();
-    let milliseconds = c_int::try_from(timeout.as_millis()).unwrap_or(c_int::MAX);
+    let timeout = libc::timespec {
+        tv_sec: timeout.as_secs().try_into().unwrap_or(i64::MAX),
+        tv_nsec: timeout.subsec_nanos().into(),
+    };
     let count = libc::nfds_t::try_from(poll.len()).unwrap_or(0);
-    // SAFETY: `poll` holds `count` entries and outlives the call.
-    let ready = unsafe { libc::poll(poll.as_mut_ptr(), count, milliseconds) };
+    // SAFETY: `poll` holds `count` entries; it and the time outlive the call; no signal mask.
+    let ready = unsafe { libc::ppoll(poll.as_mut_ptr(), count, &raw const timeout, ptr::null()) };
     if ready < 0 {
         let error = io::Error::last_os_error();
         if error.kind() != io::ErrorKind::Interrupted {
@@ -90,31 +92,10 @@ impl DirectoryWatch {
         unsafe { libc::inotify_add_watch(descriptor, path.as_ptr(), mask) >= 0 }
     }
 
-    /// Sleeps until a file is created, `end` is readable or closed, or the timeout expires. Returns
-    /// whether `matters` accepts a created file's name.
-    pub fn wait(
-        &mut self,
-        timeout: Duration,
-        end: Option<BorrowedFd<'_>>,
-        matters: impl Fn(&str) -> bool,
-    ) -> bool {
-        // The kernel skips an entry with a negative descriptor.
-        let end = end.map_or(-1, |end| end.as_raw_fd());
-        let mut poll = [self.events.as_raw_fd(), end].map(|fd| libc::pollfd {
-            fd,
-            events: libc::POLLIN,
-            revents: 0,
-        });
-        let timeout = libc::timespec {
-            tv_sec: timeout.as_secs().try_into().unwrap_or(i64::MAX),
-            tv_nsec: timeout.subsec_nanos().into(),
-        };
-        // SAFETY: two entries and the time, all of which outlive the call; no signal mask.
-        let ready = unsafe { libc::ppoll(poll.as_mut_ptr(), 2, &raw const timeout, ptr::null()) };
+    /// Takes the names of files created since the last call. Returns whether `matters` accepts one.
+    pub fn created(&mut self, matters: impl Fn(&str) -> bool) -> bool {
         let (mut any, mut events) = (false, [0; 4096]);
-        while ready > 0
-            && let Ok(read @ 1..) = self.events.read(&mut events)
-        {
+        while let Ok(read @ 1..) = self.events.read(&mut events) {
             any |= names(events.get(..read).unwrap_or_default()).any(&matters);
         }
         any
@@ -358,17 +339,21 @@ mod tests {
     fn a_created_file_ends_the_sleep_and_is_reported_once() {
         let directory = tempfile::tempdir().unwrap();
         let mut watch = DirectoryWatch::new().unwrap();
+        let news = |watch: &mut DirectoryWatch, timeout, name: &str| {
+            wait(&[watch.as_fd()], timeout).unwrap() == Some(0)
+                && watch.created(|created| name.is_empty() || created == name)
+        };
         assert!(watch.add(directory.path()));
         assert!(!watch.add(Path::new("/nowhere")));
         let short = Duration::from_micros(100);
-        assert!(!watch.wait(short, None, |_| true));
+        assert!(!news(&mut watch, short, ""));
         for name in ["one", "two"] {
             std::fs::write(directory.path().join(name), "").unwrap();
         }
-        assert!(watch.wait(Duration::from_secs(60), None, |name| name == "two"));
-        assert!(!watch.wait(short, None, |_| true));
+        assert!(news(&mut watch, Duration::from_secs(60), "two"));
+        assert!(!news(&mut watch, short, ""));
         std::fs::write(directory.path().join("three"), "").unwrap();
-        assert!(!watch.wait(Duration::from_secs(60), None, |name| name == "two"));
+        assert!(!news(&mut watch, Duration::from_secs(60), "two"));
     }
 
     #[test]
@@ -379,16 +364,18 @@ mod tests {
         let mut watch = DirectoryWatch::new().unwrap();
         assert!(watch.add_with_removals(directory.path()));
         std::fs::remove_dir(&group).unwrap();
-        assert!(watch.wait(Duration::from_secs(60), None, |name| name == "group"));
+        let ready = wait(&[watch.as_fd()], Duration::from_secs(60)).unwrap();
+        assert!(ready == Some(0) && watch.created(|name| name == "group"));
     }
 
     #[test]
     fn a_closed_pipe_ends_the_sleep() {
-        let mut watch = DirectoryWatch::new().unwrap();
+        let watch = DirectoryWatch::new().unwrap();
         let (ended, end) = io::pipe().unwrap();
         drop(end);
         let start = Instant::now();
-        assert!(!watch.wait(Duration::from_secs(60), Some(ended.as_fd()), |_| true));
+        let ready = wait(&[watch.as_fd(), ended.as_fd()], Duration::from_secs(60));
+        assert_eq!(ready.unwrap(), Some(1));
         assert!(start.elapsed() < Duration::from_secs(30));
     }
 

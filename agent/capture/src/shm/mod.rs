@@ -37,7 +37,7 @@ use self::directories::{Name, ShmDirectories, ShmDirectoryId};
 use self::inbox::{Inbox, Item};
 use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
-use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu};
+use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Spawn, Task};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
@@ -288,9 +288,8 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
         // Creation of a file ends the sleep, and nothing else is to be noticed.
         let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
-        if watch.wait(sleep, Some(ended.as_fd()), |name| {
-            Name::parse(name).is_some()
-        }) {
+        let ready = wait(&[watch.as_fd(), ended.as_fd()], sleep);
+        if matches!(ready, Ok(Some(0))) && watch.created(|name| Name::parse(name).is_some()) {
             tap.spend(thread_cpu().saturating_sub(before));
             tap.expect_participant();
             interval.newcomer(at);

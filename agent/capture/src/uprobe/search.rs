@@ -7,6 +7,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, OpenOptions};
 use std::io;
+use std::os::fd::AsFd as _;
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +20,7 @@ use super::processes::{LibraryId, Mapped, Processes, is_library};
 use crate::error_chain::in_words;
 use crate::filter::{FilterError, Probe, Probes};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
-use crate::system::DirectoryWatch;
+use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
 
 /// Interval of visiting processes if nothing happens.
@@ -282,7 +283,8 @@ fn follow(shared: &Shared, mut attachments: Attachments, scope: Scope) {
         }
         watched = directories;
         std::thread::sleep(GATHER);
-        somebody_came = watch.wait(EVERY, None, |name| Name::parse(name).is_some());
+        somebody_came = matches!(wait(&[watch.as_fd()], EVERY), Ok(Some(0)))
+            && watch.created(|name| Name::parse(name).is_some());
     }
 }
 
