@@ -3,7 +3,7 @@
 use std::error::Error;
 use std::path::{Path, PathBuf};
 
-use ros2probe_capture::cgroup::{Cgroup, CgroupError, topmost};
+use ros2probe_capture::cgroup::{Cgroup, CgroupError, has_version_1, topmost};
 use ros2probe_capture::error_chain::in_words;
 pub use ros2probe_capture::system::ClockState;
 use ros2probe_capture::system::clock_state;
@@ -15,6 +15,8 @@ use rustix::thread::CapabilitySet;
 pub enum CgroupHierarchy {
     /// No hierarchy is mounted.
     NotMounted,
+    /// The same, beside hierarchies of version 1.
+    Version1,
     /// The hierarchy of the whole host, at this mount point.
     WholeHost(PathBuf),
     /// A part of the hierarchy, as in containers, at this mount point.
@@ -31,7 +33,10 @@ impl CgroupHierarchy {
     #[must_use]
     pub fn find(mounts: &[u8], at: impl Fn(&Path) -> PathBuf) -> Self {
         let Some(point) = topmost(mounts) else {
-            return Self::NotMounted;
+            return match has_version_1(mounts) {
+                true => Self::Version1,
+                false => Self::NotMounted,
+            };
         };
         match Cgroup::open(&at(&point)) {
             Ok(group) if group.is_whole_host() => Self::WholeHost(point),

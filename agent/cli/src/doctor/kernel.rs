@@ -152,25 +152,23 @@ fn control_groups(host: &HostState) -> Finding {
     let mounts = host.files.bytes(MOUNTS, 1 << 20).unwrap_or_default();
     let path = |point: &Path| host.files.path(&point.to_string_lossy());
     let (finding, point) = match CgroupHierarchy::find(&mounts, path) {
-        CgroupHierarchy::NotMounted => {
+        hierarchy @ (CgroupHierarchy::NotMounted | CgroupHierarchy::Version1) => {
             let sentence = "no cgroup v2 hierarchy is mounted: the agent can observe interfaces \
                 only, not sockets";
             let finding = report(Severity::Warning, sentence.to_owned()).seen("no cgroup2", MOUNTS);
+            if hierarchy == CgroupHierarchy::NotMounted {
+                return finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup");
+            }
             // A mount at the usual place would hide the controllers of version 1.
-            let has_version_1 = mounts.windows(10).any(|window| window == b" - cgroup ");
-            return if has_version_1 {
-                finding
-                    .remedy(
-                        "sudo mkdir -p /run/cgroup2 && sudo mount -t cgroup2 none /run/cgroup2    \
-                         # beside version 1; then sudo systemctl restart ros2probe",
-                    )
-                    .elsewhere(
-                        "systemd.unified_cgroup_hierarchy=1    # on the kernel's command line, \
-                         for good",
-                    )
-            } else {
-                finding.remedy("sudo mount -t cgroup2 none /sys/fs/cgroup")
-            };
+            return finding
+                .remedy(
+                    "sudo mkdir -p /run/cgroup2 && sudo mount -t cgroup2 none /run/cgroup2    \
+                     # beside version 1; then sudo systemctl restart ros2probe",
+                )
+                .elsewhere(
+                    "systemd.unified_cgroup_hierarchy=1    # on the kernel's command line, for \
+                     good",
+                );
         }
         CgroupHierarchy::WholeHost(point) => {
             let at = point.display();
