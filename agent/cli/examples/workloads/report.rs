@@ -182,7 +182,7 @@ impl Row {
     /// here.
     fn beside_nobody(&self, observer: Observer) -> f64 {
         let median = |who| median(self.of(who).map(|window| window.workload));
-        median(observer) / median(Observer::Nobody)
+        median(observer) / median(Observer::None)
     }
 
     fn is_large(&self) -> bool {

@@ -79,11 +79,9 @@ impl Spread {
 
 impl fmt::Display for Spread {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let alone = self.subjects.iter();
-        let alone = alone
-            .filter(|subject| subject.observer == Observer::Nobody)
-            .map(|subject| median(&subject.workload))
-            .next();
+        let mut subjects = self.subjects.iter();
+        let alone = subjects.find(|subject| subject.observer == Observer::None);
+        let alone = alone.map(|subject| median(&subject.workload));
         for subject in &self.subjects {
             let ratio = alone.map_or_else(
                 || "-".to_owned(),

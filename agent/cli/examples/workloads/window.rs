@@ -21,7 +21,7 @@ pub(crate) const UNIT_SECONDS: f64 = 20.0;
 /// The observer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
 pub(crate) enum Observer {
-    Nobody,
+    None,
     /// The agent with the host hook.
     Host,
     /// The agent with packet sockets.
@@ -58,7 +58,7 @@ pub(crate) struct AgentTotals {
 
 impl Observer {
     pub(crate) const ALL: [Observer; 4] = [
-        Observer::Nobody,
+        Observer::None,
         Observer::Host,
         Observer::Wire,
         Observer::Subscriber,
@@ -75,7 +75,7 @@ impl Observer {
         let capture = match self {
             Observer::Host => format!("source: host, cgroup: {}", link.cgroup().display()),
             Observer::Wire => "source: wire".to_owned(),
-            Observer::Nobody | Observer::Subscriber => return None,
+            Observer::None | Observer::Subscriber => return None,
         };
         Some(format!("watch: [/**]\ncapture: {{{capture}}}\nlog: warn\n"))
     }
