@@ -9,7 +9,7 @@ use aya_ebpf::{
 use ros2probe_wire::{
     Record,
     filter::{
-        Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
+        COUNTER_SLOTS, Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
         RUN_CAPACITY, UNKNOWN_CAPACITY,
     },
     host::{PIECE_BYTES, Piece, SOCKET_CAPACITY, Socket},
@@ -28,6 +28,7 @@ const _: () = assert!(RECORDS_PER_DATAGRAM.is_power_of_two());
 /// Runs of programs that may be active on one CPU, see [`claim_outgoing`]: received datagrams and
 /// frames use the slots below [`OUTGOING_SLOT`], sent datagrams the others.
 pub const SLOTS: u32 = 6;
+const _: () = assert!((SLOTS as usize) < COUNTER_SLOTS && COUNTER_SLOTS.is_power_of_two());
 /// First slot for sent datagrams.
 pub const OUTGOING_SLOT: u32 = 2;
 /// Captures remembered per CPU, a power of two.
@@ -108,13 +109,13 @@ pub static RUNS: HashMap<RunKey, Record> = HashMap::with_max_entries(RUN_CAPACIT
 /// behind.
 #[map]
 pub static RUN_CPUS: LruHashMap<Stream, u32> = LruHashMap::with_max_entries(RUN_CAPACITY, 0);
-/// Records for user space, read a few times a second or when the ring is half full.
+/// Records for user space, read once a second or when the ring is half full.
 #[map]
 pub static RECORDS: RingBuf = RingBuf::with_byte_size(256 * 1024, 0);
-/// Counters by slot and `filter::Counter`; one more slot counts what happens outside of slots.
+/// Counters by slot and `filter::Counter`, read in one system call.
 #[map]
-pub static COUNTERS: PerCpuArray<[u64; Counter::ALL.len()]> =
-    PerCpuArray::with_max_entries(SLOTS + 1, 0);
+pub static COUNTERS: PerCpuArray<[[u64; Counter::ALL.len()]; COUNTER_SLOTS]> =
+    PerCpuArray::with_max_entries(1, 0);
 /// Captured datagrams of the host hook, in [`PieceBuffer`]s cut to their length.
 #[map]
 pub static PIECES: RingBuf = RingBuf::with_byte_size(1024 * 1024, 0);
@@ -280,6 +281,8 @@ pub struct Scratch {
     pub pending: Record,
     /// How many of `records` are filled.
     pub count: u32,
+    /// User space has classified the endpoint of the last of them.
+    pub classified: u32,
     /// The capture is needed only for an unclassified writer.
     pub unknown: u32,
     /// Host hook: a copy of the datagram was captured just before.
@@ -448,21 +451,27 @@ pub fn last() -> Option<&'static Last> {
 /// Adds to a counter of this CPU and slot.
 #[inline(always)]
 pub fn count(slot: u32, counter: Counter, by: u64) {
-    if let Some(counters) = COUNTERS.get_ptr_mut(slot) {
-        // SAFETY: a map value pointer checked against null, of a slot that this run holds, and an
-        // index below the number of counters.
-        unsafe { *counters.cast::<u64>().add(counter as usize) += by }
+    if let Some(counter) = counter_of(slot, counter) {
+        // SAFETY: in a map value, of a slot that this run holds.
+        unsafe { *counter += by }
     }
 }
 
 /// Adds to a counter of this CPU outside of slots.
 #[inline(always)]
 pub fn count_outside(counter: Counter, by: u64) {
-    if let Some(counters) = COUNTERS.get_ptr_mut(SLOTS) {
-        // SAFETY: a map value pointer checked against null, and an index below the number of
-        // counters.
-        add(unsafe { counters.cast::<u64>().add(counter as usize) }, by);
+    if let Some(counter) = counter_of(SLOTS, counter) {
+        add(counter, by);
     }
+}
+
+#[inline(always)]
+fn counter_of(slot: u32, counter: Counter) -> Option<*mut u64> {
+    let counters = COUNTERS.get_ptr_mut(0)?;
+    let slot = opaque(slot) as usize & (COUNTER_SLOTS - 1);
+    let index = slot * Counter::ALL.len() + counter as usize;
+    // SAFETY: a map value pointer checked against null, and an index within the value.
+    Some(unsafe { counters.cast::<u64>().add(index) })
 }
 
 /// Adds in one instruction, so that no other run comes between.

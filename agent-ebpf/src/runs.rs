@@ -3,7 +3,7 @@
 //! A run begins with a sample's first fragment and ends with its last, or before a missing
 //! fragment. Everything else (a retransmission, the rest behind a gap) is written at once. If the
 //! sender moves to another CPU in the middle, the run is written and a new one starts there. User
-//! space removes runs that have stopped growing; it checks a few times a second.
+//! space removes runs that have stopped growing; it checks at least once a second.
 
 use aya_ebpf::helpers::bpf_get_smp_processor_id;
 use ros2probe_wire::record::{Record, flag, kind};

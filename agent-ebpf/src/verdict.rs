@@ -3,7 +3,7 @@
 use aya_ebpf::{bindings::__sk_buff, helpers::bpf_ktime_get_ns};
 use ros2probe_wire::{
     filter::{Budget, Counter, UNKNOWN_CAPTURE_BYTES},
-    record::{Record, Verdict, flag},
+    record::{Record, Verdict, flag, kind},
     walk::{self, Fate, MAGIC, Step},
 };
 
@@ -216,6 +216,9 @@ pub extern "C" fn advance(skb: *mut __sk_buff, base: u32, present: u32, slot: u3
 /// Looks up the current submessage in the interest map.
 #[inline(always)]
 pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
+    if joins_last(scratch) {
+        return progress::ON;
+    }
     let (key, unknown_counts) = match walk::fate(&scratch.walk.record) {
         Fate::Ignore => return progress::ON,
         Fate::Capture if host::captured_before(slot, scratch) => return progress::ON,
@@ -223,6 +226,7 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
         Fate::Writer => (scratch.walk.record.writer, true),
         Fate::Reader => (scratch.walk.record.reader, false),
     };
+    scratch.classified = 1;
     let meter = match INTEREST.get_ptr(key) {
         // SAFETY: a map value pointer checked against null.
         Some(verdict) => match unsafe { *verdict } {
@@ -234,10 +238,13 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
             }
             verdict => verdict == Verdict::Meter as u32,
         },
-        None if unknown_counts => match unknown(slot, scratch, key) {
-            progress::CAPTURE => return progress::CAPTURE,
-            admitted => admitted == progress::STOP,
-        },
+        None if unknown_counts => {
+            scratch.classified = 0;
+            match unknown(slot, scratch, key) {
+                progress::CAPTURE => return progress::CAPTURE,
+                admitted => admitted == progress::STOP,
+            }
+        }
         None => false,
     };
     if !meter {
@@ -252,6 +259,26 @@ pub fn endpoint(slot: u32, scratch: &mut Scratch, long_gap: bool) -> u32 {
     }
     scratch.count = index + 1;
     progress::ON
+}
+
+/// Adds the current submessage to the last record if it holds the next fragments of the same
+/// sample. Returns whether it does. Cyclone DDS sends ten DATA_FRAGs in a datagram.
+#[inline(always)]
+fn joins_last(scratch: &mut Scratch) -> bool {
+    let record = &scratch.walk.record;
+    if record.kind != kind::DATA_FRAG || scratch.count == 0 || scratch.classified == 0 {
+        return false;
+    }
+    let index = opaque(scratch.count - 1) as usize & (RECORDS_PER_DATAGRAM as usize - 1);
+    let Some(last) = scratch.records.get_mut(index) else {
+        return false;
+    };
+    last.kind == kind::DATA_FRAG
+        && last.writer[3] == record.writer[3]
+        && last.writer[2] == record.writer[2]
+        && last.writer[1] == record.writer[1]
+        && last.writer[0] == record.writer[0]
+        && last.extend(record)
 }
 
 /// Handles a writer that user space has not classified: `CAPTURE` within its budget, then `STOP`

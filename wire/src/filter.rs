@@ -147,6 +147,9 @@ pub enum Budget {
     Records = 1,
 }
 
+/// Working areas with counters of their own, and one for what happens outside of them; a power of
+/// two.
+pub const COUNTER_SLOTS: usize = 8;
 /// Writers and readers in the interest map.
 pub const INTEREST_CAPACITY: u32 = 16_384;
 /// Participants whose last message the filter notes.

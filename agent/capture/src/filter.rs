@@ -13,7 +13,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, ProgramArray, RingBuf};
 use aya::programs::{Program, ProgramError, ProgramFd};
 use aya::{Ebpf, EbpfError, EbpfLoader};
-use ros2probe_wire::filter::{Budget, Counter};
+use ros2probe_wire::filter::{Budget, COUNTER_SLOTS, Counter};
 use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 use zerocopy::FromBytes;
@@ -117,7 +117,7 @@ pub struct Filter {
     /// Values are [`Record`]s.
     runs: HashMap<MapData, RunKey, [u64; 17]>,
     /// By slot.
-    counters: PerCpuArray<MapData, [u64; Counter::ALL.len()]>,
+    counters: PerCpuArray<MapData, [[u64; Counter::ALL.len()]; COUNTER_SLOTS]>,
     records: RingBuf<MapData>,
 }
 
@@ -257,15 +257,11 @@ impl Filter {
     /// Fails if the kernel refuses the lookup.
     pub fn counters(&self) -> Result<Vec<(Counter, u64)>, FilterError> {
         let mut sums = Counter::ALL.map(|counter| (counter, 0));
-        for slot in 0..self.counters.len() {
-            let values = self
-                .counters
-                .get(&slot, 0)
-                .map_err(failed("COUNTERS", "read"))?;
-            for counters in values.iter() {
-                for ((_, sum), value) in sums.iter_mut().zip(counters) {
-                    *sum += value;
-                }
+        let values = self.counters.get(&0, 0);
+        let values = values.map_err(failed("COUNTERS", "read"))?;
+        for counters in values.iter().flatten() {
+            for ((_, sum), value) in sums.iter_mut().zip(counters) {
+                *sum += value;
             }
         }
         Ok(sums.to_vec())

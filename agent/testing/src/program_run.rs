@@ -391,18 +391,32 @@ pub fn data(writer: Guid, number: u32, size: usize) -> Vec<u8> {
 
 /// Returns one DATA_FRAG with one fragment of 1000 bytes, as an IPv4 packet.
 pub fn fragment(writer: Guid, number: u32, start: u32, of: u32) -> Vec<u8> {
+    data_frags(writer, number, [start], of, 1000)
+}
+
+/// Returns DATA_FRAGs with one fragment of `size` bytes each, in one datagram, as an IPv4 packet.
+pub fn data_frags(
+    writer: Guid,
+    number: u32,
+    starts: impl IntoIterator<Item = u32>,
+    of: u32,
+    size: u16,
+) -> Vec<u8> {
     let mut bytes = b"RTPS\x02\x04\x01\x12".to_vec();
     bytes.extend_from_slice(&writer.prefix.0);
-    bytes.extend_from_slice(&[0x16, 1]);
-    bytes.extend_from_slice(&u16::try_from(32 + 1000).unwrap().to_le_bytes());
-    bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
-    bytes.extend_from_slice(&writer.entity.0);
-    for word in [0, number, start] {
-        bytes.extend_from_slice(&word.to_le_bytes());
+    for start in starts {
+        bytes.extend_from_slice(&[0x16, 1]);
+        bytes.extend_from_slice(&(32 + size).to_le_bytes());
+        bytes.extend_from_slice(&[0, 0, 28, 0, 0, 0, 0, 0]);
+        bytes.extend_from_slice(&writer.entity.0);
+        for word in [0, number, start] {
+            bytes.extend_from_slice(&word.to_le_bytes());
+        }
+        bytes.extend_from_slice(&[1, 0]);
+        bytes.extend_from_slice(&size.to_le_bytes());
+        bytes.extend_from_slice(&(of * u32::from(size)).to_le_bytes());
+        bytes.extend(std::iter::repeat_n(0x33, size.into()));
     }
-    bytes.extend_from_slice(&[1, 0, 0xe8, 0x03]);
-    bytes.extend_from_slice(&(of * 1000).to_le_bytes());
-    bytes.extend(std::iter::repeat_n(0x33, 1000));
     datagram(&bytes)
 }
 

@@ -128,6 +128,39 @@ fn thirty_two_samples_in_one_datagram_become_records_and_more_make_it_captured()
 }
 
 #[test]
+fn consecutive_fragments_in_one_datagram_are_one_record_however_many() {
+    let writer = Guid::new(GuidPrefix(*b"\x01\x10manyfrags "), EntityId([0, 0, 1, 3]));
+    let reports = |kernel: &mut Kernel, number, starts: Vec<u32>, of| {
+        let seen = kernel.frame(&program_run::data_frags(writer, number, starts, of, 16));
+        assert!(!seen.kept);
+        let records = [seen.records, kernel.take_stalled()].concat();
+        let reports = records.into_iter().map(|record| {
+            let count = record.fragments_in_submessage();
+            (record.sequence_number, record.fragment_start, count)
+        });
+        reports.collect::<Vec<_>>()
+    };
+    let mut kernel = Kernel::load();
+    kernel.set_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    // More than the records of a datagram.
+    let all: Vec<u32> = (1..=40).collect();
+    assert_eq!(reports(&mut kernel, 1, all.clone(), 40), [(1, 1, 40)]);
+    let later: Vec<u32> = (1..=5).chain(7..=12).collect();
+    let holes = reports(&mut kernel, 2, later, 40);
+    assert_eq!(holes, [(2, 1, 5), (2, 7, 6)]);
+    let back = reports(&mut kernel, 3, vec![9, 10, 3, 4, 4], 40);
+    assert_eq!(back, [(3, 9, 2), (3, 3, 2), (3, 4, 1)]);
+
+    // Each submessage of an unclassified writer is charged.
+    kernel.forget_interest(&BTreeMap::from([(writer, Verdict::Meter)]));
+    kernel.set_unknown_budget(0, 3);
+    let before = kernel.counter(Counter::MeteredUnknown);
+    let charged = reports(&mut kernel, 4, all, 40);
+    assert_eq!(charged, [(4, 1, 3)]);
+    assert_eq!(kernel.counter(Counter::MeteredUnknown) - before, 3);
+}
+
+#[test]
 fn an_acknack_is_metered_by_its_reader() {
     let reader = Guid::new(GuidPrefix(*b"\x01\x0freaderread"), EntityId([0, 0, 7, 4]));
     let mut payload = b"RTPS\x02\x03\x01\x0f".to_vec();
