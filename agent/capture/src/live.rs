@@ -43,12 +43,16 @@ const UNKNOWN_BYTES_PER_SECOND: u32 = 4 << 20;
 /// Refilled in small portions: a storm during a delay of this process then leaves most of the
 /// record ring to known writers.
 const UNKNOWN_RECORDS_PER_TENTH: u32 = 410;
+/// Most of these portions at once: a fifth of a ring of the default size.
+const UNKNOWN_PORTIONS: u64 = 4;
 /// How long news from the host hook is collected: a starting node announces its endpoints one by
 /// one, and each round costs CPU time.
 const GATHER: Duration = Duration::from_millis(10);
 /// The same while whole samples are captured: a point cloud fills the ring in a few milliseconds.
 const GATHER_PAYLOADS: Duration = Duration::from_millis(2);
 const TENTH: u64 = SECOND / 10;
+/// Longer than any wait for packets.
+const HELD_UP: u64 = 2 * SECOND;
 
 /// Why capturing cannot start or continue.
 #[derive(Debug, thiserror::Error)]
@@ -88,6 +92,8 @@ pub struct LiveSource {
     records_refilled: u64,
     /// When the model last reported its interest in shared memory.
     wanted_asked: u64,
+    /// Whether the requests may have changed since.
+    wanted_waits: bool,
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
@@ -163,6 +169,7 @@ impl LiveSource {
             bytes_refilled: 0,
             records_refilled: 0,
             wanted_asked: 0,
+            wanted_waits: false,
             refused_updates: 0,
             clock: clocks.now,
             clocks,
@@ -235,6 +242,10 @@ impl LiveSource {
         let taps = sockets.chain(processes).chain(interfaces).chain(looks);
         let descriptors: Vec<_> = bell.into_iter().chain(taps).collect();
         let began = Instant::now();
+        let timeout = match self.wanted_waits {
+            true => timeout.min(Duration::from_nanos(TENTH)),
+            false => timeout,
+        };
         let ready = wait(&descriptors, timeout).map_err(CaptureError::Wait)?;
         let woken = ready.is_some_and(|first| first >= rings) && began.elapsed() < timeout;
         if (self.host.is_some() || self.exact.is_some()) && woken {
@@ -255,7 +266,7 @@ impl LiveSource {
             );
             observer.input(Input::ClockSet(step));
         }
-        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= SECOND;
+        let held_up = clocks.monotonic.saturating_sub(self.clocks.monotonic) >= HELD_UP;
         self.clocks = clocks;
         self.refill(clocks.monotonic);
         let mut settle = 0;
@@ -276,20 +287,22 @@ impl LiveSource {
             shared_memory.poll(&clocks, observer);
         }
         self.apply_wanted(clocks.monotonic, observer);
-        if held_up {
-            // Its rings may have been too small: silence does not mean that participants left,
-            // since this process did not read.
+        self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
+        // Any message renews a lease. If this process did not read for long, its rings may have
+        // been too small for the announcements.
+        let clock = self.clock;
+        if held_up || observer.next_expiry().is_some_and(|end| end <= clock) {
             for (prefix, at) in self.last_seen() {
                 observer.input(Input::ParticipantAlive(prefix, at));
             }
         }
-        self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
         Ok(())
     }
 
     /// Passes the model's requests for shared memory to its readers, ten times a second.
     fn apply_wanted(&mut self, now: u64, observer: &Observer) {
-        if now.wrapping_sub(self.wanted_asked) < TENTH {
+        self.wanted_waits = now.wrapping_sub(self.wanted_asked) < TENTH;
+        if self.wanted_waits {
             return;
         }
         self.wanted_asked = now;
@@ -537,14 +550,16 @@ impl LiveSource {
     }
 
     fn refill(&mut self, monotonic: u64) {
-        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND {
+        if monotonic.wrapping_sub(self.bytes_refilled) >= SECOND - TENTH {
             self.bytes_refilled = monotonic;
             let (budget, amount) = (Budget::CaptureBytes, UNKNOWN_BYTES_PER_SECOND);
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
-        if monotonic.wrapping_sub(self.records_refilled) >= TENTH {
+        let tenths = monotonic.wrapping_sub(self.records_refilled) / TENTH;
+        if tenths > 0 {
             self.records_refilled = monotonic;
-            let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH);
+            let portions = u32::try_from(tenths.min(UNKNOWN_PORTIONS)).unwrap_or(1);
+            let (budget, amount) = (Budget::Records, UNKNOWN_RECORDS_PER_TENTH * portions);
             self.each_filter(|filter| filter.set_unknown_budget(budget, amount));
         }
     }

@@ -18,8 +18,8 @@ use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::snapshot::SocketFacts;
 
-/// Interval of looking for new sockets.
-const PERIOD: u64 = 2 * SECOND;
+/// Interval of looking for new sockets: every second round of an idle agent.
+const PERIOD: u64 = 19 * SECOND / 10;
 /// Interval of reading all owners again: sockets are closed, and count their drops.
 const ALL_PERIOD: u64 = 15 * SECOND;
 /// Most queries for the owner of a socket that was not found.

@@ -273,7 +273,7 @@ mod tests {
                 ..Snapshot::default()
             };
             let state = State {
-                snapshot: Some(snapshot),
+                snapshot: Some(Arc::new(snapshot)),
                 agent: AgentFacts::new(SourceKind::Wire, at),
             };
             figures.note(&state);

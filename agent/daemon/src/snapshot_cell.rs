@@ -30,6 +30,8 @@ pub struct SnapshotCell {
     past_wanted: AtomicU8,
     /// Whether a reader waits for a newer state.
     asked: AtomicBool,
+    /// Whether the state was read since [`Self::was_read`].
+    read: AtomicBool,
     bell: Arc<CaptureBell>,
     news: Notify,
 }
@@ -42,8 +44,9 @@ pub struct CaptureBell(Option<Bell>);
 /// State published by the capture thread.
 #[derive(Clone, Debug)]
 pub struct State {
-    /// State of the robot; `None` until the first snapshot.
-    pub snapshot: Option<Snapshot>,
+    /// State of the robot; `None` until the first snapshot. Without readers it is renewed every few
+    /// seconds and when the graph changes, but the state of the agent each second.
+    pub snapshot: Option<Arc<Snapshot>>,
     /// State of the agent.
     pub agent: AgentFacts,
 }
@@ -88,21 +91,34 @@ impl SnapshotCell {
             past: ArcSwap::default(),
             past_wanted: AtomicU8::new(0),
             asked: AtomicBool::new(false),
+            read: AtomicBool::new(false),
             bell: Arc::new(CaptureBell::new()),
             news: Notify::new(),
         }
     }
 
     /// Replaces the state, and returns the new one.
-    pub fn publish(&self, snapshot: Snapshot, agent: AgentFacts) -> Arc<State> {
+    pub fn publish(&self, snapshot: impl Into<Arc<Snapshot>>, agent: AgentFacts) -> Arc<State> {
         let state = Arc::new(State {
-            snapshot: Some(snapshot),
+            snapshot: Some(snapshot.into()),
             agent,
         });
         self.state.store(Arc::clone(&state));
         self.asked.store(false, Ordering::Relaxed);
         self.news.notify_waiters();
         state
+    }
+
+    /// Replaces the state of the agent alone. Readers that wait for a newer state go on waiting.
+    pub fn publish_agent(&self, agent: AgentFacts) {
+        let snapshot = self.state.load().snapshot.clone();
+        self.state.store(Arc::new(State { snapshot, agent }));
+    }
+
+    /// Returns whether the state was read since the last call.
+    #[must_use]
+    pub fn was_read(&self) -> bool {
+        self.read.swap(false, Ordering::Relaxed)
     }
 
     /// Counts one second, and returns whether the last seconds were read lately.
@@ -128,9 +144,16 @@ impl SnapshotCell {
         self.past.load_full()
     }
 
-    /// The latest state.
+    /// The latest state. A reader that returns every second gets a new one each time.
     #[must_use]
     pub fn state(&self) -> Arc<State> {
+        self.read.store(true, Ordering::Relaxed);
+        self.state.load_full()
+    }
+
+    /// The latest state, for a reader that needs the state of the agent alone.
+    #[must_use]
+    pub fn own_state(&self) -> Arc<State> {
         self.state.load_full()
     }
 
@@ -170,7 +193,7 @@ impl State {
     #[must_use]
     pub fn known(&self) -> &Snapshot {
         static NOTHING: LazyLock<Snapshot> = LazyLock::new(Snapshot::default);
-        self.snapshot.as_ref().unwrap_or(&NOTHING)
+        self.snapshot.as_deref().unwrap_or(&NOTHING)
     }
 
     /// Checks whether the state describes the robot at `now`.
@@ -254,7 +277,7 @@ mod tests {
         let start = Instant::now();
         let gone = "the cgroup /robot was removed".to_owned();
         let mut state = State {
-            snapshot: Some(Snapshot::default()),
+            snapshot: Some(Arc::default()),
             agent: AgentFacts {
                 gone: Some(gone.clone()),
                 ..AgentFacts::new(SourceKind::Host, start)
@@ -276,10 +299,35 @@ mod tests {
             ..AgentFacts::new(SourceKind::Replay, start)
         };
         let state = State {
-            snapshot: Some(Snapshot::default()),
+            snapshot: Some(Arc::default()),
             agent,
         };
         assert_eq!(state.ready(start + Duration::from_hours(1)), Ok(()));
+    }
+
+    #[tokio::test]
+    async fn a_new_state_of_the_agent_alone_is_not_what_a_reader_waits_for() {
+        let cell = SnapshotCell::new(SourceKind::Wire);
+        let start = Instant::now();
+        let at = |seconds| AgentFacts::new(SourceKind::Wire, start + Duration::from_secs(seconds));
+        let snapshot = Snapshot {
+            records: 7,
+            ..Snapshot::default()
+        };
+        cell.publish(snapshot, at(0));
+        assert!(!cell.was_read());
+        let mut news = Box::pin(cell.published());
+        assert!(futures_util::poll!(&mut news).is_pending());
+        cell.refresh(Duration::ZERO).await;
+        cell.publish_agent(at(3));
+        assert!(futures_util::poll!(&mut news).is_pending() && cell.is_asked());
+        let own = cell.own_state();
+        assert_eq!((own.known().records, own.agent.at), (7, at(3).at));
+        assert!(!cell.was_read(), "the snapshot was not read");
+        assert_eq!(cell.state().known().records, 7);
+        assert!(cell.was_read() && !cell.was_read());
+        cell.publish(Snapshot::default(), at(4));
+        news.await;
     }
 
     #[tokio::test]

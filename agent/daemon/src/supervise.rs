@@ -168,6 +168,7 @@ impl Supervisor {
 
         let _ = sd_notify::notify(&[NotifyState::Stopping]);
         self.stop.cancel();
+        self.sources.latest.bell().ring();
         let drained = timeout(DRAIN, async {
             if working {
                 let _ = (&mut worker.ended).await;
@@ -419,7 +420,7 @@ impl Watchdog {
     /// ready.
     fn check(&mut self, latest: &SnapshotCell, events: &EventLog) -> bool {
         let now = Instant::now();
-        let state = latest.state();
+        let state = latest.own_state();
         let ready = state.ready(now);
         for event in self.sight.check(&ready, state.agent.attached_anew, now) {
             events.record(event);

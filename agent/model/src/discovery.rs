@@ -22,9 +22,7 @@ use std::time::Duration;
 
 use ros2probe_wire::discovery::{EndpointAnnouncement, ParticipantAnnouncement};
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{
-    DomainId, EntityId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp,
-};
+use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
@@ -33,7 +31,7 @@ use super::size::Size;
 use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;
-use eviction::{MAX_SILENCE, Newcomer, Table, Victims};
+use eviction::{Newcomer, Table, Victims};
 use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
 pub use memory::{Memory, hexadecimal};
@@ -421,22 +419,21 @@ impl Discovery {
         self.remove(guid.prefix, origin.at, Some(Event::Disposed), journal);
     }
 
+    /// Returns the end of the lease that ends first, as far as participants were heard.
+    pub fn next_expiry(&self) -> Option<Timestamp> {
+        let participants = self.participants.values();
+        participants
+            .filter_map(|participant| participant.lease_end())
+            .min()
+    }
+
     /// Removes participants whose lease has expired at `now`.
     pub fn advance(&mut self, now: Timestamp, journal: &mut Journal) {
         let mut expired: Vec<_> = self
             .participants
             .iter()
-            .filter_map(|(prefix, participant)| {
-                let lease = match participant.proxy.lease {
-                    RtpsDuration::Finite(lease) => lease,
-                    // The restored participant may have stopped while no agent ran, so its infinite
-                    // lease is limited.
-                    RtpsDuration::Infinite if participant.restored.is_some() => MAX_SILENCE,
-                    RtpsDuration::Infinite => return None,
-                };
-                let end = participant.last_seen + lease;
-                (end <= now).then_some((end, *prefix))
-            })
+            .filter_map(|(prefix, participant)| Some((participant.lease_end()?, *prefix)))
+            .filter(|(end, _)| *end <= now)
             .collect();
         expired.sort_unstable();
         for (end, prefix) in expired {

@@ -35,7 +35,7 @@ impl Histogram {
 
     /// Adds a value in seconds.
     pub fn observe(&mut self, seconds: f64) {
-        if self.count() == 0 {
+        if self.counts.iter().all(|count| *count == 0) {
             (self.minimum, self.maximum) = (seconds, seconds);
         }
         let bucket = self.bounds().partition_point(|bound| seconds > *bound);

@@ -1,5 +1,5 @@
-//! Working thread of the agent: reads packets from the source, feeds the model, and publishes a
-//! snapshot once a second or on a scrape. Surfaces only read snapshots.
+//! Working thread of the agent: reads packets from the source, feeds the model, and publishes
+//! snapshots. Surfaces only read those.
 
 mod capture_time;
 pub mod replay;
@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use ros2probe_wire::{GuidPrefix, Timestamp};
 use tokio_util::sync::CancellationToken;
 
+use crate::agent_facts::AgentFacts;
 use crate::events::DropMonitor;
 use crate::events::EventLog;
 use crate::limit_facts::LimitFigures;
@@ -31,12 +32,19 @@ use ros2probe_model::selection::SampleRequest;
 use ros2probe_model::snapshot::Snapshot;
 pub use source::{Source, probe};
 
-/// Longest time without checking commands and the clock. Captured frames and a half-full record
-/// ring end it earlier. Each round costs a wake-up, and on a quiet host nothing else does.
+/// Longest time of a replay without checking commands.
 const SLICE: Duration = Duration::from_millis(250);
-/// Interval of snapshots without requests, and least interval with requests.
-const PUBLISH: Duration = Duration::from_secs(1);
+/// Longest time of a live source without checking commands and the clock. Captured frames, a
+/// half-full record ring and commands end it earlier. Each round costs a wake-up, and on a quiet
+/// host nothing else does.
+const SLICE_LIVE: Duration = Duration::from_secs(1);
+/// Least interval of snapshots without requests: they are due each second, give or take the delay
+/// of a wake-up.
+const PUBLISH: Duration = Duration::from_millis(900);
+/// Least interval of snapshots with requests.
 const PUBLISH_ASKED: Duration = Duration::from_millis(50);
+/// Longest interval of snapshots without a reader, while the graph does not change.
+const SNAPSHOT_UNREAD: Duration = Duration::from_secs(5);
 /// Longest interval of clock items to subscribers during silence.
 const SLICE_SUBSCRIBED: Duration = Duration::from_millis(90);
 const CLOCK_INTERVAL: Duration = Duration::from_millis(100);
@@ -68,6 +76,8 @@ pub struct Run {
     sample_requests: Option<Arc<Vec<SampleRequest>>>,
     /// Last clock item sent to subscriptions.
     published_until: Timestamp,
+    /// When the latest snapshot was taken, and the revision of the graph in it.
+    taken: Option<(Instant, u64)>,
     stop: CancellationToken,
     keeper: Option<StateWriter>,
     history: Option<History>,
@@ -107,6 +117,7 @@ impl Run {
             subscriptions,
             sample_requests: None,
             published_until: Timestamp::default(),
+            taken: None,
             stop,
             keeper: None,
             history: None,
@@ -160,7 +171,7 @@ impl Run {
             } else if subscribed {
                 SLICE_SUBSCRIBED
             } else {
-                SLICE
+                self.idle_slice()
             };
             let step = self.step(subscribed);
             let bell = self.outputs.latest.bell().descriptor();
@@ -183,10 +194,16 @@ impl Run {
             }
             let age = published.elapsed();
             let is_current = age < PUBLISH_ASKED && !self.source.is_paused();
-            let due = age >= PUBLISH || (!is_current && self.outputs.latest.is_asked());
+            let is_asked = !is_current && self.outputs.latest.is_asked();
             let held = self.source.reached_pause();
-            if finished || held || polled.is_err() || due {
-                self.publish();
+            let must = finished || held || polled.is_err() || is_asked;
+            if must || age >= PUBLISH {
+                if must || self.is_snapshot_due() {
+                    self.publish();
+                } else {
+                    let facts = self.facts();
+                    self.outputs.latest.publish_agent(facts);
+                }
                 published = Instant::now();
             }
             if held {
@@ -206,6 +223,17 @@ impl Run {
         self.hand_over();
         self.publish();
         Ok(())
+    }
+
+    /// Longest wait without requests: until the next decision of the model, or the end of a second.
+    fn idle_slice(&self) -> Duration {
+        if let Source::Replay(_) = self.source {
+            return SLICE;
+        }
+        let decision = self.observer.next_decision();
+        let second = self.history.as_ref().map(History::due);
+        let next = second.map_or(decision, |second| second.min(decision));
+        (next - self.source.clock()).min(SLICE_LIVE)
     }
 
     /// Next time at which a replay has to return: for a clock item to subscriptions, or at the end
@@ -299,6 +327,7 @@ impl Run {
                 self.observer.input(Input::ParticipantAlive(prefix, at));
             }
         }
+        let revision = self.observer.memory_revision();
         let mut snapshot = self.observer.snapshot(self.source.clock());
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
@@ -310,6 +339,23 @@ impl Run {
         if let Source::Live(live) = &mut self.source {
             follow(live, &mut self.followed, &snapshot);
         }
+        self.taken = Some((Instant::now(), revision));
+        let facts = self.facts();
+        let state = self.outputs.latest.publish(snapshot, facts);
+        self.outputs.limits.note(&state);
+    }
+
+    /// Returns whether the latest snapshot is read, or no longer describes the graph.
+    fn is_snapshot_due(&self) -> bool {
+        let was_read = self.outputs.latest.was_read();
+        let is_current = self.taken.is_some_and(|(at, revision)| {
+            at.elapsed() < SNAPSHOT_UNREAD && revision == self.observer.memory_revision()
+        });
+        was_read || !is_current || !matches!(self.source, Source::Live(_))
+    }
+
+    /// Returns the state of the agent, and reports what it has missed.
+    fn facts(&mut self) -> AgentFacts {
         let mut facts = self.source.facts();
         facts.subscriptions = self.subscriptions.facts();
         if let Some(keeper) = &mut self.keeper {
@@ -322,8 +368,7 @@ impl Run {
         for drop in self.drops.check(&facts, Instant::now()) {
             self.outputs.events.record(drop);
         }
-        let state = self.outputs.latest.publish(snapshot, facts);
-        self.outputs.limits.note(&state);
+        facts
     }
 }
 

@@ -123,7 +123,7 @@ pub(super) fn model(
     hidden_deliveries: usize,
     limits: &LimitFigures,
 ) -> fmt::Result {
-    let snapshot = state.snapshot.as_ref();
+    let snapshot = state.snapshot.as_deref();
     let tables = || snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
     sink.single(
         &metric::DATAGRAMS,

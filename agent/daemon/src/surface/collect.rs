@@ -21,7 +21,6 @@ use crate::limit_facts::LimitFigures;
 use crate::recording::RecordingFigures;
 use crate::settings_cell::{Settings, SettingsCell};
 use crate::snapshot_cell::SnapshotCell;
-use ros2probe_model::snapshot::Snapshot;
 
 /// Input of a collection. Each part has its own writer; only the agent's setup and the collections
 /// hold all parts.
@@ -74,8 +73,7 @@ pub(super) fn collect(
     previous: Duration,
 ) -> fmt::Result {
     let (state, settings) = (sources.latest.state(), sources.settings.settings());
-    let nothing = Snapshot::default();
-    let snapshot = state.snapshot.as_ref().unwrap_or(&nothing);
+    let snapshot = state.known();
     let rows = TopicRows::new(snapshot, &settings);
     let now = Instant::now();
 

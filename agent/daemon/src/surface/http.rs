@@ -276,7 +276,7 @@ fn encoding(headers: &HeaderMap) -> Encoding {
 }
 
 async fn readyz(Extract(pages): Extract<Pages>) -> Response {
-    let state = pages.latest.state();
+    let state = pages.latest.own_state();
     match state.ready(Instant::now()) {
         Ok(()) => match pages.limits.degraded(&state) {
             Some(reason) => format!("ready\ndegraded: {reason}\n").into_response(),

@@ -11,6 +11,7 @@ use ros2probe_wire::rtps::{Locator, VendorId};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsDuration, SequenceNumber, Timestamp};
 use serde::{Deserialize, Serialize};
 
+use super::eviction::MAX_SILENCE;
 use super::priority::Priority;
 use crate::names::{DdsName, NodeName, TypeName};
 
@@ -183,6 +184,16 @@ impl Participant {
             self.restored = None;
         }
         self.last_seen = self.last_seen.max(at);
+    }
+
+    /// Returns the end of its lease, unless it is heard before; `None` = never.
+    pub(super) fn lease_end(&self) -> Option<Timestamp> {
+        let lease = match self.proxy.lease {
+            RtpsDuration::Finite(lease) => lease,
+            // It may have stopped while no agent ran, so its infinite lease is limited.
+            RtpsDuration::Infinite => self.restored.map(|_| MAX_SILENCE)?,
+        };
+        Some(self.last_seen + lease)
     }
 
     /// Returns its priority in a full table.

@@ -27,6 +27,25 @@ impl Observer {
         }
     }
 
+    /// Returns when the next decision is due that may become an event: at a whole second, or when
+    /// a lease ends.
+    #[must_use]
+    pub fn next_decision(&self) -> Timestamp {
+        let second = Timestamp(self.clock.0 - self.clock.0 % SECOND + SECOND);
+        let second = self.wall_clock.wall_time(second);
+        self.next_expiry().map_or(second, |end| end.min(second))
+    }
+
+    /// Returns when the lease of a participant ends, unless it is heard before; the first one's.
+    /// Leases are checked at multiples of an interval.
+    #[must_use]
+    pub fn next_expiry(&self) -> Option<Timestamp> {
+        let end = self.discovery.next_expiry()?;
+        let tick = nanoseconds(TICK);
+        let end = Timestamp(end.0.div_ceil(tick).saturating_mul(tick));
+        Some(self.wall_clock.wall_time(end))
+    }
+
     /// Makes all open decisions at the end of the input, without elapsed time.
     pub(super) fn settle(&mut self) {
         let graph = graph!(self);

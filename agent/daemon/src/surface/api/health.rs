@@ -36,7 +36,7 @@ async fn health(State(context): State<Context>) -> Json<Health> {
     let state = context.latest.state();
     let instant = Instant::now();
     let ready = state.ready(instant);
-    let (agent, snapshot) = (&state.agent, state.snapshot.as_ref());
+    let (agent, snapshot) = (&state.agent, state.snapshot.as_deref());
     let interfaces = agent.interfaces.iter();
     let tables = snapshot.into_iter().flat_map(|snapshot| &snapshot.tables);
     let age = instant.saturating_duration_since(agent.at);

@@ -33,7 +33,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
     responses((status = 200, description = "Processes of this host.", body = ProcessList))
 )]
 async fn list(State(context): State<Context>) -> Result<Json<ProcessList>, Problem> {
-    let ids = local(context.latest.state().known());
+    let ids = local(context.state().await.known());
     let read = tokio::task::spawn_blocking(move || read(ids)).await;
     read.map(Json)
         .map_err(|_| Problem::new(Code::Ending, "the agent is shutting down"))

@@ -71,7 +71,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn list(State(context): State<Context>) -> Json<WatchList> {
     let (state, in_force) = (context.state().await, context.watches.in_force());
-    let snapshot = state.snapshot.as_ref();
+    let snapshot = state.snapshot.as_deref();
     let watches = in_force.entries().iter().map(|entry| view(entry, snapshot));
     Json(WatchList {
         watches: watches.collect(),
@@ -99,7 +99,7 @@ async fn show(
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
-    Ok(Json(view(entry, state.snapshot.as_ref())))
+    Ok(Json(view(entry, state.snapshot.as_deref())))
 }
 
 /// Watch a topic
@@ -273,7 +273,10 @@ fn answer(
     });
     let state = context.latest.state();
     // A new watch is in no snapshot yet; an entry of that name belongs to an earlier watch.
-    let snapshot = state.snapshot.as_ref().filter(|_| done == Done::Unchanged);
+    let snapshot = state
+        .snapshot
+        .as_deref()
+        .filter(|_| done == Done::Unchanged);
     let body = Json(view(&entry, snapshot));
     Ok(match done {
         Done::Added => {

@@ -6,7 +6,7 @@ use ros2probe_model::input::Input;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{Guid, Timestamp};
 
-use super::{ALICE, Dice, START, WRITER, World, alice};
+use super::{ALICE, BOB, Dice, START, WRITER, World, alice};
 
 #[test]
 fn a_clock_that_is_set_an_hour_forward_or_back_ends_no_lease_and_delays_none() {
@@ -96,4 +96,44 @@ fn the_same_input_gives_the_same_facts() {
         )
     };
     assert_eq!(replay(), replay());
+}
+
+#[test]
+fn an_agent_that_sleeps_until_the_next_decision_reports_every_event_in_time() {
+    // Events with their times, the time at which each was reported, and the number of rounds.
+    let silence = |sleep: &dyn Fn(&World) -> u64| {
+        let mut world = World::new(&["/chatter"]);
+        for (prefix, lease_seconds) in [(ALICE, 3), (BOB, 2)] {
+            world.spdp(prefix, lease_seconds);
+        }
+        world.sedp(alice(WRITER), "rt/chatter");
+        world.stream(alice(WRITER), 1..=97);
+        // Number 98 is lost, and nothing follows the last one.
+        world.stream(alice(WRITER), 99..=120);
+        world.observer.drain();
+        let (end, mut rounds) = (world.now + 15 * SECOND, 0);
+        let mut events = Vec::new();
+        while world.now < end {
+            world.now = sleep(&world).min(end);
+            let now = world.now;
+            world.observer.input(Input::Time(Timestamp(now)));
+            rounds += 1;
+            let news = world.observer.drain().events.events.into_iter();
+            events.extend(news.map(|event| (event.at, format!("{:?}", event.kind), now)));
+        }
+        (events, rounds)
+    };
+    let (careful, _) = silence(&|world| world.now + MILLISECOND);
+    let (lazy, rounds) = silence(&|world| world.observer.next_decision().0);
+    assert!(careful.len() >= 4, "{careful:#?}");
+    for what in ["Loss", "Expired"] {
+        assert!(careful.iter().any(|(_, kind, _)| kind.contains(what)));
+    }
+    assert_eq!(lazy.len(), careful.len());
+    for (lazy, careful) in lazy.iter().zip(&careful) {
+        assert_eq!((lazy.0, &lazy.1), (careful.0, &careful.1));
+        assert!(lazy.2 <= careful.2, "{lazy:?} {careful:?}");
+    }
+    // One for each second, and one for each lease.
+    assert!(rounds <= 15 + 2 + 1, "{rounds}");
 }
