@@ -4,8 +4,8 @@
 //! Everything behind `/proc/<pid>/root` is untrusted, so links are not followed there.
 
 use std::collections::{HashMap, HashSet};
-use std::fs::{self, Metadata};
-use std::os::unix::fs::{DirEntryExt as _, MetadataExt as _};
+use std::fs::{self, File, Metadata};
+use std::os::unix::fs::{DirEntryExt as _, FileExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
@@ -27,13 +27,13 @@ const MAX_LISTED: usize = 65_536;
 const COARSE: Duration = Duration::from_secs(1);
 /// Number of rounds in which a new process may still be mounting directories; afterwards it is
 /// inspected only once per so many rounds.
-const MOUNTING_ROUNDS: u32 = 10;
+const MOUNTING_ROUNDS: u32 = 5;
 const ROUNDS: u32 = 32;
 /// Levels of cgroups and processes of a scope that are visited.
 const DEPTH: usize = 8;
 const MAX_PROCESSES: usize = 8192;
 /// Rounds after a new process in which it may still move to a cgroup in scope.
-const MOVING_ROUNDS: u32 = 10;
+const MOVING_ROUNDS: u32 = 3;
 /// Most rounds without a new process that use the same list of processes.
 const SAME_ROUNDS: u32 = 5;
 
@@ -94,6 +94,8 @@ pub struct ShmDirectories {
     newest: NewestProcess,
     /// Visited processes with their directory and the number of visits.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
+    /// Whether a process may still be mounting directories.
+    is_mounting: bool,
     /// Directories and files skipped because of a cap.
     pub left_out: u64,
 }
@@ -173,12 +175,27 @@ impl ShmDirectories {
             listed: Vec::new(),
             newest: NewestProcess::default(),
             processes: HashMap::new(),
+            is_mounting: false,
             left_out: 0,
+        }
+    }
+
+    /// Finds the directories of shared memory as [`Self::find`] does, unless no process is new: a
+    /// directory whose path led through an ended process may be missed for some rounds.
+    pub fn find_new(&mut self) {
+        self.newest.look();
+        if self.newest.lists || self.is_mounting || matches!(self.scope, Scope::Directories(_)) {
+            self.go_through_scope();
         }
     }
 
     /// Finds the directories of shared memory, and forgets those that no living process reaches.
     pub fn find(&mut self) {
+        self.newest.look();
+        self.go_through_scope();
+    }
+
+    fn go_through_scope(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;
         }
@@ -208,7 +225,7 @@ impl ShmDirectories {
 
     /// Visits the processes in scope. They are listed again if there may be others.
     fn go_through_processes(&mut self) {
-        if self.newest.may_have_changed(newest_process()) {
+        if self.newest.lists {
             self.listed = self.scope.processes();
             // The agent itself may be in a cgroup in scope, but shares nothing.
             if matches!(self.scope, Scope::Cgroup(_)) {
@@ -222,8 +239,10 @@ impl ShmDirectories {
 
     fn go_through(&mut self, processes: &[u32]) {
         let before = std::mem::take(&mut self.processes);
+        self.is_mounting = false;
         for &pid in processes {
             let (known, met) = before.get(&pid).copied().unwrap_or((None, 0));
+            self.is_mounting |= met <= MOUNTING_ROUNDS;
             let is_settled = met > MOUNTING_ROUNDS && met % ROUNDS != pid % ROUNDS;
             let directory = match known.and_then(|id| self.directories.get_mut(&id)) {
                 // Its path may lead through another process, which may have ended.
@@ -380,15 +399,28 @@ impl ShmDirectory {
 /// Tracks the newest process, so that processes are listed only if there may be others.
 #[derive(Debug, Default)]
 struct NewestProcess {
+    /// `/proc/loadavg`, open for further reads.
+    file: Option<File>,
     id: Option<u32>,
+    /// Whether the processes are to be listed.
+    lists: bool,
     /// Rounds since another one was seen, and since the processes were listed.
     rounds: u32,
     same: u32,
 }
 
 impl NewestProcess {
-    /// Returns whether the processes are to be listed, given the id of the newest one.
-    fn may_have_changed(&mut self, newest: Option<u32>) -> bool {
+    /// Reads the id of the newest process.
+    fn look(&mut self) {
+        if self.file.is_none() {
+            self.file = File::open("/proc/loadavg").ok();
+        }
+        let newest = self.file.as_ref().and_then(newest_process);
+        self.note(newest);
+    }
+
+    /// Decides whether the processes are to be listed, given the id of the newest one.
+    fn note(&mut self, newest: Option<u32>) {
         let is_new = newest.is_none() || newest != self.id;
         self.id = newest;
         self.rounds = if is_new {
@@ -397,18 +429,19 @@ impl NewestProcess {
             self.rounds.saturating_add(1)
         };
         self.same += 1;
-        let lists = self.rounds <= MOVING_ROUNDS || self.same >= SAME_ROUNDS;
-        if lists {
+        self.lists = self.rounds <= MOVING_ROUNDS || self.same >= SAME_ROUNDS;
+        if self.lists {
             self.same = 0;
         }
-        lists
     }
 }
 
 /// Returns the id of the process or thread created last in this PID namespace or below, the last
 /// word of `/proc/loadavg` (proc_loadavg(5)); `None` if it is unknown.
-fn newest_process() -> Option<u32> {
-    let line = fs::read_to_string("/proc/loadavg").ok()?;
+fn newest_process(loadavg: &File) -> Option<u32> {
+    let mut line = [0; 128];
+    let len = loadavg.read_at(&mut line, 0).ok()?;
+    let line = std::str::from_utf8(line.get(..len)?).ok()?;
     line.split_whitespace().last()?.parse().ok()
 }
 
@@ -442,16 +475,23 @@ mod tests {
     fn processes_are_listed_again_after_a_new_one_and_now_and_then() {
         let mut newest = NewestProcess::default();
         let mut lists = |id, rounds: u32| {
-            let rounds = (0..rounds).filter(|_| newest.may_have_changed(id));
+            let rounds = (0..rounds).filter(|_| {
+                newest.note(id);
+                newest.lists
+            });
             rounds.count()
         };
-        assert_eq!(lists(Some(7), MOVING_ROUNDS + 1), 11);
+        assert_eq!(lists(Some(7), MOVING_ROUNDS + 1), 4);
         assert_eq!(lists(Some(7), 4 * SAME_ROUNDS), 4);
         assert_eq!(lists(Some(8), 1), 1);
-        assert_eq!(lists(Some(8), MOVING_ROUNDS), 10);
+        assert_eq!(lists(Some(8), MOVING_ROUNDS), 3);
         // Unknown: always.
         assert_eq!(lists(None, 40), 40);
-        assert!(newest_process().is_some());
+        newest.look();
+        let (file, id) = (newest.file.as_ref().unwrap(), newest.id.unwrap());
+        // Read again, not remembered.
+        std::process::Command::new("true").status().unwrap();
+        assert_ne!(newest_process(file).unwrap(), id);
     }
 
     #[test]

@@ -445,7 +445,11 @@ impl Tap {
         let finds = now.saturating_sub(self.found) >= every || self.found == 0;
         if finds {
             self.found = now;
-            self.directories.find();
+            if self.ports.is_empty() && self.unborn.is_empty() {
+                self.directories.find_new();
+            } else {
+                self.directories.find();
+            }
             self.abandoned.clear();
         }
         if !self.directories.list() && !finds {
