@@ -38,7 +38,7 @@ pub(super) fn check(node: &Node, path: &str, schema: &Value, root: &Value, found
         match choices.iter().find(|choice| allows(choice, node)) {
             Some(choice) => check(node, path, choice, root, found),
             None => {
-                let expected: Vec<&str> = choices.into_iter().flat_map(expected).collect();
+                let expected: Vec<_> = choices.into_iter().flat_map(expected).collect();
                 wrong_kind(node, path, &expected, found);
             }
         }
@@ -137,7 +137,7 @@ fn check_scalar(node: &Node, text: &str, path: &str, schema: &Value, found: &mut
     }
 }
 
-fn wrong_kind(node: &Node, path: &str, expected: &[&str], found: &mut Mistakes) {
+fn wrong_kind(node: &Node, path: &str, expected: &[String], found: &mut Mistakes) {
     let message = format!("is {}, must be {}", node.describe(), expected.join(" or "));
     found.add(node.position, path, message);
 }
@@ -215,15 +215,18 @@ fn allows(schema: &Value, node: &Node) -> bool {
     }
 }
 
-/// Names of the allowed kinds. Empty sections are always allowed and not listed.
-fn expected(schema: &Value) -> Vec<&'static str> {
+/// Names of the allowed kinds, with the words of an enumeration. Empty sections are always allowed
+/// and not listed.
+fn expected(schema: &Value) -> Vec<String> {
+    let listed: Vec<_> = words(schema).collect();
     let words = |kind: &&str| match *kind {
-        "array" => Some("a list"),
-        "object" => Some("a map of keys"),
-        "boolean" => Some("true or false"),
-        "integer" => Some("a whole number"),
-        "number" => Some("a number"),
-        "string" => Some("text"),
+        "array" => Some("a list".to_owned()),
+        "object" => Some("a map of keys".to_owned()),
+        "boolean" => Some("true or false".to_owned()),
+        "integer" => Some("a whole number".to_owned()),
+        "number" => Some("a number".to_owned()),
+        "string" if listed.is_empty() => Some("text".to_owned()),
+        "string" => Some(format!("one of {}", listed.join(", "))),
         _ => None,
     };
     kinds(schema).iter().filter_map(words).collect()

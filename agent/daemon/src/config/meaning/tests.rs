@@ -54,7 +54,11 @@ fn the_ros2_daemon_is_a_word_or_a_map() {
     );
     assert_eq!(
         report("ros2_daemon: 3"),
-        "f:1:14: ros2_daemon: is `3`, must be text or a map of keys"
+        "f:1:14: ros2_daemon: is `3`, must be one of on, off or a map of keys"
+    );
+    assert_eq!(
+        report("ros2_daemon: {enabled: true}"),
+        "f:1:24: ros2_daemon.enabled: is `true`, must be one of on, off"
     );
     assert_eq!(
         report("ros2_daemon: {distro: noetic}"),
