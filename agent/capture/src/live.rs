@@ -94,6 +94,8 @@ pub struct LiveSource {
     wanted_asked: u64,
     /// Whether the requests may have changed since.
     wanted_waits: bool,
+    /// When the programs' times of participants were last read for a lease.
+    heard: u64,
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
@@ -170,6 +172,7 @@ impl LiveSource {
             records_refilled: 0,
             wanted_asked: 0,
             wanted_waits: false,
+            heard: 0,
             refused_updates: 0,
             clock: clocks.now,
             clocks,
@@ -291,7 +294,10 @@ impl LiveSource {
         // Any message renews a lease. If this process did not read for long, its rings may have
         // been too small for the announcements.
         let clock = self.clock;
-        if held_up || observer.next_expiry().is_some_and(|end| end <= clock) {
+        let ends = observer.next_expiry().is_some_and(|end| end <= clock);
+        let is_due = clocks.monotonic.wrapping_sub(self.heard) >= TENTH;
+        if held_up || ends && is_due {
+            self.heard = clocks.monotonic;
             for (prefix, at) in self.last_seen() {
                 observer.input(Input::ParticipantAlive(prefix, at));
             }

@@ -37,13 +37,13 @@ impl Observer {
     }
 
     /// Returns when the lease of a participant ends, unless it is heard before; the first one's.
-    /// Leases are checked at multiples of an interval.
+    /// Leases are checked at multiples of an interval, also those that end at once.
     #[must_use]
     pub fn next_expiry(&self) -> Option<Timestamp> {
         let end = self.discovery.next_expiry()?;
         let tick = nanoseconds(TICK);
         let end = Timestamp(end.0.div_ceil(tick).saturating_mul(tick));
-        Some(self.wall_clock.wall_time(end))
+        Some(self.wall_clock.wall_time(end.max(self.clock + TICK)))
     }
 
     /// Makes all open decisions at the end of the input, without elapsed time.

@@ -4,7 +4,7 @@ use ros2probe_model::churn;
 use ros2probe_model::event::EventKind;
 use ros2probe_model::input::Input;
 use ros2probe_wire::time::{MILLISECOND, SECOND};
-use ros2probe_wire::{Guid, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::{ALICE, BOB, Dice, START, WRITER, World, alice};
 
@@ -106,6 +106,10 @@ fn an_agent_that_sleeps_until_the_next_decision_reports_every_event_in_time() {
         for (prefix, lease_seconds) in [(ALICE, 3), (BOB, 2)] {
             world.spdp(prefix, lease_seconds);
         }
+        world.wait(0);
+        // A lease that has ended when it begins does not keep the agent awake.
+        world.spdp(GuidPrefix(*b"\x01\x0fhastyhasty"), 0);
+        assert!(world.observer.next_decision().0 >= world.now + 90 * MILLISECOND);
         world.sedp(alice(WRITER), "rt/chatter");
         world.stream(alice(WRITER), 1..=97);
         // Number 98 is lost, and nothing follows the last one.
