@@ -244,7 +244,7 @@ pair() {
         ln -sf "../$name"/{disk,vmlinuz,initrd} "$out/pair-$architecture"
         payload "pair-$architecture" "$architecture" pair.sh NUMBER=$number
         boot "pair-$architecture" "$architecture" "-netdev stream,id=net,server=$([ $number = 1 ] && echo on || echo off),addr.type=unix,addr.path=$wire -device virtio-net-pci,netdev=net,mac=52:54:00:00:00:0$number" &
-        while [ ! -e "$wire" ]; do sleep 0.2; done
+        until [ -e "$wire" ] || ! kill -0 $! 2>/dev/null; do sleep 0.2; done
     done
     wait
 }
@@ -272,6 +272,7 @@ main() {
         case " ${chosen/pair/pair arm64-6.1 amd64-6.1} " in *" $name "*) ;; *) continue ;; esac
         [ -n "$disks" ] || ls "$target/dist"/ros2probe_*_"$architecture.deb" >/dev/null 2>&1 ||
             die "no package for $architecture in $target/dist: run make dist"
+        [ -n "$disks" ] || step "$(cd "$target/dist" && date -r ros2probe_*_"$architecture.deb" '+the package of %F %T'), from make dist"
         emulate "$architecture"
         base "$architecture"
         disk "$name" "$architecture" "$suite" "$package"
