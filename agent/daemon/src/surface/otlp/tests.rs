@@ -157,7 +157,8 @@ async fn newer_points_take_the_place_of_those_a_slow_receiver_does_not_take() {
 
 #[tokio::test]
 async fn a_receiver_that_comes_later_gets_the_latest_and_one_that_never_comes_delays_no_end() {
-    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    // An address of its own: another test could get its port before it listens there.
+    let listener = TcpListener::bind("127.17.40.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     drop(listener);
     let (exports, exporter) = exporting(address, 1, "");
