@@ -64,7 +64,11 @@ test-corpus: ## tests against the whole corpus of captures in ROS2PROBE_FIXTURES
 
 test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
 	@.ci/prerequisites.sh test ros2
-	cargo nextest run --workspace --run-ignored only --filterset 'binary(humble)'
+	cargo nextest run --workspace --run-ignored only --filterset 'binary(humble) and not test(/^cost::/)'
+
+bench-ros2: ## what the agent and `ros2 topic hz` cost nodes of rmw_zenoh; ROUNDS=N (3) (needs root)
+	@.ci/prerequisites.sh test ros2
+	ROUNDS=$(or $(ROUNDS),3) cargo test --release --package ros2probe --test humble -- --ignored --nocapture cost::
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf
@@ -157,4 +161,4 @@ deny: ## licences, sources and known vulnerabilities of dependencies; DENY=bans 
 prerequisites: ## install what demo, test, dist, ebpf and fuzz need
 	@.ci/prerequisites.sh demo test dist ebpf fuzz
 
-.PHONY: help demo test test-fast test-corpus test-ros2 ebpf run page page-bench screenshots peers arm dist vm distcheck bench soak fuzz miri book deny prerequisites
+.PHONY: help demo test test-fast test-corpus test-ros2 bench-ros2 ebpf run page page-bench screenshots peers arm dist vm distcheck bench soak fuzz miri book deny prerequisites

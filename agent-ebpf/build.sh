@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Builds the kernel filter's object, or checks that the committed one is current.
+# Builds the objects with the kernel programs, or checks that the committed ones are current.
 #
-#   build.sh           rebuild filter.bpf.o and filter.bpf.sha256
-#   build.sh --check   fail if the sources do not build the committed object
-#   build.sh --stale   fail if a source has changed since the object was built (no toolchain)
+#   build.sh           rebuild each object (OBJECT.bpf.o) and its list (OBJECT.bpf.sha256)
+#   build.sh --check   fail if the sources do not build the committed objects
+#   build.sh --stale   fail if a source has changed since an object was built (no toolchain)
 #
-# filter.bpf.sha256 lists the toolchain and every file that the compiler read, with its checksum.
+# A list names the toolchain and every file that the compiler read, with its checksum.
 #
 # Needs bpf-linker and nightly (or the toolchain in NIGHTLY) with rust-src: `make prerequisites`
 # installs them. LLVM_PREFIX names the directory of LLVM's tools, unless they are in PATH or where
@@ -13,14 +13,18 @@
 set -euo pipefail
 cd "$(dirname "$0")"
 
+objects="filter inside"
 nightly=${NIGHTLY:-nightly}
 strip=${LLVM_PREFIX:-/usr/lib/llvm-22}/bin/llvm-strip
 [ -x "$strip" ] || strip=llvm-strip
 
 if [ "${1:-}" = --stale ]; then
-    sha256sum --check --quiet --strict filter.bpf.sha256 && exit 0
-    echo "agent-ebpf/filter.bpf.o is older than its sources: run 'make ebpf' and commit it" >&2
-    exit 1
+    for object in $objects; do
+        sha256sum --check --quiet --strict "$object.bpf.sha256" && continue
+        echo "agent-ebpf/$object.bpf.o is older than its sources: run 'make ebpf' and commit it" >&2
+        exit 1
+    done
+    exit 0
 fi
 
 separator=$'\x1f'
@@ -33,10 +37,6 @@ done
 flags+="${separator}--remap-path-prefix=$(rustc "+$nightly" --print sysroot)=/rust"
 CARGO_ENCODED_RUSTFLAGS="$flags" cargo "+$nightly" build --quiet --release --locked \
     --target bpfel-unknown-none -Z build-std=core
-built=target/bpfel-unknown-none/release/filter
-# The linker needs the debug information to write BTF; the object does not contain it.
-"$strip" --strip-debug "$built"
-
 # Cargo's dep-info names the compiled files; each file's manifest is the nearest one above it.
 sources() {
     local file directory
@@ -56,21 +56,27 @@ list() {
     sources | LC_ALL=C sort -u | xargs -d '\n' sha256sum
 }
 
-if [ "${1:-}" = --check ]; then
-    if [ "$(toolchain)" != "$(head -n 1 filter.bpf.sha256)" ]; then
-        ./build.sh --stale
-        echo "agent-ebpf/filter.bpf.o: sources unchanged and they build here; the bytes are not compared,"
-        echo "    because another toolchain built it: $(head -n 1 filter.bpf.sha256), here $(toolchain)"
-    elif ! cmp -s "$built" filter.bpf.o; then
-        echo "agent-ebpf/filter.bpf.o does not match its sources: run 'make ebpf' and commit it" >&2
-        exit 1
-    elif ! list | cmp -s - filter.bpf.sha256; then
-        echo "agent-ebpf/filter.bpf.o is current; its list of sources is not ('make ebpf' renews it)"
+for object in $objects; do
+    built=target/bpfel-unknown-none/release/$object
+    committed=$object.bpf
+    # The linker needs the debug information to write BTF; the object does not contain it.
+    "$strip" --strip-debug "$built"
+    if [ "${1:-}" = --check ]; then
+        if [ "$(toolchain)" != "$(head -n 1 "$committed.sha256")" ]; then
+            ./build.sh --stale
+            echo "agent-ebpf/$committed.o: sources unchanged and they build here; the bytes are not compared,"
+            echo "    because another toolchain built it: $(head -n 1 "$committed.sha256"), here $(toolchain)"
+        elif ! cmp -s "$built" "$committed.o"; then
+            echo "agent-ebpf/$committed.o does not match its sources: run 'make ebpf' and commit it" >&2
+            exit 1
+        elif ! list | cmp -s - "$committed.sha256"; then
+            echo "agent-ebpf/$committed.o is current; its list of sources is not ('make ebpf' renews it)"
+        else
+            echo "agent-ebpf/$committed.o is current"
+        fi
     else
-        echo "agent-ebpf/filter.bpf.o is current"
+        cp "$built" "$committed.o"
+        list > "$committed.sha256"
+        echo "agent-ebpf/$committed.o: $(stat -c %s "$committed.o") bytes"
     fi
-else
-    cp "$built" filter.bpf.o
-    list > filter.bpf.sha256
-    echo "agent-ebpf/filter.bpf.o: $(stat -c %s filter.bpf.o) bytes"
-fi
+done

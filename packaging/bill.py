@@ -95,21 +95,23 @@ def main(architecture, binary):
         component["purl"] = purl(crate)
         components.append(component)
     standard = "pkg:generic/rust-std@%s?target=%s" % (compiler, target)
-    kernel = "agent-ebpf/filter.bpf.o"
+    kernel = ["agent-ebpf/filter.bpf.o", "agent-ebpf/inside.bpf.o"]
     components += [
         {"type": "library", "bom-ref": standard, "name": "rust-std", "version": compiler,
          "description": "Rust's standard library for this target, with the musl and libunwind that come with it",
          "licenses": [{"expression": "MIT OR Apache-2.0"}], "purl": standard},
-        {"type": "file", "bom-ref": kernel, "name": kernel, "hashes": sha256(ROOT / kernel),
-         "description": "the kernel programs, committed as built"},
     ]
+    components += [
+        {"type": "file", "bom-ref": name, "name": name, "hashes": sha256(ROOT / name),
+         "description": "kernel programs, committed as built"}
+        for name in kernel]
     page = vendored()
     components += page
     dependencies = [{"ref": purl(crate), "dependsOn": sorted(map(purl, edges[crate]))} for crate in sorted(edges)]
     for dependency in dependencies:
         if dependency["ref"] == purl(program):
             dependency["dependsOn"] = sorted(
-                dependency["dependsOn"] + [standard, kernel] + [library["bom-ref"] for library in page])
+                dependency["dependsOn"] + [standard] + kernel + [library["bom-ref"] for library in page])
     time = datetime.fromtimestamp(int(os.environ["SOURCE_DATE_EPOCH"]), timezone.utc)
     bill = {
         "bomFormat": "CycloneDX",

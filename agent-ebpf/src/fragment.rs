@@ -13,9 +13,8 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{
-        FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, opaque, scratch,
-    },
+    instructions::opaque,
+    maps::{FLOWS, Flow, FlowKey, NEW_FLOW, Packet, Scratch, Working, copy, count, scratch},
     runs,
     verdict::{self, progress},
 };

@@ -8,14 +8,12 @@
 use aya_ebpf::{
     helpers::{
         bpf_ktime_get_ns,
-        generated::{
-            bpf_get_current_ancestor_cgroup_id, bpf_get_smp_processor_id, bpf_probe_read_user,
-        },
+        generated::{bpf_get_smp_processor_id, bpf_probe_read_user},
     },
     macros::map,
     maps::PerCpuArray,
 };
-use core::{arch::asm, mem::MaybeUninit};
+use core::mem::MaybeUninit;
 use ros2probe_wire::{
     filter::Counter,
     host::PIECE_BYTES,
@@ -24,15 +22,14 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{SLOTS, Scratch, claim_outgoing, count, piece, release, scratch, setting},
+    instructions::opaque,
+    maps::{SLOTS, Scratch, claim_outgoing, count, piece, release, scratch},
     pieces,
+    registers::{is_aarch64, register},
+    settings::is_within,
     verdict::{self, progress},
 };
 
-/// `maps::ARCHITECTURE`.
-const AARCH64: u32 = 1;
-/// Ancestor control groups that are compared.
-const LEVELS: i32 = 16;
 /// Submessages read per message; a message with more is captured.
 const SUBMESSAGES: u32 = 64;
 /// Bytes of a buffer's description in a list: an address and a length.
@@ -103,24 +100,6 @@ impl Bytes for Message {
     }
 }
 
-/// Reads a register at this offset of the program's context, in one instruction: the verifier
-/// requires a constant offset.
-macro_rules! register {
-    ($registers:expr, $place:literal) => {{
-        let value: u64;
-        // SAFETY: reads the program's context, of which the verifier allows every register.
-        unsafe {
-            asm!(
-                concat!("{0} = *(u64 *)({1} + ", $place, ")"),
-                out(reg) value,
-                in(reg) $registers,
-                options(readonly, nostack, preserves_flags),
-            );
-        }
-        value
-    }};
-}
-
 /// Results of [`shm_find`]; values cross a function boundary as `u32`.
 mod found {
     pub const NOWHERE: u32 = 0;
@@ -136,7 +115,7 @@ mod found {
 pub fn look(registers: *const u64, in_list: bool) {
     // The caller allocates the object that the call returns. On x86-64 its address is the first
     // argument, before `this`; on AArch64 it has its own register, so the arguments are x1 and x2.
-    let (message, len) = if setting!(ARCHITECTURE) == AARCH64 {
+    let (message, len) = if is_aarch64() {
         (register!(registers, 8), register!(registers, 16))
     } else {
         // rdx and rcx.
@@ -148,24 +127,6 @@ pub fn look(registers: *const u64, in_list: bool) {
     let Some(slot) = claim_outgoing() else { return };
     shm_message(slot, message, len as u32, u32::from(in_list));
     release(slot);
-}
-
-/// Returns whether the running process is in the observed control group.
-#[inline(always)]
-fn is_within() -> bool {
-    let within = setting!(WITHIN);
-    if within == 0 {
-        return true;
-    }
-    let mut level = 0;
-    while level < LEVELS {
-        // SAFETY: no preconditions.
-        if unsafe { bpf_get_current_ancestor_cgroup_id(level) } == within {
-            return true;
-        }
-        level += 1;
-    }
-    false
 }
 
 /// Handles one message of `len` bytes at `address`.
@@ -418,7 +379,7 @@ pub extern "C" fn shm_bridge(slot: u32, offset: u32, index: u32) -> u32 {
     let Some([byte]) = read::<[u8; 1]>(from) else {
         return 0;
     };
-    let index = crate::maps::opaque(index) as usize & (4 * BRIDGE - 1);
+    let index = opaque(index) as usize & (4 * BRIDGE - 1);
     // SAFETY: an index below the array's length.
     unsafe {
         *(&raw mut handed.bridge).cast::<u8>().add(index) = byte;

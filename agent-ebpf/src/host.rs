@@ -134,14 +134,21 @@ fn datagram(skb: *mut __sk_buff, slot: u32, at: u32) -> Option<()> {
     }
     (scratch.met, scratch.met_at) = (socket, now);
     if SOCKETS.get_ptr(socket).is_none() {
-        let met = Socket {
-            // SAFETY: `skb` is the program's context.
-            cgroup: unsafe { bpf_skb_cgroup_id(skb) },
-            rcvbuf_errors: 0,
-        };
-        let _ = SOCKETS.insert(socket, met, 0);
+        meet(skb, socket, 0);
     }
     Some(())
+}
+
+/// Shows a socket to user space, which looks up its process.
+#[inline(always)]
+pub fn meet(skb: *mut __sk_buff, socket: u64, is_stream: u64) {
+    let met = Socket {
+        // SAFETY: `skb` is the program's context.
+        cgroup: unsafe { bpf_skb_cgroup_id(skb) },
+        rcvbuf_errors: 0,
+        is_stream,
+    };
+    let _ = SOCKETS.insert(socket, met, 0);
 }
 
 /// Returns a token for the current datagram, and its socket's cookie. `named` counts per slot, and

@@ -4,7 +4,7 @@
 //! It is thin on purpose: `ros2probe_wire::walk`, which user space runs too, reads submessages and
 //! decides what happens to them. This crate adds the socket buffer, the maps and the fragments.
 //! Hooks: [`wire`] reads frames on interfaces, [`host_ingress`] and [`host_egress`] read datagrams
-//! at sockets. If enabled, [`shm_handed`] reads messages in the process that sends them.
+//! at sockets, [`zenoh_ingress`] and [`zenoh_egress`] TCP segments. If enabled, [`shm_handed`] reads messages in the process that sends them.
 //!
 //! It stays within what Linux 5.10 verifies: bounded loops, global functions that are verified
 //! once, reads of fixed size, no spin lock, no atomics that return a value.
@@ -16,15 +16,19 @@
 mod fragment;
 mod handed;
 mod host;
-mod inside;
+mod instructions;
+mod kernel_memory;
 mod maps;
-mod socket_full;
 mod owners;
 mod packet;
 mod pieces;
 mod reassembly;
+mod registers;
 mod runs;
+mod settings;
+mod socket_full;
 mod verdict;
+mod zenoh;
 
 use aya_ebpf::{
     EbpfContext as _,
@@ -35,8 +39,9 @@ use aya_ebpf::{
 use ros2probe_wire::filter::Counter;
 
 use crate::{
-    maps::{INTERFACES, WIRE, claim_incoming, count, count_outside, release, setting},
+    maps::{INTERFACES, NEW_INTERFACES, WIRE, claim_incoming, count, count_outside, release},
     packet::hook,
+    settings::setting,
 };
 
 /// `skb->pkt_type` of a frame that this host sends.
@@ -74,6 +79,21 @@ pub fn host_ingress(context: SkBuffContext) -> i32 {
 #[cgroup_skb(egress)]
 pub fn host_egress(context: SkBuffContext) -> i32 {
     host::look(context.skb.skb, hook::EGRESS);
+    1
+}
+
+/// Runs as [`host_ingress`] does, beside it, for TCP segments of Zenoh. Linux may show several
+/// segments of a connection as one packet.
+#[cgroup_skb(ingress)]
+pub fn zenoh_ingress(context: SkBuffContext) -> i32 {
+    zenoh::socket(context.skb.skb, hook::INGRESS);
+    1
+}
+
+/// Runs as [`zenoh_ingress`] does, for what a socket sends.
+#[cgroup_skb(egress)]
+pub fn zenoh_egress(context: SkBuffContext) -> i32 {
+    zenoh::socket(context.skb.skb, hook::EGRESS);
     1
 }
 
@@ -140,7 +160,7 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
     let accepted = match INTERFACES.get_ptr(interface) {
         // SAFETY: a map value pointer that was checked against null.
         Some(accepted) => unsafe { *accepted },
-        None => setting!(NEW_INTERFACES),
+        None => setting(&NEW_INTERFACES),
     };
     if accepted == 0 {
         count_outside(Counter::InterfaceExcluded, 1);
@@ -155,7 +175,14 @@ fn frame(skb: *mut __sk_buff) -> Option<i64> {
 #[inline(always)]
 fn claimed(skb: *mut __sk_buff, segments: u32, slot: u32) -> Option<i64> {
     if packet::parse(skb, slot, hook::WIRE) == 0 {
-        return Some(0);
+        if zenoh::frame(skb, slot, packet::start(skb)) == 0 {
+            return Some(0);
+        }
+        // SAFETY: the verifier rewrites reads of this field.
+        let len = unsafe { (*skb).len };
+        count(slot, Counter::ZenohFrames, 1);
+        count(slot, Counter::CapturedBytes, u64::from(len));
+        return Some(i64::from(len));
     }
     if segments > 1 {
         count(slot, Counter::Segmented, 1);

@@ -1,6 +1,6 @@
 //! The filter's maps and per-CPU state.
 
-use core::{arch::asm, cell::UnsafeCell};
+use core::cell::UnsafeCell;
 
 use aya_ebpf::{
     macros::map,
@@ -9,11 +9,16 @@ use aya_ebpf::{
 use ros2probe_wire::{
     Record,
     filter::{
-        COUNTER_SLOTS, Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY, PARTICIPANT_CAPACITY,
-        RUN_CAPACITY, UNKNOWN_CAPACITY,
+        COUNTER_SLOTS, Counter, FLOW_CAPACITY, INTEREST_CAPACITY, INTERFACE_CAPACITY,
+        PARTICIPANT_CAPACITY, RUN_CAPACITY, UNKNOWN_CAPACITY,
     },
     host::{PIECE_BYTES, Piece, SOCKET_CAPACITY, Socket},
     walk::Walk,
+};
+
+use crate::{
+    instructions::{add, opaque},
+    settings::setting,
 };
 
 /// `BPF_F_NO_PREALLOC`: user space alone fills this map, and it is mostly empty. No map of a
@@ -55,32 +60,12 @@ pub static PREEMPTED: u32 = 1;
 #[unsafe(no_mangle)]
 pub static IN_PLACE: u32 = 1;
 
-/// How the kernel lays out the registers of a call's arguments: 0 = x86-64, 1 = AArch64. Set by the
-/// loader.
-#[unsafe(no_mangle)]
-pub static ARCHITECTURE: u32 = 0;
-
-/// Messages in shared memory: restricts them to processes in or below this control group; 0 = all.
-/// Set by the loader.
-#[unsafe(no_mangle)]
-pub static WITHIN: u64 = 0;
-
-/// Reads a setting that the loader may have changed.
-macro_rules! setting {
-    ($name:ident) => {{
-        // SAFETY: a constant of the loaded object, never written while the program runs.
-        unsafe { core::ptr::read_volatile(&raw const $crate::maps::$name) }
-    }};
-}
-pub(crate) use setting;
-
 /// The wire hook's program, which the short socket filter tail-calls. Set by the loader.
 #[map]
 pub static WIRE: ProgramArray = ProgramArray::with_max_entries(1, 0);
 /// Writers and readers that user space has classified: GUID to `Verdict`.
 #[map]
-pub static INTEREST: HashMap<[u32; 4], u32> =
-    HashMap::with_max_entries(INTEREST_CAPACITY, 0);
+pub static INTEREST: HashMap<[u32; 4], u32> = HashMap::with_max_entries(INTEREST_CAPACITY, 0);
 /// Participants that user space knows: GUID prefix to the time of their last message.
 #[map]
 pub static PARTICIPANTS: HashMap<[u32; 3], u64> =
@@ -352,7 +337,7 @@ pub fn claim_outgoing() -> Option<u32> {
 /// bottom halves disabled, one after the other, except on kernels that preempt even that.
 #[inline(always)]
 pub fn claim_incoming() -> Option<u32> {
-    if setting!(PREEMPTED) == 0 {
+    if setting(&PREEMPTED) == 0 {
         return Some(0);
     }
     claim(0, OUTGOING_SLOT)
@@ -382,7 +367,7 @@ fn claim(first: u32, end: u32) -> Option<u32> {
 /// Releases a slot.
 #[inline(always)]
 pub fn release(slot: u32) {
-    if setting!(PREEMPTED) == 0 && slot < OUTGOING_SLOT {
+    if setting(&PREEMPTED) == 0 && slot < OUTGOING_SLOT {
         return;
     }
     if let Some(scratch) = SCRATCH.get_ptr_mut(slot) {
@@ -472,27 +457,6 @@ fn counter_of(slot: u32, counter: Counter) -> Option<*mut u64> {
     let index = slot * Counter::ALL.len() + counter as usize;
     // SAFETY: a map value pointer checked against null, and an index within the value.
     Some(unsafe { counters.cast::<u64>().add(index) })
-}
-
-/// Adds in one instruction, so that no other run comes between.
-#[inline(always)]
-pub fn add(to: *mut u64, by: u64) {
-    // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
-    // every BPF verifier accepts.
-    unsafe {
-        asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
-    }
-}
-
-/// Returns the same number with its bounds hidden from the optimizer, so that a mask that follows
-/// is kept and every verifier sees it.
-#[inline(always)]
-pub fn opaque(value: u32) -> u64 {
-    let mut value = u64::from(value);
-    // The assembly must not be empty: the verifier refuses line information without an instruction.
-    // SAFETY: changes nothing.
-    unsafe { asm!("{0} = {0}", inout(reg) value, options(pure, nomem, nostack, preserves_flags)) }
-    value
 }
 
 /// Copies a whole value from one map to another. Plain assignment would become a call of `memmove`,

@@ -7,7 +7,7 @@
 use aya_ebpf::helpers::generated::bpf_seq_write;
 use ros2probe_wire::host::{Layout, Owner};
 
-use crate::inside::{member, place, read};
+use crate::kernel_memory::{member, place, read};
 
 /// `S_IFMT` and `S_IFSOCK`.
 const KIND_OF_FILE: u16 = 0o170_000;

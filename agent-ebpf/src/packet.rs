@@ -6,7 +6,9 @@ use ros2probe_wire::{filter::Counter, walk};
 
 use crate::{
     PACKET_OUTGOING,
-    maps::{Packet, count, opaque, scratch, setting},
+    instructions::opaque,
+    maps::{IN_PLACE, Packet, count, scratch},
+    settings::setting,
 };
 
 /// Bytes of a datagram that [`in_place`] reads at most: the verifier requires a bound.
@@ -55,7 +57,7 @@ pub fn load<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
 /// Reads a value from the contiguous part of a datagram, without a helper call.
 #[inline(always)]
 fn in_place<T: Copy>(skb: *mut __sk_buff, offset: u32) -> Option<T> {
-    if setting!(IN_PLACE) == 0 {
+    if setting(&IN_PLACE) == 0 {
         // Packet taps may not read in place; the verifier skips what follows for them.
         return None;
     }
@@ -110,8 +112,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     };
     let packet = &mut scratch.get().packet;
     // SAFETY: the verifier rewrites reads of these fields.
-    let (pkt_type, protocol, interface) =
-        unsafe { ((*skb).pkt_type, (*skb).protocol, (*skb).ifindex) };
+    let (pkt_type, interface) = unsafe { ((*skb).pkt_type, (*skb).ifindex) };
     let host = at != hook::WIRE;
     // At a socket the packet type is unusable: a sent datagram does not have it yet.
     let outgoing = if host {
@@ -122,12 +123,7 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     packet.host = u32::from(host);
     packet.outgoing = u32::from(outgoing);
     packet.interface = interface;
-    // The kernel strips the outer VLAN tag of received frames; a second one is still there.
-    let start = if !host && !outgoing && (protocol == VLAN || protocol == SERVICE_VLAN) {
-        4
-    } else {
-        0
-    };
+    let start = if host { 0 } else { start(skb) };
     let Some(header) = load::<[u32; 5]>(skb, start) else {
         return 0;
     };
@@ -141,6 +137,19 @@ pub extern "C" fn parse(skb: *mut __sk_buff, slot: u32, at: u32) -> u32 {
     }
     count(slot, Counter::Frames, 1);
     1
+}
+
+/// Returns where the IP header of a frame begins. The kernel strips the outer VLAN tag of received
+/// frames; a second one is still there.
+#[inline(always)]
+pub fn start(skb: *mut __sk_buff) -> u32 {
+    // SAFETY: the verifier rewrites reads of these fields.
+    let (pkt_type, protocol) = unsafe { ((*skb).pkt_type, (*skb).protocol) };
+    if pkt_type != PACKET_OUTGOING && (protocol == VLAN || protocol == SERVICE_VLAN) {
+        4
+    } else {
+        0
+    }
 }
 
 /// Reads an IPv4 header (RFC 791).

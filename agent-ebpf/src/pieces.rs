@@ -10,7 +10,9 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    maps::{PIECES, PieceBuffer, count, opaque, piece, scratch, setting},
+    instructions::opaque,
+    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece, scratch},
+    settings::setting,
     verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
 };
 
@@ -94,7 +96,7 @@ pub extern "C" fn hand_over(skb: *mut __sk_buff, slot: u32, base: u32, offset: u
 pub fn publish(slot: u32, buffer: &mut PieceBuffer) -> u32 {
     let wake = if scratch(slot)
         .is_some_and(|mut scratch| scratch.get().walk.record.writer[3] != SPDP_WRITER)
-        || PIECES.query(AVAILABLE_DATA) > setting!(WAKE_PIECE_BYTES)
+        || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES)
     {
         FORCE_WAKEUP
     } else {

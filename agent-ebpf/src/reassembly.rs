@@ -21,8 +21,9 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    inside::{member, place, read},
-    maps::{INTEREST, add, copy, count_outside},
+    instructions::add,
+    kernel_memory::{member, place, read},
+    maps::{INTEREST, copy, count_outside},
     packet::IPV4_MAPPED,
     verdict::{spend, write_outside},
 };

@@ -16,8 +16,9 @@ use ros2probe_wire::{
 };
 
 use crate::{
-    inside::{member, place, read},
-    maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, add, count_outside, last, scratch},
+    instructions::add,
+    kernel_memory::{member, place, read},
+    maps::{Last, RECORDS_PER_DATAGRAM, SOCKETS, count_outside, last, scratch},
     verdict::write,
 };
 

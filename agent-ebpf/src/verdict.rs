@@ -9,12 +9,15 @@ use ros2probe_wire::{
 
 use crate::{
     host,
+    instructions::opaque,
     maps::{
         BUDGET, INTEREST, PARTICIPANTS, RECORDS, RECORDS_PER_DATAGRAM, Scratch, Shared, UNKNOWN,
-        copy, count, count_outside, opaque, scratch, setting,
+        WAKE_BYTES, copy, count, count_outside, scratch,
     },
     packet::{Payload, load},
     runs,
+    settings::setting,
+    zenoh,
 };
 
 /// Submessages that one run of the program reads; a datagram with more is captured.
@@ -46,7 +49,7 @@ pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32) -> u32 {
         return 0;
     };
     if begin(skb, slot, scratch.get()).is_none() {
-        return 0;
+        return zenoh::quic(skb, slot);
     }
     let begun = scratch.get();
     let (base, present) = (begun.packet.body + 8, begun.walk.datagram_len);
@@ -385,7 +388,7 @@ pub fn write_outside(record: &Record) {
 
 #[inline(always)]
 fn output(record: &Record) -> Counter {
-    let wake = if RECORDS.query(AVAILABLE_DATA) > setting!(WAKE_BYTES) {
+    let wake = if RECORDS.query(AVAILABLE_DATA) > setting(&WAKE_BYTES) {
         FORCE_WAKEUP
     } else {
         NO_WAKEUP

@@ -10,6 +10,7 @@ import { kept, keep, state, stream, useLive, useRoute } from './store.js';
 import { html, Mark } from './ui.js';
 import { TimeBar } from './timebar.js';
 import { Agent } from './views/agent.js';
+import { ChainView, Chains } from './views/chains.js';
 import { Events } from './views/events.js';
 import { Graph } from './views/graph.js';
 import { NodeView, Nodes } from './views/nodes.js';
@@ -26,7 +27,7 @@ applyTheme(theme);
 /** @type {[string, string, string][]} view, title, second key of its shortcut */
 const VIEWS = [
   ['', 'Overview', 'o'], ['topics', 'Topics', 't'], ['graph', 'Graph', 'g'],
-  ['nodes', 'Nodes', 'n'], ['events', 'Events', 'e'], ['recordings', 'Recordings', 'r'],
+  ['chains', 'Chains', 'c'], ['nodes', 'Nodes', 'n'], ['events', 'Events', 'e'], ['recordings', 'Recordings', 'r'],
   ['agent', 'Agent', 'a'],
 ];
 
@@ -65,7 +66,9 @@ function App() {
   }, []);
   const refused = stream.status === 'refused';
   useEffect(() => { if (refused) show('token'); }, [refused]);
-  const place = `${route?.view}/${route?.name}`;
+  // Chains of the same first topic are different places.
+  const rest = route?.view === 'chains' && route.name != null ? JSON.stringify(route.query) : '';
+  const place = `${route?.view}/${route?.name}${rest}`;
   const first = useRef(true);
   useEffect(() => {
     const [, title] = VIEWS.find(([view]) => view === route?.view) ?? ['', 'Not found'];
@@ -109,6 +112,9 @@ function View({ route }) {
       ? html`<${Topics} query=${query} />`
       : html`<${Topic} name=${route.name} query=${query} />`;
     case 'graph': return html`<${Graph} query=${query} />`;
+    case 'chains': return route.name == null
+      ? html`<${Chains} query=${query} />`
+      : html`<${ChainView} from=${route.name} query=${query} />`;
     case 'nodes': return route.name == null
       ? html`<${Nodes} query=${query} />`
       : html`<${NodeView} name=${route.name} query=${query} />`;

@@ -99,6 +99,28 @@ export class Camera {
     this.apply();
   }
 
+  /**
+   * Shows a part of the drawing as a whole, or its first place if it would be illegible.
+   * @param {{x: number, y: number, w: number, h: number}[]} places centres and sizes, in order
+   */
+  part(places) {
+    const [first] = places;
+    if (!first) return;
+    const [left, right] = [Math.min(...places.map(({ x, w }) => x - w / 2)),
+      Math.max(...places.map(({ x, w }) => x + w / 2))];
+    const [top, bottom] = [Math.min(...places.map(({ y, h }) => y - h / 2)),
+      Math.max(...places.map(({ y, h }) => y + h / 2))];
+    const { width, height } = this.view();
+    const scale = Math.min((width - 32) / (right - left), (height - 32) / (bottom - top), 1.2);
+    this.scale = Math.max(LEGIBLE, scale);
+    const isWhole = scale >= LEGIBLE;
+    this.x = isWhole ? width / 2 - ((left + right) / 2) * this.scale
+      : 16 - (first.x - first.w / 2) * this.scale;
+    this.y = height / 2 - (isWhole ? (top + bottom) / 2 : first.y) * this.scale;
+    this.fitted = false;
+    this.apply();
+  }
+
   /** Handles a key; returns whether it has a function here. @param {string} key */
   key(key) {
     const { width, height } = this.view();

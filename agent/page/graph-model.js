@@ -13,8 +13,9 @@ const HUBS = new Set(['rosout', 'parameter_events', 'tf', 'tf_static', 'clock', 
 /**
  * @typedef {{mode: 'both'|'nodes', hubs: boolean, hidden: boolean,
  *   boxes: 'none'|'namespace'|'process', toggled: Set<string>, focus: string|null,
- *   hops: number}} Options
- *   `toggled` holds the boxes whose initial state the user has changed.
+ *   hops: number, shown?: Set<string>, only?: boolean}} Options
+ *   `toggled` holds the boxes whose initial state the user has changed; `shown` what is neither
+ *   folded nor hidden. `only` omits everything else.
  * @typedef {{key: string, kind: 'node'|'participant'|'topic'|'service'|'action'|'box',
  *   name: string, detail: string, parent: string|null, topic: number|null, node: number|null,
  *   closed: boolean, count: number, members: string[], w: number, h: number}} Vertex
@@ -56,6 +57,10 @@ export function build(state, options, joints = null) {
   const near = options.focus ? around(base, options.focus, options.hops) : null;
   if (near) {
     for (const key of [...base.vertices.keys()]) if (!near.has(key)) base.vertices.delete(key);
+  }
+  const { shown } = options;
+  if (options.only && shown?.size) {
+    for (const key of [...base.vertices.keys()]) if (!shown.has(key)) base.vertices.delete(key);
   }
   const joined = base.edges.filter((edge) =>
     base.vertices.has(edge.from) && base.vertices.has(edge.to));
@@ -111,9 +116,10 @@ function gather(state, options, joints) {
   /** @type {Map<string, Edge>} */
   const known = new Map();
   let folded = 0;
+  const isShown = (/** @type {string} */ key) => options.focus === key || options.shown?.has(key);
   for (const node of state.nodes.values()) {
-    if (node.hidden && !options.hidden) continue;
     const key = nodeKey(node);
+    if (node.hidden && !options.hidden && !isShown(key)) continue;
     vertices.set(key, vertex(key, 'node', node.name, { node: node.id }));
   }
   const join = (/** @type {Omit<Edge, 'id'>} */ edge) => {
@@ -128,11 +134,10 @@ function gather(state, options, joints) {
     known.set(id, own);
     edges.push(own);
   };
-  const focused = options.focus;
   for (const topic of state.topics.values()) {
-    if (topic.vanished || (topic.hidden && !options.hidden)) continue;
     const key = topicKey(topic);
-    if (!options.hubs && isHub(topic.name) && focused !== key) {
+    if (topic.vanished || (topic.hidden && !options.hidden && !isShown(key))) continue;
+    if (!options.hubs && isHub(topic.name) && !isShown(key)) {
       folded += 1;
       continue;
     }
@@ -140,7 +145,7 @@ function gather(state, options, joints) {
     for (const side of /** @type {const} */ (['publishers', 'subscriptions'])) {
       for (const endpoint of topic[side]) {
         const owner = state.ownerOf(endpoint);
-        if (owner.node?.hidden && !options.hidden) continue;
+        if (owner.node?.hidden && !options.hidden && !isShown(owner.key)) continue;
         if (!vertices.has(owner.key)) {
           vertices.set(owner.key, vertex(owner.key, owner.node ? 'node' : 'participant',
             owner.name, { node: owner.node?.id ?? null }));

@@ -5,7 +5,7 @@
  *   `name` is that of the topic or node in the view, if any.
  */
 
-const VIEWS = ['', 'topics', 'graph', 'nodes', 'events', 'recordings', 'agent', 'token'];
+const VIEWS = ['', 'topics', 'graph', 'chains', 'nodes', 'events', 'recordings', 'agent', 'token'];
 
 /**
  * @param {string} fragment with or without its `#`

@@ -177,6 +177,11 @@ silent() {
     dmesg | grep -A 12 -E 'WARNING:|BUG:|Oops' | head -40 >warnings.txt
     [ -z "$figure" ]
 }
+# The kernel may refuse the programs for TCP alone.
+zenoh_observed() {
+    figure=$(journalctl -u ros2probe --no-pager -o cat | grep 'Zenoh are not observed' | head -1)
+    [ -z "$figure" ]
+}
 purged() {
     apt-get purge -y ros2probe >purge.log 2>&1
     figure=$(find /etc/ros2probe /var/lib/ros2probe /usr/bin/rp /lib/systemd/system/ros2probe.service 2>/dev/null | wc -l)
@@ -239,6 +244,7 @@ check threads confined
 check systemd-analyze exposed
 cp $config config.before
 if [ "$source" = host ]; then
+    check "programs for Zenoh" zenoh_observed
     check "counts at the sockets" at_sockets ./robot small 320 100 1000 --reliable
     ip link set lo mtu 1500
     check "DATA_FRAGs at MTU 1500" at_sockets ./robot large 100000 10 100 --reliable

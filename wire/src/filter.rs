@@ -64,11 +64,27 @@ pub enum Counter {
     NotReassembledUnnamed,
     /// Messages for shared memory that could not be read in their sender's memory.
     Unreadable,
+    /// Zenoh: batches that began in a followed direction of a connection.
+    ZenohBatches,
+    /// Zenoh: batches among them of which nothing was passed on.
+    ZenohSkipped,
+    /// Zenoh: chunks written to the ring.
+    ZenohChunks,
+    /// Zenoh: chunks lost because the ring was full.
+    ZenohChunksLost,
+    /// Zenoh: times that the boundary of a batch was lost, as after TCP segments out of order.
+    ZenohGaps,
+    /// Zenoh: places in other TCP connections that looked like a batch.
+    ZenohCandidates,
+    /// Zenoh: directions of connections found.
+    ZenohConnections,
+    /// Zenoh: frames of connections handed to user space, on interfaces.
+    ZenohFrames,
 }
 
 impl Counter {
     /// Every counter, in index order.
-    pub const ALL: [Self; 29] = [
+    pub const ALL: [Self; 37] = [
         Self::Frames,
         Self::Messages,
         Self::Ignored,
@@ -98,6 +114,14 @@ impl Counter {
         Self::NotReassembled,
         Self::NotReassembledUnnamed,
         Self::Unreadable,
+        Self::ZenohBatches,
+        Self::ZenohSkipped,
+        Self::ZenohChunks,
+        Self::ZenohChunksLost,
+        Self::ZenohGaps,
+        Self::ZenohCandidates,
+        Self::ZenohConnections,
+        Self::ZenohFrames,
     ];
 
     /// Returns the label value.
@@ -133,6 +157,14 @@ impl Counter {
             Self::NotReassembled => "not_reassembled",
             Self::NotReassembledUnnamed => "not_reassembled_unnamed",
             Self::Unreadable => "unreadable",
+            Self::ZenohBatches => "zenoh_batches",
+            Self::ZenohSkipped => "zenoh_skipped",
+            Self::ZenohChunks => "zenoh_chunks",
+            Self::ZenohChunksLost => "zenoh_chunks_lost",
+            Self::ZenohGaps => "zenoh_gaps",
+            Self::ZenohCandidates => "zenoh_candidates",
+            Self::ZenohConnections => "zenoh_connections",
+            Self::ZenohFrames => "zenoh_frames",
         }
     }
 }
@@ -162,6 +194,12 @@ pub const FLOW_CAPACITY: u32 = 1_024;
 pub const INTERFACE_CAPACITY: u32 = 1_024;
 /// Incomplete runs of DATA_FRAGs.
 pub const RUN_CAPACITY: u32 = 512;
+/// Directions of TCP connections of Zenoh that the filter follows.
+pub const CONNECTION_CAPACITY: u32 = 4_096;
+/// Directions of other TCP connections in which batches of Zenoh are searched for.
+pub const CANDIDATE_CAPACITY: u32 = 1_024;
+/// TCP ports of Zenoh that can be configured.
+pub const PORT_CAPACITY: usize = 8;
 /// Bytes captured per unclassified writer before it is only metered: enough for the whole
 /// `ros_discovery_info` burst of a starting node, or a few datagrams of a point cloud.
 pub const UNKNOWN_CAPTURE_BYTES: u32 = 256 * 1024;

@@ -1,8 +1,9 @@
-//! Parses a captured frame into a UDP datagram, or the piece of one that an IP fragment carries.
+//! Parses a captured frame into a UDP datagram, the piece of one that an IP fragment carries, or a
+//! TCP segment.
 //!
 //! Views only: nothing is copied or kept between frames, and checksums are not verified (transmit
-//! offload leaves them unset in captures). Reassembly happens elsewhere. Packets that are not UDP
-//! over IP are identified and not read.
+//! offload leaves them unset in captures). Reassembly happens elsewhere. Packets of other protocols
+//! are identified and not read.
 //!
 //! A capture may hold less of a frame than was on the wire. Every length here is the true one; the
 //! bytes beside it may be fewer.
@@ -102,8 +103,31 @@ pub enum Payload<'a> {
     Datagram(Datagram<'a>),
     /// A part of a UDP datagram.
     Fragment(Fragment<'a>),
-    /// Another protocol, by its IP protocol number.
+    /// A TCP segment, or several that segmentation offload shows as one.
+    Segment(Segment<'a>),
+    /// Another protocol, by its IP protocol number; also a TCP segment in IP fragments.
     Other(u8),
+}
+
+/// A TCP segment (RFC 9293, 3.1).
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Segment<'a> {
+    /// Port it was sent from.
+    pub source_port: u16,
+    /// Port it was sent to.
+    pub destination_port: u16,
+    /// Sequence number of the first byte, or of the SYN.
+    pub sequence_number: u32,
+    /// Whether the connection begins.
+    pub syn: bool,
+    /// Whether the sender sends nothing after this.
+    pub fin: bool,
+    /// Whether the connection is aborted.
+    pub rst: bool,
+    /// Captured bytes of the payload.
+    pub payload: &'a [u8],
+    /// True length of the payload.
+    pub length: u32,
 }
 
 /// A whole UDP datagram.

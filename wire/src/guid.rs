@@ -7,6 +7,8 @@ use core::fmt;
 
 use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout, Unaligned};
 
+use crate::rtps::VendorId;
+
 /// The 12 bytes that all entities of one participant share.
 #[derive(
     Clone,
@@ -29,6 +31,20 @@ pub struct GuidPrefix(pub [u8; 12]);
 impl GuidPrefix {
     /// All zero: "any participant" in INFO_DST (RTPS 2.5, 8.3.8.7).
     pub const UNKNOWN: Self = Self([0; 12]);
+
+    /// Returns the vendor in the first two bytes (RTPS 2.5, 9.3.1.5).
+    #[must_use]
+    pub const fn vendor(self) -> VendorId {
+        let [first, second, ..] = self.0;
+        VendorId([first, second])
+    }
+
+    /// Returns whether it stands for a session of Zenoh rather than a participant of DDS.
+    #[must_use]
+    pub const fn is_zenoh(self) -> bool {
+        let ([first, second], [z, e]) = (self.vendor().0, VendorId::ZENOH.0);
+        first == z && second == e
+    }
 }
 
 /// The entity within its participant; the last byte is its kind.

@@ -1,5 +1,5 @@
-//! Output of the host hook besides records: captured datagrams in pieces, and the sockets that
-//! receive and send them.
+//! Output of the host hook besides records: captured datagrams in pieces, chunks of the TCP
+//! connections of Zenoh, and the sockets that receive and send them.
 //!
 //! Shared binary layout with the kernel program. Words are in the host's byte order unless they
 //! hold wire bytes (addresses).
@@ -11,9 +11,27 @@ pub const PIECE_BYTES: u32 = 16_384;
 /// Sockets that the hook remembers.
 pub const SOCKET_CAPACITY: u32 = 4_096;
 
+/// Bits of [`Piece::chunk`].
+pub mod chunk {
+    /// A batch begins with the first byte.
+    pub const BOUNDARY: u16 = 1;
+    /// The bytes before it were left out on purpose: those samples are not needed.
+    pub const SKIPPED: u16 = 1 << 1;
+    /// Bytes before it were seen and could not be passed on, or not understood.
+    pub const LOST: u16 = 1 << 2;
+    /// The connection begins with these bytes.
+    pub const SYN: u16 = 1 << 3;
+    /// The sender sends nothing after these bytes.
+    pub const END: u16 = 1 << 4;
+    /// The bytes are the beginning of a UDP datagram, an Initial packet of QUIC.
+    pub const QUIC: u16 = 1 << 5;
+}
+
 /// One piece of a captured datagram; the bytes follow. Pieces of one datagram arrive in order of
 /// their offset with the same token; pieces of other datagrams may lie between them. If the last
 /// piece is missing, the ring was full.
+///
+/// With [`crate::record::flag::STREAM`] it is a chunk of a connection of Zenoh instead.
 #[derive(
     Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
 )]
@@ -27,24 +45,27 @@ pub struct Piece {
     pub source: [u32; 4],
     /// Destination address, in the same form.
     pub destination: [u32; 4],
-    /// Source UDP port.
+    /// Source port.
     pub source_port: u16,
-    /// Destination UDP port.
+    /// Destination port.
     pub destination_port: u16,
     /// Interface index in the socket's network namespace.
     pub interface: u32,
-    /// Token of the datagram, unique for some seconds, as in [`crate::Record::datagram`].
+    /// Token of the datagram, unique for some seconds, as in [`crate::Record::datagram`]. Of a
+    /// chunk: TCP sequence number of its first byte.
     pub datagram: u32,
-    /// Length of the whole UDP payload.
+    /// Length of the whole UDP payload, or of the chunk.
     pub datagram_len: u32,
-    /// Offset of this piece in the UDP payload.
+    /// Offset of this piece in the UDP payload; 0 for a chunk, of which only the beginning follows.
     pub offset: u32,
     /// Number of bytes that follow, at most [`PIECE_BYTES`].
     pub len: u32,
     /// Bits of [`crate::record::flag`].
     pub flags: u16,
+    /// Bits of [`chunk`].
+    pub chunk: u16,
     /// Zero.
-    pub unused: [u16; 3],
+    pub unused: [u16; 2],
 }
 
 const _: () = assert!(size_of::<Piece>() == 80 && align_of::<Piece>() == 8);
@@ -59,6 +80,8 @@ pub struct Socket {
     pub cgroup: u64,
     /// Datagrams dropped at its full buffer, RTPS or not.
     pub rcvbuf_errors: u64,
+    /// 1 = a TCP socket, whose drop counter counts no datagrams.
+    pub is_stream: u64,
 }
 
 /// A process that holds a socket, as the iterator over open files writes it.

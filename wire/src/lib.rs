@@ -1,5 +1,6 @@
 //! RTPS as ROS 2 uses it, read without joining: zero-copy, bounded parsers, the walk that decides
-//! what the kernel filter keeps, and the binary layouts shared by kernel and user space.
+//! what the kernel filter keeps, and the binary layouts shared by kernel and user space. [`zenoh`]
+//! reads the other protocol of ROS 2; the agent does not use it yet.
 //!
 //! No I/O, no clock, no log, no `unsafe`: bytes and a caller-given time in, typed values out. The
 //! kernel program builds this crate without `alloc`.
@@ -25,11 +26,13 @@ pub mod filter;
 pub mod frame;
 pub mod guid;
 pub mod host;
+pub mod inside;
 #[cfg(feature = "alloc")]
 pub mod names;
 pub mod parameters;
 #[cfg(feature = "alloc")]
 pub mod qos;
+pub mod quic;
 pub mod record;
 pub mod rtps;
 #[cfg(test)]
@@ -38,6 +41,8 @@ mod testing;
 mod text;
 pub mod time;
 pub mod walk;
+#[cfg(feature = "alloc")]
+pub mod zenoh;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
 pub use domain::DomainId;

@@ -72,6 +72,11 @@ pub mod flag {
     /// With [`SHM`]: read in the sending process, which shows every message of that process, so
     /// missing samples were not sent. Written by the kernel program.
     pub const EXACT: u16 = 1 << 10;
+    /// Carried by a TCP connection of Zenoh: a copy is for another receiver, never a repetition. Of a
+    /// [`crate::host::Piece`]: it is a chunk of such a connection.
+    pub const STREAM: u16 = 1 << 11;
+    /// With [`STREAM`]: sent to a router, which passes it on and is no subscriber.
+    pub const RELAYED: u16 = 1 << 12;
 }
 
 /// One submessage of one writer or reader. 136 bytes.

@@ -88,6 +88,14 @@ pub const fn nanoseconds(duration: Duration) -> u64 {
 pub struct RtpsTime(pub u64);
 
 impl RtpsTime {
+    /// Converts nanoseconds since the Unix epoch, so that [`Self::timestamp`] returns them again.
+    #[must_use]
+    pub const fn of(timestamp: Timestamp) -> Self {
+        let (seconds, rest) = (timestamp.0 / SECOND, timestamp.0 % SECOND);
+        // Rounds to nearest, as the way back does.
+        Self((seconds << 32) | (((rest << 32) + SECOND / 2) / SECOND))
+    }
+
     /// Returns nanoseconds since the Unix epoch; `None` for "no time".
     #[must_use]
     pub const fn timestamp(self) -> Option<Timestamp> {
@@ -176,6 +184,15 @@ mod tests {
     #[test]
     fn no_time_is_not_the_epoch() {
         assert_eq!(RtpsTime(0).timestamp(), None);
+        for nanoseconds in [
+            1,
+            999_999_999,
+            1_795_232_033_832_943_680,
+            4_000_000_000_999_999_999,
+        ] {
+            let time = RtpsTime::of(Timestamp(nanoseconds));
+            assert_eq!(time.timestamp(), Some(Timestamp(nanoseconds)));
+        }
         assert_eq!(
             RtpsTime(1 << 32 | 1 << 31).timestamp(),
             Some(Timestamp(1_500_000_000))

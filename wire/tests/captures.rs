@@ -198,7 +198,7 @@ fn datagrams(capture: &[u8], mut each: impl FnMut(&[u8])) -> bool {
                     each(&whole[8..]);
                 }
             }
-            frame::Payload::Other(_) => {}
+            frame::Payload::Segment(_) | frame::Payload::Other(_) => {}
         }
     }
     is_whole

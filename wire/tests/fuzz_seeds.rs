@@ -57,3 +57,8 @@ fn discovery_samples_survive() {
 fn entities_survive() {
     run("fuzz/seeds/entities", entry::entities);
 }
+
+#[test]
+fn zenoh_batches_survive() {
+    run("fuzz/seeds/zenoh", entry::zenoh);
+}

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Open;
 use crate::attributes::{Attributes, Value};
+use crate::inside::Trigger;
 
 /// A problem of the graph.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -65,6 +66,62 @@ pub enum Diagnosis<'a> {
         /// Domain ids in which the node appears.
         domains: Cow<'a, [u32]>,
     },
+    /// A callback runs longer than the period of its timer, or of a timer in the same thread.
+    SlowCallback {
+        /// Node of the callback; null when unknown.
+        node: Option<Cow<'a, str>>,
+        /// Its process.
+        process_id: u32,
+        /// What triggers it.
+        trigger: Trigger<'a>,
+        /// 99th percentile of its duration when the problem appeared.
+        duration_seconds: f64,
+        /// The period.
+        period_seconds: f64,
+        /// The period is that of its own timer.
+        own_period: bool,
+    },
+    /// A callback waits for the executor, longer than its interval and than 100 ms.
+    ExecutorWait {
+        /// Node of the callback; null when unknown.
+        node: Option<Cow<'a, str>>,
+        /// Its process.
+        process_id: u32,
+        /// What triggers it.
+        trigger: Trigger<'a>,
+        /// 99th percentile of its wait when the problem appeared.
+        wait_seconds: f64,
+    },
+    /// Messages within a process are overwritten before the subscription takes them.
+    IntraProcessOverflow {
+        /// Node of the subscription; null when unknown.
+        node: Option<Cow<'a, str>>,
+        /// Its process.
+        process_id: u32,
+        /// Share of messages overwritten when the problem appeared.
+        overwritten_ratio: f64,
+    },
+    /// A process exceeds its budget of calls, and the agent no longer counts them.
+    ObservationSuspended {
+        /// The process.
+        process_id: u32,
+        /// Its name; null when unknown.
+        process: Option<Cow<'a, str>>,
+    },
+    /// A node publishes at the rate of an input, but with new stamps: chains end at it.
+    RestampingNode {
+        /// Name of the node.
+        node: Cow<'a, str>,
+        /// The input, whose stamps are older.
+        input: Cow<'a, str>,
+    },
+    /// A configured chain that ends with the topic takes longer than it may.
+    SlowChain {
+        /// First topic of the chain.
+        from: Cow<'a, str>,
+        /// Longest time that it may take, in milliseconds.
+        max_latency_ms: f64,
+    },
 }
 
 /// A problem of the graph; `Unknown` keeps a kind that only a newer agent reports.
@@ -83,6 +140,12 @@ impl Diagnosis<'_> {
             Self::UnfedSubscriber { .. } => "unfed_subscriber",
             Self::HangingCall { .. } => "hanging_call",
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
+            Self::SlowCallback { .. } => "slow_callback",
+            Self::ExecutorWait { .. } => "executor_wait",
+            Self::IntraProcessOverflow { .. } => "intra_process_overflow",
+            Self::ObservationSuspended { .. } => "observation_suspended",
+            Self::RestampingNode { .. } => "restamping_node",
+            Self::SlowChain { .. } => "slow_chain",
         }
     }
 }

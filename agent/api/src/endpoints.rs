@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::measurement::Measurement;
 
-/// A DDS writer or reader.
+/// A writer or reader.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -17,7 +17,14 @@ pub struct Endpoint<'a> {
         schema(example = "010f2b7d6a474f3300000000.00001103")
     )]
     pub guid: String,
-    /// Node of the endpoint, from `ros_discovery_info`; null when unknown.
+    /// Identity that ROS prints as GID, in hexadecimal: the GUID, or with Zenoh the hash of the
+    /// endpoint's liveliness token.
+    #[cfg_attr(
+        feature = "openapi",
+        schema(example = "010f2b7d6a474f330000000000001103")
+    )]
+    pub gid: String,
+    /// Node of the endpoint, as its participant announces it; null when unknown.
     pub node: Option<Cow<'a, str>>,
     /// ROS enclave of the endpoint's participant; null if the participant does not use ROS.
     pub enclave: Option<Cow<'a, str>>,
@@ -25,7 +32,8 @@ pub struct Endpoint<'a> {
     pub message_type: Cow<'a, str>,
     /// RIHS01 hash of the type; null if the endpoint does not announce it (Humble).
     pub type_hash: Option<Cow<'a, str>>,
-    /// DDS implementation of the endpoint's participant; null when unknown.
+    /// Middleware of the endpoint's participant: the DDS implementation, or `Eclipse Zenoh`; null
+    /// when unknown.
     pub vendor: Option<Cow<'a, str>>,
     /// Quality of service.
     pub qos: Qos<'a>,

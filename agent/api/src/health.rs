@@ -73,6 +73,10 @@ pub struct Health {
     /// Ports at which the agent answers as the daemon of the `ros2` command line, by domain; empty
     /// if it does not.
     pub ros2_daemon: Vec<Ros2DaemonPort>,
+    /// Zenoh on this host; null until something of it was seen.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub zenoh: Option<Zenoh>,
     /// Process id of the agent, in its own PID namespace.
     pub process_id: u32,
     /// Seconds since the agent's process started; null if unknown.
@@ -134,6 +138,37 @@ pub struct Ros2DaemonPort {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub reason: Option<String>,
+}
+
+/// Connections of Zenoh.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Zenoh {
+    /// Connections at present, each counted once.
+    pub connections: u64,
+    /// Routers at present.
+    pub routers: u64,
+    /// Times that bytes of a connection were not captured.
+    pub gaps: u64,
+    /// Connections that cannot be read, by reason.
+    pub unseen: Vec<UnseenConnections>,
+}
+
+/// Connections of Zenoh that cannot be read.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct UnseenConnections {
+    /// `tls`, `quic`, `version`, `compression`, `low_latency`, or `shared_memory`: then only the
+    /// payloads are not seen.
+    #[cfg_attr(feature = "openapi", schema(example = "tls"))]
+    pub reason: Cow<'static, str>,
+    /// The reason in words, as they follow "connections".
+    #[cfg_attr(feature = "openapi", schema(example = "encrypted with TLS"))]
+    pub text: Cow<'static, str>,
+    /// Number of connections.
+    pub connections: u64,
 }
 
 /// An ability that depends on privileges, the kernel or the configuration.

@@ -18,11 +18,13 @@
 #![forbid(unsafe_code)]
 
 pub mod attributes;
+pub mod chains;
 pub mod diagnosis;
 pub mod endpoints;
 pub mod events;
 pub mod graph;
 pub mod health;
+pub mod inside;
 pub mod live;
 pub mod measurement;
 pub mod messages;

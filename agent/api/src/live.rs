@@ -184,7 +184,7 @@ pub struct Finding {
     /// Stable id: it stays the same while the finding concerns the same problem.
     pub id: String,
     /// Kind of the finding: a kind of `diagnoses` in `/topics`, or `loss`, `watch_violated`,
-    /// `watch_silent`, `agent_not_ready`, `agent_drops`, `unknown_writers`, `topics_rejected` or
+    /// `watch_silent`, `agent_not_ready`, `agent_drops`, `unknown_writers`, `zenoh_unseen`,
     /// `ability`.
     pub kind: Cow<'static, str>,
     /// Severity.

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::diagnosis::{Diagnosis, Finding};
 use crate::endpoints::Process;
+use crate::inside::NodeInside;
 
 /// All nodes.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -47,6 +48,8 @@ pub struct Node<'a> {
     /// Problems of the node. Problems of its topics are in `/topics`.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<Diagnosis<'static>>))]
     pub diagnoses: Vec<Finding<'a>>,
+    /// What observed processes show of the node; null without `capture.inside`.
+    pub inside: Option<NodeInside<'a>>,
 }
 
 /// One of the nodes with this name.

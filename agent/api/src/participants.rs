@@ -21,7 +21,7 @@ pub struct ParticipantList<'a> {
     pub unknown_writers: Vec<UnknownWriter<'a>>,
 }
 
-/// A DDS participant.
+/// A participant of DDS, or a session of Zenoh.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(default)]
@@ -30,7 +30,7 @@ pub struct Participant<'a> {
     pub guid: String,
     /// Domain id.
     pub domain_id: u32,
-    /// DDS implementation.
+    /// Middleware: the DDS implementation, or `Eclipse Zenoh`.
     #[cfg_attr(feature = "openapi", schema(example = "eProsima Fast DDS"))]
     pub vendor: Cow<'a, str>,
     /// ROS enclave; null if the participant does not use ROS.
@@ -69,7 +69,7 @@ pub struct Participant<'a> {
 pub struct UnknownWriter<'a> {
     /// GUID of the writer.
     pub guid: String,
-    /// DDS implementation; empty when unknown.
+    /// Middleware: the DDS implementation, or `Eclipse Zenoh`; empty when unknown.
     pub vendor: Cow<'a, str>,
     /// Host and process of the writer.
     #[serde(flatten)]

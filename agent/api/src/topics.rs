@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::Open;
 use crate::diagnosis::{Diagnosis, Finding};
 use crate::endpoints::Endpoint;
+use crate::inside::TopicInside;
 use crate::measurement::{Breakdown, Bucket, Delivered, Measurement};
 use crate::watches::Expectations;
 
@@ -66,6 +67,11 @@ pub struct Topic<'a> {
     pub diagnoses: Vec<Finding<'a>>,
     /// Why the topic is silent or not measured; empty if messages are counted.
     pub reasons: Vec<Reason>,
+    /// Where the messages, their rate and the time of the last one come from: `wire` (datagrams and
+    /// shared memory) or `inside` (calls inside processes, which show no sizes).
+    pub source: Cow<'static, str>,
+    /// What observed processes show of the topic; null without `capture.inside`.
+    pub inside: Option<TopicInside<'a>>,
 }
 
 /// A topic with its histograms, deliveries and acknowledgements.
@@ -95,10 +101,12 @@ pub struct TopicDetails<'a> {
 #[serde(default)]
 pub struct Passage {
     /// The transport. `network` is captured in full, `shared_memory` is sampled; `data_sharing`,
-    /// `same_process` and `iceoryx` cannot be observed.
+    /// `same_process` and `iceoryx` can be observed only inside the processes.
     pub passage: Cow<'static, str>,
     /// Number of pairs.
     pub pairs: usize,
+    /// Number of these pairs with both ends in observed processes.
+    pub observed_pairs: usize,
     /// Coverage of `shared_memory` at the moment. `exact`: every message, in the process that sends
     /// it. `close`: sampled as often as `capture.shm.reading_cpu_percent` allows, because a client
     /// reads its messages. `sampled`: sampled less often. `none`: not observed.

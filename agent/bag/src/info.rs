@@ -49,6 +49,9 @@ pub enum InfoError {
     Read(#[from] ReadError),
 }
 
+/// First bytes of a file of the sqlite3 storage.
+pub(super) const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
+
 /// Suffix of a topic with service events.
 pub const SERVICE_EVENT: &str = "/_service_event";
 
@@ -114,7 +117,7 @@ impl Bag {
             .take(16)
             .read_to_end(&mut begin)
             .map_err(wrong)?;
-        if begin == b"SQLite format 3\0" {
+        if begin == SQLITE_MAGIC {
             return Err(InfoError::Sqlite3(path.to_owned()));
         }
         let contents = match Contents::of_file(path) {

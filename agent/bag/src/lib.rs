@@ -5,10 +5,11 @@
 //!
 //! - [`Writer`] writes a bag; [`Options`] choose form, compression and the size of files.
 //! - [`info::Bag`] opens a bag and describes its content; [`read`] visits the records of a file.
+//! - [`messages::read`] visits the messages of a bag, also in the sqlite3 storage.
 //! - [`reindex::reindex`] completes the files of a bag whose writer was killed.
 //!
 //! This crate starts no thread, reads no clock, and neither subscribes, decodes nor selects topics:
-//! callers pass times, payloads and the text of schemas. sqlite3 bags are neither written nor read.
+//! callers pass times, payloads and the text of schemas. sqlite3 bags are never written.
 //!
 //! ```
 //! use std::collections::BTreeMap;
@@ -53,12 +54,14 @@ mod file;
 mod file_compression;
 pub mod info;
 pub mod mcap;
+pub mod messages;
 pub mod metadata;
 mod metadata_file;
 pub mod options;
 pub mod qos;
 pub mod read;
 pub mod reindex;
+mod sqlite3;
 mod writer;
 
 pub use compression::{Compression, Progress};

@@ -100,10 +100,7 @@ impl Contents {
         {
             return Ok(contents);
         }
-        let mut scan = scan(path, &mut |_, _| {})?;
-        let cut = std::mem::take(&mut scan.cut);
-        take_chunk(&cut, &mut scan, &mut |_, _| {});
-        Ok(scan.contents)
+        Ok(scan_with_cut(path, &mut |_, _| {})?.contents)
     }
 
     /// Returns the number of messages of all channels, saturating: a summary may contain any
@@ -229,6 +226,14 @@ pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
         return Err(ReadError::NotMcap(path.to_owned()));
     }
     scan_records(&mut records, each).map_err(wrong)
+}
+
+/// As [`scan`], but also visits the messages at the beginning of a truncated chunk.
+pub(super) fn scan_with_cut(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
+    let mut scan = scan(path, each)?;
+    let cut = std::mem::take(&mut scan.cut);
+    take_chunk(&cut, &mut scan, each);
+    Ok(scan)
 }
 
 /// Returns the compression of the whole file, by its name.

@@ -13,7 +13,7 @@ use std::os::fd::{AsFd, BorrowedFd};
 use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, ProgramArray, RingBuf};
 use aya::programs::{Program, ProgramError, ProgramFd};
 use aya::{Ebpf, EbpfError, EbpfLoader};
-use ros2probe_wire::filter::{Budget, COUNTER_SLOTS, Counter};
+use ros2probe_wire::filter::{Budget, COUNTER_SLOTS, Counter, PORT_CAPACITY};
 use ros2probe_wire::record::{Verdict, guid_words};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 use zerocopy::FromBytes;
@@ -26,8 +26,9 @@ pub use uprobe::{Form, Probe, Probes};
 /// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../agent-ebpf/filter.bpf.o"));
 
+/// Bytes at an address that an ELF header may have.
 #[repr(align(8))]
-struct Aligned<T: ?Sized>(T);
+pub(crate) struct Aligned<T: ?Sized>(pub(crate) T);
 
 /// The kernel filter's key of a run: writer, destination, port, interface, socket, CPU.
 type RunKey = [u32; 13];
@@ -87,6 +88,16 @@ pub struct FilterSettings {
     /// Host hook: whether to use the kernel's types. Without them the hook works as on a kernel
     /// without BTF.
     pub kernel_types: bool,
+    /// TCP ports of Zenoh; 0 = unused.
+    pub zenoh_ports: [u16; PORT_CAPACITY],
+}
+
+/// Returns the ports for the programs; those that do not fit are left out.
+#[must_use]
+pub fn ports(ports: &[u16]) -> [u16; PORT_CAPACITY] {
+    let mut all = [0; PORT_CAPACITY];
+    all.iter_mut().zip(ports).for_each(|(to, from)| *to = *from);
+    all
 }
 
 impl Default for FilterSettings {
@@ -96,6 +107,7 @@ impl Default for FilterSettings {
             piece_ring_bytes: 1024 * 1024,
             accept_new_interfaces: true,
             kernel_types: true,
+            zenoh_ports: ports(&[ros2probe_wire::zenoh::PORT]),
         }
     }
 }
@@ -295,7 +307,7 @@ impl Filter {
 
 impl FilterError {
     /// Maps the loader's error, and distinguishes a missing privilege from a defect of the object.
-    fn load(error: EbpfError) -> Self {
+    pub(crate) fn load(error: EbpfError) -> Self {
         if let Some(error) = not_permitted(&error) {
             Self::NotPermitted(error)
         } else if let Some(error) = caused_by(&error, libc::ENOSYS) {
@@ -305,7 +317,7 @@ impl FilterError {
         }
     }
 
-    fn program(error: ProgramError) -> Self {
+    pub(crate) fn program(error: ProgramError) -> Self {
         match not_permitted(&error) {
             Some(error) => Self::NotPermitted(error),
             None => Self::Program(error),
@@ -362,6 +374,7 @@ fn open(
         .override_global("PREEMPTED", &preempted, true)
         .override_global("ARCHITECTURE", &architecture, true)
         .override_global("WITHIN", &within, true)
+        .override_global("ZENOH_PORTS", &settings.zenoh_ports, true)
         .override_global("WAKE_BYTES", &wake, true)
         .override_global("WAKE_PIECE_BYTES", &wake_pieces, true)
         .map_max_entries("RECORDS", ring);
@@ -405,7 +418,7 @@ fn ring_size_with(bytes: u32, page: u32) -> u32 {
     bytes.next_power_of_two().max(page)
 }
 
-fn take<T>(ebpf: &mut Ebpf, name: &'static str) -> Result<T, FilterError>
+pub(crate) fn take<T>(ebpf: &mut Ebpf, name: &'static str) -> Result<T, FilterError>
 where
     T: TryFrom<Map, Error = MapError>,
 {
@@ -413,7 +426,7 @@ where
     T::try_from(map).map_err(failed(name, "open"))
 }
 
-fn failed(map: &'static str, action: &'static str) -> impl Fn(MapError) -> FilterError {
+pub(crate) fn failed(map: &'static str, action: &'static str) -> impl Fn(MapError) -> FilterError {
     move |source| FilterError::Map {
         map,
         action,
@@ -422,7 +435,7 @@ fn failed(map: &'static str, action: &'static str) -> impl Fn(MapError) -> Filte
 }
 
 /// Treats the removal of a missing element as a success.
-fn absent_is_fine(result: Result<(), MapError>) -> Result<(), MapError> {
+pub(crate) fn absent_is_fine(result: Result<(), MapError>) -> Result<(), MapError> {
     match result {
         Err(MapError::KeyNotFound) => Ok(()),
         Err(MapError::SyscallError(error)) if error.io_error.kind() == io::ErrorKind::NotFound => {

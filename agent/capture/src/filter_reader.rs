@@ -7,7 +7,7 @@
 use std::collections::VecDeque;
 use std::os::fd::BorrowedFd;
 
-use ros2probe_wire::host::Piece;
+use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record};
@@ -16,6 +16,7 @@ use super::filter::Filter;
 use super::piece_assembler::PieceAssembler;
 use super::reorder_buffer::{Next, ReorderBuffer};
 use super::system::Clocks;
+use super::zenoh::{Chunk, Streams};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
@@ -44,6 +45,7 @@ pub struct FilterReader {
     pieces: PieceAssembler,
     /// Captured datagrams that wait for older records.
     fresh: VecDeque<(Piece, Vec<u8>)>,
+    streams: Streams,
     datagrams: u64,
     copied_bytes: u64,
     /// Time of the latest record, in the kernel's clock.
@@ -51,14 +53,15 @@ pub struct FilterReader {
 }
 
 impl FilterReader {
-    /// Creates a reader without data.
+    /// Creates a reader without data; `zenoh_ports` are the TCP ports of Zenoh.
     #[must_use]
-    pub fn new(filter: Filter) -> Self {
+    pub fn new(filter: Filter, zenoh_ports: &[u16]) -> Self {
         Self {
             filter,
             order: ReorderBuffer::default(),
             pieces: PieceAssembler::default(),
             fresh: VecDeque::new(),
+            streams: Streams::new(zenoh_ports.to_vec()),
             datagrams: 0,
             copied_bytes: 0,
             recorded: 0,
@@ -90,6 +93,8 @@ impl FilterReader {
             self.take_records();
         }
         self.pieces.advance(clocks.monotonic);
+        self.streams
+            .advance(clocks.now, |report| observer.input(Input::Zenoh(report)));
     }
 
     /// Passes everything that still waits to the model, at the end.
@@ -109,6 +114,12 @@ impl FilterReader {
     /// Returns the kernel programs' maps, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         &mut self.filter
+    }
+
+    /// Returns the connections of Zenoh.
+    #[must_use]
+    pub const fn streams(&self) -> &Streams {
+        &self.streams
     }
 
     /// Returns the number of captured datagrams.
@@ -186,6 +197,19 @@ impl FilterReader {
             };
             self.copied_bytes += (size_of::<Piece>() + bytes.len()) as u64;
             newest = piece.time;
+            if piece.flags & flag::STREAM != 0 {
+                let chunk = Chunk::of_piece(&piece, bytes, clocks.calendar(piece.time));
+                if piece.chunk & chunk::QUIC != 0 {
+                    let seen = (chunk.time, chunk.stream);
+                    self.streams.datagram(seen, bytes, chunk.length, |report| {
+                        observer.input(Input::Zenoh(report));
+                    });
+                    continue;
+                }
+                self.streams
+                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+                continue;
+            }
             let Some((piece, bytes)) = self.pieces.piece(&piece, bytes) else {
                 continue;
             };

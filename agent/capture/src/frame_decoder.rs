@@ -11,12 +11,15 @@ use ros2probe_wire::walk::Envelope;
 
 use super::pcap::{Captured, PcapError, PcapReader};
 use crate::reassembly::{FlowKey, Limits, Reassembly};
+use crate::zenoh::{Chunk, Streams, flow, flow_of};
 use ros2probe_model::observer::Observer;
+use ros2probe_model::zenoh::StreamId;
 
 /// State of one replayed capture.
 #[derive(Debug)]
 pub struct FrameDecoder {
     reassembly: Reassembly,
+    streams: Streams,
     last: Timestamp,
 }
 
@@ -26,6 +29,7 @@ impl FrameDecoder {
     pub fn new(limits: Limits) -> Self {
         Self {
             reassembly: Reassembly::new(limits),
+            streams: Streams::default(),
             last: Timestamp(0),
         }
     }
@@ -51,6 +55,8 @@ impl FrameDecoder {
         // Several interfaces of one capture may be slightly out of order.
         self.last = self.last.max(captured.time);
         observer.input(Input::Time(self.last));
+        self.streams
+            .advance(self.last, |report| observer.input(Input::Zenoh(report)));
         let parsed = match frame::parse(captured.link, captured.bytes, captured.length) {
             Ok(parsed) => parsed,
             Err(error) => {
@@ -73,6 +79,19 @@ impl FrameDecoder {
         };
         match packet.payload {
             Payload::Datagram(datagram) => {
+                let stream = StreamId {
+                    flow: flow_of(&packet, datagram.source_port, datagram.destination_port),
+                    ..StreamId::default()
+                };
+                let (bytes, length) = (datagram.payload, datagram.length);
+                let is_quic =
+                    self.streams
+                        .datagram((captured.time, stream), bytes, length, |report| {
+                            observer.input(Input::Zenoh(report));
+                        });
+                if is_quic {
+                    return;
+                }
                 let envelope = Envelope {
                     source_port: datagram.source_port,
                     destination_port: datagram.destination_port,
@@ -93,8 +112,23 @@ impl FrameDecoder {
                     give(observer, &envelope, whole.payload(), whole.length);
                 }
             }
+            Payload::Segment(segment) => {
+                let stream = StreamId {
+                    flow: flow(&packet, &segment),
+                    ..StreamId::default()
+                };
+                let chunk = Chunk::of_segment(&segment, captured.time, stream);
+                self.streams
+                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+            }
             Payload::Other(_) => {}
         }
+    }
+
+    /// Returns the connections of Zenoh, for their counters.
+    #[must_use]
+    pub const fn streams(&self) -> &Streams {
+        &self.streams
     }
 
     /// Returns the reassembly, for its counters.

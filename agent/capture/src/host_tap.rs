@@ -8,7 +8,8 @@ use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
 use super::cgroup::{self, Cgroup, CgroupError};
-use super::filter::{Filter, FilterError, FilterSettings};
+use super::error_chain::in_words;
+use super::filter::{Filter, FilterError, FilterSettings, ports};
 use super::filter_reader::FilterReader;
 use super::reattach::{self, Reattach};
 use super::sockets::Sockets;
@@ -48,6 +49,8 @@ pub struct HostTapSettings {
     pub ring_bytes: usize,
     /// Bytes of the record ring.
     pub record_ring_bytes: usize,
+    /// TCP ports of Zenoh.
+    pub zenoh_ports: Vec<u16>,
 }
 
 /// The host hook and the reader of its output.
@@ -73,8 +76,13 @@ impl HostTap {
         let mut filter = Filter::load_host(&FilterSettings {
             record_ring_bytes: size(settings.record_ring_bytes),
             piece_ring_bytes: size(settings.ring_bytes),
+            zenoh_ports: ports(&settings.zenoh_ports),
             ..FilterSettings::default()
         })?;
+        if let Some(Err(error)) = filter.zenoh_programs() {
+            let reason = in_words(error);
+            tracing::warn!(reason, "connections of Zenoh are not observed");
+        }
         // First, so that no loss behind the hook is missed.
         filter.attach_tracepoints(cgroup.is_whole_host());
         filter.attach(cgroup.directory())?;
@@ -86,7 +94,7 @@ impl HostTap {
         Ok(Self {
             sockets: Sockets::new(hierarchy),
             cgroup,
-            reader: FilterReader::new(filter),
+            reader: FilterReader::new(filter, &settings.zenoh_ports),
             reattach: None,
         })
     }

@@ -31,9 +31,11 @@ use super::threads::Spawn;
 use super::uprobe::Uprobe;
 use super::uprobe::search::Facts as UprobeFacts;
 use super::wire_tap::{self, WireTap, WireTapError};
+use super::zenoh::Streams;
+use crate::inside::{Facts as InsideFacts, Inside};
 use crate::reassembly::Limits;
 use crate::settings::{CaptureSettings, ShmMode};
-use open::{open_exact, open_host, open_wires, scope};
+use open::{open_exact, open_host, open_inside, open_wires, scope};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
@@ -87,6 +89,9 @@ pub struct LiveSource {
     exact: Option<Uprobe>,
     /// Why shared-memory messages are not read in their senders although that is configured.
     without_exact: Option<String>,
+    inside: Option<Inside>,
+    /// Why processes are not observed from inside although that is configured.
+    without_inside: Option<String>,
     /// When the budget of unclassified writers was last refilled.
     bytes_refilled: u64,
     records_refilled: u64,
@@ -149,6 +154,7 @@ impl LiveSource {
             }
         };
         let (exact, without_exact) = open_exact(settings, host.is_some());
+        let (inside, without_inside) = open_inside(settings);
         give_back_memory();
         let shared_memory = match settings.shm.mode {
             ShmMode::Off => Shm::Off,
@@ -168,6 +174,8 @@ impl LiveSource {
             shared_memory,
             exact,
             without_exact,
+            inside,
+            without_inside,
             bytes_refilled: 0,
             records_refilled: 0,
             wanted_asked: 0,
@@ -197,7 +205,26 @@ impl LiveSource {
             let reason = in_words(&error);
             tracing::warn!(reason, "a recreated cgroup is not observed");
         }
+        if let Some(inside) = &mut self.inside
+            && let Err(error) = inside.start(spawn)
+        {
+            let reason = in_words(&error);
+            tracing::warn!(reason, "processes are not observed from inside");
+            (self.inside, self.without_inside) = (None, Some(reason));
+        }
         self.start_shared_memory(spawn);
+    }
+
+    /// Returns the state of the source inside processes, if it is used.
+    #[must_use]
+    pub fn inside(&self) -> Option<InsideFacts> {
+        self.inside.as_ref().map(Inside::facts)
+    }
+
+    /// Returns why processes are not observed from inside although that is configured.
+    #[must_use]
+    pub fn without_inside(&self) -> Option<&str> {
+        self.without_inside.as_deref()
     }
 
     /// Returns the tap at the host's sockets, if it is used.
@@ -283,11 +310,18 @@ impl LiveSource {
             settle = filter_reader::SETTLE_NANOSECONDS;
         }
         for wire in &mut self.wires {
-            wire.poll(&clocks, observer)?;
+            let at_sockets = self.host.as_ref().map(|host| host.reader().streams());
+            wire.poll(&clocks, at_sockets, observer)?;
             settle = settle.max(wire_tap::SETTLE_NANOSECONDS);
         }
         if let Shm::Running(shared_memory) = &self.shared_memory {
             shared_memory.poll(&clocks, observer);
+        }
+        for round in self.inside.iter().flat_map(Inside::take) {
+            observer.input(Input::Inside(round.report));
+            for publication in &round.publications {
+                observer.input(Input::CausalPublication(publication));
+            }
         }
         self.apply_wanted(clocks.monotonic, observer);
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
@@ -452,6 +486,12 @@ impl LiveSource {
     #[must_use]
     pub fn reassembly_evicted(&self) -> u64 {
         self.wires.iter().map(WireTap::reassembly_evicted).sum()
+    }
+
+    /// Returns the tables of connections of Zenoh: one of the sockets, and one of each namespace.
+    pub fn streams(&self) -> impl Iterator<Item = &Streams> {
+        let host = self.host.iter().map(|host| host.reader().streams());
+        host.chain(self.wires.iter().map(WireTap::streams))
     }
 
     /// Returns the report of the shared-memory tap, if it exists.

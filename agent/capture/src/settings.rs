@@ -26,6 +26,23 @@ pub struct CaptureSettings {
     pub record_ring_bytes: usize,
     /// Settings of shared memory.
     pub shm: ShmSettings,
+    /// What is observed inside processes.
+    pub inside: InsideChoice,
+    /// TCP ports of Zenoh, at most [`ros2probe_wire::filter::PORT_CAPACITY`].
+    pub zenoh_ports: Vec<u16>,
+}
+
+/// What is observed inside processes, by uprobes on `libtracetools.so`.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum InsideChoice {
+    /// The source is off.
+    #[default]
+    Off,
+    /// Messages that are published and taken, also within a process.
+    Topics,
+    /// Also callbacks, timers and lifecycle transitions.
+    Full,
 }
 
 /// How shared memory is observed.

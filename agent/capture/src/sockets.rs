@@ -164,8 +164,11 @@ impl Known {
     }
 
     /// Returns the drops of the socket beyond the attributed ones; `None` if the kernel does not
-    /// count them.
+    /// count them, or counts segments of TCP.
     fn unnamed(&self, socket: &Socket) -> Option<u64> {
+        if socket.is_stream != 0 {
+            return None;
+        }
         let dropped = u64::from(self.owner.as_ref()?.drops?);
         Some(dropped.saturating_sub(socket.rcvbuf_errors))
     }
@@ -203,6 +206,7 @@ mod tests {
         let socket = Socket {
             cgroup: 1,
             rcvbuf_errors,
+            is_stream: 0,
         };
         cookies.iter().map(|cookie| (*cookie, socket)).collect()
     }
@@ -227,6 +231,22 @@ mod tests {
         // Attributed since the counter was read.
         assert_eq!(drops(&all, 40), 0);
         assert_eq!(look(&mut all, 125, 20), 5);
+    }
+
+    #[test]
+    fn segments_that_tcp_drops_are_no_datagrams() {
+        let socket = Socket {
+            is_stream: 1,
+            ..Socket::default()
+        };
+        let known = Known {
+            owner: Some(owner(3)),
+            dropped_before: Some(0),
+            ..Known::default()
+        };
+        assert_eq!(known.unnamed(&socket), None);
+        let facts = known.facts(1, &socket, &CgroupPaths::new(PathBuf::new()));
+        assert_eq!((facts.process_id, facts.unidentified_drops), (Some(7), 0));
     }
 
     #[test]

@@ -253,6 +253,20 @@ impl Clocks {
     }
 }
 
+/// Returns CLOCK_MONOTONIC_RAW less CLOCK_MONOTONIC in nanoseconds, modulo 2^64: the closest of
+/// several readings.
+#[must_use]
+pub fn raw_difference() -> u64 {
+    let read = || {
+        let before = nanoseconds(libc::CLOCK_MONOTONIC);
+        let raw = nanoseconds(libc::CLOCK_MONOTONIC_RAW);
+        let within = nanoseconds(libc::CLOCK_MONOTONIC).saturating_sub(before);
+        (within, raw.wrapping_sub(before + within / 2))
+    };
+    let readings = std::iter::repeat_with(read).take(READINGS);
+    readings.min().unwrap_or_default().1
+}
+
 /// Returns nanoseconds of the monotonic clock.
 #[must_use]
 pub fn monotonic() -> u64 {

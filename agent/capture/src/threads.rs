@@ -12,6 +12,8 @@ pub enum Task {
     Reattach,
     /// Attaches uprobes to libraries.
     Probes,
+    /// Attaches uprobes inside processes, and reads their tables.
+    Inside,
 }
 
 /// Starts a thread with only the privileges of its task, and returns after the others are dropped.

@@ -14,16 +14,18 @@ use ros2probe_wire::record::Body;
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 
-use super::filter::{Filter, FilterError, FilterSettings};
+use super::filter::{Filter, FilterError, FilterSettings, ports};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::reattach::{Identity, identity};
 use super::reorder_buffer::{Next, ReorderBuffer};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
+use super::zenoh::{Chunk, Streams, flow, flow_of};
 use crate::ahead::{Ahead, Ready};
 use crate::reassembly::{FlowKey, Limits, Reassembled, Reassembly};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
+use ros2probe_model::zenoh::StreamId;
 
 /// Records younger than this wait for frames captured before them: a frame waits up to 100 ms until
 /// its block is full.
@@ -58,6 +60,8 @@ pub struct WireTapSettings {
     pub record_ring_bytes: usize,
     /// Limits of IP reassembly.
     pub reassembly: Limits,
+    /// TCP ports of Zenoh.
+    pub zenoh_ports: Vec<u16>,
 }
 
 /// The tap of one network namespace.
@@ -95,6 +99,7 @@ impl WireTap {
         let mut filter = Filter::load(&FilterSettings {
             record_ring_bytes: u32::try_from(settings.record_ring_bytes).unwrap_or(u32::MAX >> 1),
             accept_new_interfaces: selection.accepts_unknown(),
+            zenoh_ports: ports(&settings.zenoh_ports),
             ..FilterSettings::default()
         })?;
         let interfaces = Interfaces::open()?;
@@ -121,6 +126,7 @@ impl WireTap {
                 reassembly: Reassembly::new(settings.reassembly),
                 ahead: Ahead::default(),
                 order: ReorderBuffer::default(),
+                streams: Streams::new(settings.zenoh_ports.clone()),
                 copied_bytes: 0,
             },
             refused_interfaces: 0,
@@ -186,19 +192,24 @@ impl WireTap {
     }
 
     /// Reads everything available, and passes everything older than [`SETTLE_NANOSECONDS`] to the
-    /// model.
+    /// model. Connections of Zenoh in `at_sockets` are left out: they are reported from there.
     ///
     /// # Errors
     /// Fails if the kernel refuses to continue.
-    pub fn poll(&mut self, clocks: &Clocks, observer: &mut Observer) -> Result<(), WireTapError> {
+    pub fn poll(
+        &mut self,
+        clocks: &Clocks,
+        at_sockets: Option<&Streams>,
+        observer: &mut Observer,
+    ) -> Result<(), WireTapError> {
         self.follow_interfaces();
-        self.take_frames(clocks, observer)?;
+        self.take_frames(clocks, at_sockets, observer)?;
         self.frames.take_records(&mut self.filter);
         let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
         self.frames.take_stalled(&mut self.filter, stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
         self.frames.deliver(clocks, settled, observer);
-        self.frames.advance(clocks);
+        self.frames.advance(clocks, observer);
         Ok(())
     }
 
@@ -266,6 +277,12 @@ impl WireTap {
         self.frames.reassembly.counters().evicted
     }
 
+    /// Returns the connections of Zenoh.
+    #[must_use]
+    pub const fn streams(&self) -> &Streams {
+        &self.frames.streams
+    }
+
     /// Returns the number of interfaces that did not fit the kernel filter's map.
     #[must_use]
     pub const fn refused_interfaces(&self) -> u64 {
@@ -302,6 +319,7 @@ impl WireTap {
     fn take_frames(
         &mut self,
         clocks: &Clocks,
+        at_sockets: Option<&Streams>,
         observer: &mut Observer,
     ) -> Result<(), WireTapError> {
         // Clears the error that the socket reports when a link goes down; otherwise waiting would
@@ -316,7 +334,7 @@ impl WireTap {
             let mut frames = block.frames();
             for captured in frames.by_ref() {
                 *self.packets.entry(captured.interface).or_default() += 1;
-                if let Err(error) = self.frames.frame(clocks, &captured, observer) {
+                if let Err(error) = self.frames.frame(clocks, &captured, at_sockets, observer) {
                     observer.input(Input::DecodeError {
                         stage: "frame",
                         reason: error.reason,
@@ -368,6 +386,8 @@ struct FrameAssembly {
     ahead: Ahead,
     /// Records that wait for their turn.
     order: ReorderBuffer,
+    /// Connections of Zenoh.
+    streams: Streams,
     copied_bytes: u64,
 }
 
@@ -417,16 +437,19 @@ impl FrameAssembly {
         }
     }
 
-    /// Discards datagrams that have waited too long for their rest.
-    fn advance(&mut self, clocks: &Clocks) {
+    /// Discards datagrams and TCP segments that have waited too long for others.
+    fn advance(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.ahead.advance(clocks.now);
         self.reassembly.advance(clocks.now);
+        self.streams
+            .advance(clocks.now, |report| observer.input(Input::Zenoh(report)));
     }
 
     fn frame(
         &mut self,
         clocks: &Clocks,
         captured: &RingFrame<'_>,
+        at_sockets: Option<&Streams>,
         observer: &mut Observer,
     ) -> Result<(), WireError> {
         self.copied_bytes += captured.bytes.len() as u64;
@@ -451,6 +474,18 @@ impl FrameAssembly {
         };
         match &packet.payload {
             Payload::Datagram(udp) => {
+                let stream = StreamId {
+                    flow: flow_of(&packet, udp.source_port, udp.destination_port),
+                    ..StreamId::default()
+                };
+                let is_quic =
+                    self.streams
+                        .datagram((time, stream), udp.payload, udp.length, |report| {
+                            observer.input(Input::Zenoh(report));
+                        });
+                if is_quic {
+                    return Ok(());
+                }
                 (envelope.source_port, envelope.destination_port) =
                     (udp.source_port, udp.destination_port);
                 decode_frame(&envelope, udp.payload, clocks, &mut self.order, observer);
@@ -472,7 +507,22 @@ impl FrameAssembly {
                     decode_frame(&envelope, payload, clocks, &mut self.order, observer);
                 }
             }
-            _ => {}
+            Payload::Segment(segment) => {
+                let stream = StreamId {
+                    flow: flow(&packet, segment),
+                    outgoing,
+                    namespace: self.number,
+                    interface: captured.interface,
+                    ..StreamId::default()
+                };
+                if at_sockets.is_some_and(|streams| streams.follows_flow(&stream.flow)) {
+                    return Ok(());
+                }
+                let chunk = Chunk::of_segment(segment, time, stream);
+                self.streams
+                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+            }
+            Payload::Other(_) => {}
         }
         Ok(())
     }

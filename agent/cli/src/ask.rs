@@ -1,6 +1,8 @@
 //! `rp discover` on the terminal: lists participants, prints the planned packets, sends them and
 //! reports the answers.
 
+mod router;
+
 use std::io::{Write, stdout};
 use std::time::Duration;
 
@@ -15,6 +17,9 @@ use crate::cli::Discover;
 
 /// Runs `rp discover`.
 pub(crate) fn discover(options: &Discover) -> Result<()> {
+    if let Some(address) = &options.router {
+        return router::discover(address, options);
+    }
     let mut out = stdout().lock();
     let (config, _) = configuration(options.config.as_deref())?;
     let listening = Listening {

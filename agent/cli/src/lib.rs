@@ -3,6 +3,7 @@
 //! - [`client`] reaches an agent at a socket or an address, or replays a capture in this process.
 //! - [`ros2`] formats answers as `ros2 topic`, `ros2 node`, `ros2 bag info` and others do.
 //! - [`learn`] chooses expectations from what a healthy robot does.
+//! - [`inside`] formats what processes show from inside.
 //! - [`top`] is the screen of `rp top`, [`doctor`] the checks of `rp doctor`.
 //!
 //! The commands themselves are in the program (`src/cli/`).
@@ -15,8 +16,10 @@
 
 #![forbid(unsafe_code)]
 
+pub mod chain;
 pub mod client;
 pub mod doctor;
+pub mod inside;
 pub mod learn;
 pub mod ros2;
 pub mod top;

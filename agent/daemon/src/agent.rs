@@ -224,6 +224,7 @@ pub fn run(options: Options) -> Result<()> {
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);
 
     let mut observer = Observer::new(settings(&config, options.replay.is_none()));
+    observer.input(Input::ExpectedChains(Arc::new(config.chains.clone())));
     state.restore(&mut observer, &source);
     let stop = CancellationToken::new();
     let components = Components {

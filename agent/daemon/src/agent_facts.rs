@@ -66,6 +66,8 @@ pub struct AgentFacts {
     pub shared_memory: Option<SharedMemoryFacts>,
     /// Libraries with uprobes for exact capture of shared memory. Empty if exact mode is off.
     pub exact: Vec<ExactFacts>,
+    /// State of the observation inside processes. `None` if it is off.
+    pub inside: Option<InsideSourceFacts>,
     /// Facts about subscriptions.
     pub subscriptions: SubscriptionFacts,
     /// Filter of system calls in force.
@@ -78,6 +80,30 @@ pub struct ExactFacts {
     /// Path of the library as seen by its processes. Empty for facts about all libraries.
     pub library: String,
     /// Reason for the failure. `None` while messages are captured.
+    pub refused: Option<String>,
+}
+
+/// State of the observation inside processes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct InsideSourceFacts {
+    /// `topics` or `full`.
+    pub mode: &'static str,
+    /// Observed libraries.
+    pub libraries: Vec<InsideLibrary>,
+    /// Counters of the kernel programs, all of them in a fixed order.
+    pub counters: Vec<(&'static str, u64)>,
+    /// Why nothing is observed although the source is switched on. `None` if it works.
+    pub reason_off: Option<String>,
+}
+
+/// An observed library.
+#[derive(Clone, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct InsideLibrary {
+    /// Path as seen by its processes.
+    pub path: String,
+    /// Number of processes that use it.
+    pub processes: u64,
+    /// Reason for the failure. `None` while its calls are observed.
     pub refused: Option<String>,
 }
 
@@ -126,6 +152,8 @@ pub enum Ability {
     SharedMemory,
     /// Every message in shared memory, from all processes.
     SharedMemoryExact,
+    /// Counts from inside processes, whatever the transport.
+    Inside,
 }
 
 /// Counters of one interface.
@@ -170,6 +198,7 @@ impl AgentFacts {
             state: None,
             shared_memory: None,
             exact: Vec::new(),
+            inside: None,
             subscriptions: SubscriptionFacts::default(),
             sandbox: privilege::sandbox(),
         }
@@ -200,7 +229,7 @@ impl SourceKind {
 
 impl Ability {
     /// All abilities.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::Subscribers,
         Self::Sent,
         Self::SocketLosses,
@@ -210,6 +239,7 @@ impl Ability {
         Self::Forwarded,
         Self::SharedMemory,
         Self::SharedMemoryExact,
+        Self::Inside,
     ];
 
     /// Label value.
@@ -225,6 +255,7 @@ impl Ability {
             Self::Forwarded => "forwarded",
             Self::SharedMemory => "shared_memory",
             Self::SharedMemoryExact => "shared_memory_exact",
+            Self::Inside => "inside",
         }
     }
 }

@@ -56,9 +56,10 @@ pub fn clock() -> Result<ClockState, String> {
     clock_state().map_err(|error| error.to_string())
 }
 
-/// Names of the capabilities that exact mode (`capture.shm.exact`) needs and `effective` lacks.
+/// Names of the capabilities that uprobes (`capture.shm.exact`, `capture.inside`) need and
+/// `effective` lacks.
 #[must_use]
-pub fn exact_mode_lacks(effective: CapabilitySet) -> Vec<&'static str> {
+pub fn uprobes_lack(effective: CapabilitySet) -> Vec<&'static str> {
     uprobe::lacking(effective)
 }
 

@@ -3,6 +3,7 @@
 //! - [`agent::run`] is the lifecycle of an agent. [`agent::Components`] composes one, live or
 //!   replayed.
 //! - [`replay_agent`] replays a capture within the process of a client.
+//! - [`bag_chains`] finds chains in a bag.
 //! - [`config`] reads the configuration, [`watches`] merges the watched topics.
 //! - [`run`] is the loop of the working thread, the only one that touches the model.
 //! - [`snapshot_cell`] holds the latest snapshot, [`events`] the log of events, [`limit_facts`] the
@@ -22,6 +23,7 @@
 
 pub mod agent;
 pub mod agent_facts;
+pub mod bag_chains;
 pub mod config;
 mod control;
 pub mod discover;

@@ -236,6 +236,7 @@ fn assemble(
     let settings = observer::Settings {
         // No kernel filter has to be updated first.
         payload_delay: Duration::ZERO,
+        directed: false,
         ..observer::Settings::default().with_limits(&config.limits)
     };
     let components = Components {

@@ -525,7 +525,7 @@ impl Inside {
                 }
                 assert!(self.0.bytes() <= Limits::default().bytes);
             }
-            Payload::Other(_) => {}
+            Payload::Segment(_) | Payload::Other(_) => {}
         }
     }
 }

@@ -9,10 +9,14 @@
 mod matching;
 
 use std::cmp::Ordering;
+use std::sync::Arc;
+use std::time::Duration;
 
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::{DomainId, Guid};
 
+use super::inside::facts::Owner;
+use super::inside::report::Trigger;
 use super::names::{DdsName, NodeName, TopicName, TypeName};
 use super::topic_kind::TopicKind;
 pub(crate) use matching::effort;
@@ -104,6 +108,68 @@ pub enum Diagnosis {
         /// Domains, sorted.
         domains: Vec<DomainId>,
     },
+    /// A callback runs longer than the period of its timer, or of a timer in the same thread.
+    SlowCallback {
+        /// Its topic, if messages trigger it.
+        topic: Option<TopicKey>,
+        /// The callback.
+        callback: Owner,
+        /// What triggers it.
+        trigger: Trigger,
+        /// 99th percentile of its duration.
+        duration: Duration,
+        /// The period.
+        period: Duration,
+        /// Whether the period is that of its own timer.
+        is_own_period: bool,
+    },
+    /// A callback waits longer than its interval until the executor calls it.
+    ExecutorWait {
+        /// Its topic, if messages trigger it.
+        topic: Option<TopicKey>,
+        /// The callback.
+        callback: Owner,
+        /// What triggers it.
+        trigger: Trigger,
+        /// 99th percentile of its wait.
+        wait: Duration,
+    },
+    /// Messages within a process are overwritten before the subscription takes them.
+    IntraProcessOverflow {
+        /// Topic.
+        topic: TopicKey,
+        /// The subscription's queue.
+        queue: Owner,
+        /// Overwritten messages of 1000 that entered the queue.
+        overwritten_permille: u64,
+    },
+    /// A process makes more calls than its budget allows, and they are no longer counted.
+    ObservationSuspended {
+        /// Domain of the process.
+        domain_id: DomainId,
+        /// Process id.
+        process: u32,
+        /// Its name.
+        name: Option<Arc<str>>,
+    },
+    /// A node that publishes at the rate of an input, but with new stamps: chains end there.
+    RestampingNode {
+        /// Topic that it publishes.
+        topic: TopicKey,
+        /// Fully qualified name.
+        node: NodeName,
+        /// Input with the same rate, whose stamps are older.
+        input: TopicName,
+    },
+    /// A configured chain takes longer than it may.
+    SlowChain {
+        /// Last topic of the chain.
+        topic: TopicKey,
+        /// First topic of the chain.
+        from: TopicName,
+        /// Longest time that it may take.
+        max_latency: Duration,
+    },
 }
 
 /// Why an endpoint has no counterpart: the mismatch that is nearest to a match.
@@ -156,7 +222,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 8] = [
+    pub const KINDS: [&'static str; 14] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -165,6 +231,12 @@ impl Diagnosis {
         "unfed_subscriber",
         "hanging_call",
         "node_in_several_domains",
+        "slow_callback",
+        "executor_wait",
+        "intra_process_overflow",
+        "observation_suspended",
+        "restamping_node",
+        "slow_chain",
     ];
 
     /// Returns the kind as a label value.
@@ -179,6 +251,12 @@ impl Diagnosis {
             Self::UnfedSubscriber { .. } => "unfed_subscriber",
             Self::HangingCall { .. } => "hanging_call",
             Self::NodeInSeveralDomains { .. } => "node_in_several_domains",
+            Self::SlowCallback { .. } => "slow_callback",
+            Self::ExecutorWait { .. } => "executor_wait",
+            Self::IntraProcessOverflow { .. } => "intra_process_overflow",
+            Self::ObservationSuspended { .. } => "observation_suspended",
+            Self::RestampingNode { .. } => "restamping_node",
+            Self::SlowChain { .. } => "slow_chain",
         }
     }
 
@@ -191,8 +269,14 @@ impl Diagnosis {
             | Self::TypeHashConflict { topic, .. }
             | Self::UnheardPublisher { topic, .. }
             | Self::UnfedSubscriber { topic, .. }
-            | Self::HangingCall { topic, .. } => Some(topic),
-            Self::DuplicateNode { .. } | Self::NodeInSeveralDomains { .. } => None,
+            | Self::HangingCall { topic, .. }
+            | Self::IntraProcessOverflow { topic, .. }
+            | Self::RestampingNode { topic, .. }
+            | Self::SlowChain { topic, .. } => Some(topic),
+            Self::SlowCallback { topic, .. } | Self::ExecutorWait { topic, .. } => topic.as_ref(),
+            Self::DuplicateNode { .. }
+            | Self::NodeInSeveralDomains { .. }
+            | Self::ObservationSuspended { .. } => None,
         }
     }
 
@@ -208,6 +292,27 @@ impl Diagnosis {
             .cmp(&place(other))
             .then_with(topics)
             .then_with(|| self.within_topic().cmp(&other.within_topic()))
+            .then_with(|| self.handle().cmp(&other.handle()))
+    }
+
+    /// Returns the publisher, subscription or callback that the finding concerns, if any.
+    #[must_use]
+    pub const fn owner(&self) -> Option<&Owner> {
+        match self {
+            Self::SlowCallback { callback, .. } | Self::ExecutorWait { callback, .. } => {
+                Some(callback)
+            }
+            Self::IntraProcessOverflow { queue, .. } => Some(queue),
+            _ => None,
+        }
+    }
+
+    /// Returns the process and handle of a finding from inside processes.
+    fn handle(&self) -> Option<(u32, u64)> {
+        match self {
+            Self::ObservationSuspended { process, .. } => Some((*process, 0)),
+            _ => self.owner().map(|owner| (owner.process, owner.handle)),
+        }
     }
 
     /// Returns the key that distinguishes findings of one kind and topic.
@@ -228,6 +333,12 @@ impl Diagnosis {
             Self::NodeInSeveralDomains {
                 node, participant, ..
             } => (DomainId(0), node, Some(*participant), None),
+            Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
+            Self::SlowCallback { .. }
+            | Self::ExecutorWait { .. }
+            | Self::IntraProcessOverflow { .. } => (DomainId(0), "", None, None),
+            Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
+            Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }
     }
 }

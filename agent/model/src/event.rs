@@ -15,6 +15,7 @@ use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 use super::churn;
 use super::diagnosis::Diagnosis;
 use super::expectation::WatchState;
+use super::inside::facts::LifecycleState;
 use super::loss::Loss;
 use super::names::{DdsName, NodeName, TopicName, TypeName};
 use super::size::Size;
@@ -83,6 +84,8 @@ pub enum EventKind {
         /// Fully qualified name.
         name: NodeName,
     },
+    /// A managed node changed its lifecycle state.
+    Lifecycle(LifecycleState),
     /// Samples of a writer within about one second were settled as lost.
     Loss(LossBurst),
     /// A watched topic changed its state under a watchlist entry.
@@ -144,7 +147,7 @@ pub enum Class {
     Participant,
     /// Endpoints.
     Endpoint,
-    /// Nodes.
+    /// Nodes and their lifecycle.
     Node,
     /// Losses.
     Loss,
@@ -205,7 +208,7 @@ impl EventKind {
         match self {
             Self::Participant { .. } => Class::Participant,
             Self::Endpoint { .. } => Class::Endpoint,
-            Self::Node { .. } => Class::Node,
+            Self::Node { .. } | Self::Lifecycle(_) => Class::Node,
             Self::Loss(_) => Class::Loss,
             Self::Expectation { .. } | Self::Silence { .. } => Class::Expectation,
             Self::Diagnosis { .. } => Class::Diagnosis,
@@ -331,7 +334,13 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         Diagnosis::QosIncompatible { .. }
         | Diagnosis::UnheardPublisher { .. }
         | Diagnosis::UnfedSubscriber { .. }
-        | Diagnosis::HangingCall { .. } => {}
+        | Diagnosis::HangingCall { .. }
+        | Diagnosis::SlowCallback { .. }
+        | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ObservationSuspended { .. }
+        | Diagnosis::RestampingNode { .. }
+        | Diagnosis::SlowChain { .. } => {}
     }
     finding
 }

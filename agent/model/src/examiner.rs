@@ -11,8 +11,10 @@ use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Guid, Timestamp};
 
+use crate::chain::Chains;
 use crate::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::discovery::Discovery;
+use crate::inside::Inside;
 use crate::services::Services;
 use crate::size::Size;
 use crate::topic::Topics;
@@ -31,8 +33,9 @@ const STEPS_PER_TOPIC: usize = 50_000;
 /// Examines the graph after each change.
 #[derive(Debug, Default)]
 pub struct Examiner {
-    /// Revisions of discovery and of the hanging calls at the last examination.
-    revision: Option<(u64, u64)>,
+    /// Revisions of discovery, of the hanging calls, of the findings from inside processes and of the
+    /// chains at the last examination.
+    revision: Option<(u64, u64, u64, u64)>,
     /// Time at which the first unmatched endpoint becomes a finding.
     due: Option<Timestamp>,
     /// Time since which each endpoint is unmatched.
@@ -106,9 +109,11 @@ impl Examiner {
         discovery: &Discovery,
         topics: &Topics,
         services: &Services,
+        (inside, chains): (&Inside, &Chains),
         now: Timestamp,
     ) {
-        let revision = Some((discovery.revision(), services.revision()));
+        let graph = (discovery.revision(), services.revision());
+        let revision = Some((graph.0, graph.1, inside.revision(), chains.revision()));
         let is_due = self.due.is_some_and(|due| due <= now);
         if self.revision == revision && !is_due {
             return;
@@ -134,6 +139,12 @@ impl Examiner {
         nodes::examine(discovery, &mut findings);
         for (topic, writer) in services.hanging() {
             findings.add(Diagnosis::HangingCall { topic, writer });
+        }
+        for finding in inside.findings() {
+            findings.add(finding);
+        }
+        for finding in chains.findings() {
+            findings.add(finding.clone());
         }
         (self.alone, self.due) = (alone, due);
         let found = findings.finish();

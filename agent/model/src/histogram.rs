@@ -33,6 +33,25 @@ impl Histogram {
         }
     }
 
+    /// Creates a histogram from another kind of distribution: `up_to` returns the number of values
+    /// of at most a bound, `range` the smallest and largest value in seconds.
+    #[must_use]
+    pub fn of(up_to: impl Fn(f64) -> u64, count: u64, sum: f64, range: (f64, f64)) -> Self {
+        let mut histogram = Self {
+            sum,
+            minimum: range.0,
+            maximum: range.1,
+            ..Self::default()
+        };
+        let bounds = BOUNDS.iter().map(|bound| up_to(*bound)).chain([count]);
+        let mut below = 0;
+        for (own, up_to) in histogram.counts.iter_mut().zip(bounds) {
+            *own = up_to.saturating_sub(below);
+            below = below.max(up_to);
+        }
+        histogram
+    }
+
     /// Adds a value in seconds.
     pub fn observe(&mut self, seconds: f64) {
         if self.counts.iter().all(|count| *count == 0) {

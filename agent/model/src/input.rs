@@ -6,13 +6,18 @@ use ros2probe_wire::record::{Handover, Verdict};
 use ros2probe_wire::walk::Envelope;
 use ros2probe_wire::{Guid, GuidPrefix, Reason, Record, Timestamp};
 
+use crate::chain::causality::CausalPublication;
+use crate::chain::expected::ExpectedChain;
+use crate::chain::spans::ChainSpans;
 use crate::discovery::Memory;
 use crate::dispatch::Dispatch;
 use crate::event::Taken;
+use crate::inside::report::Report;
 use crate::selection::SampleRequest;
 use crate::sockets::SocketFacts;
 use crate::trace::Spans;
 use crate::watch::Watchlist;
+use crate::zenoh::StreamReport;
 
 /// An input of the model. Times are in nanoseconds since the Unix epoch.
 #[derive(Debug)]
@@ -60,6 +65,8 @@ pub enum Input<'a> {
     SharedMemoryGap(Timestamp),
     /// Uprobes no longer observe writes to shared memory, so sampled messages count again.
     ProbesDetached,
+    /// A report about one direction of a Zenoh connection.
+    Zenoh(&'a StreamReport<'a>),
     /// A record of a complete datagram, from the kernel filter.
     Record(&'a Record),
     /// The time at which a participant last sent a packet, from the kernel filter.
@@ -70,6 +77,8 @@ pub enum Input<'a> {
     SocketClosed(u64),
     /// The kernel's table dropped the socket with this cookie, which may still be open.
     SocketForgotten(u64),
+    /// Figures from inside processes, with times of this host's clock.
+    Inside(Report),
     /// A source failed to parse captured bytes.
     DecodeError {
         /// The stage of parsing.
@@ -82,6 +91,10 @@ pub enum Input<'a> {
     /// The samples to dispatch from now on. Their topics are measured as long as they are
     /// requested.
     SampleRequests(Arc<Vec<SampleRequest>>),
+    /// The chains with a limit for their latency. The topics between their ends are measured.
+    ExpectedChains(Arc<Vec<ExpectedChain>>),
+    /// A publication within the callback that processes an input, from inside a process.
+    CausalPublication(&'a CausalPublication),
     /// State from before a restart, valid for at most one lease from `now` on.
     Restored {
         /// The saved state.
@@ -104,4 +117,6 @@ pub struct Output {
     pub samples: Vec<Dispatch>,
     /// Completed spans of traced samples.
     pub spans: Spans,
+    /// Completed spans of traced chains.
+    pub chain_spans: ChainSpans,
 }

@@ -25,6 +25,7 @@
 
 pub mod acknowledgement;
 pub mod assembly;
+pub mod chain;
 pub mod churn;
 pub mod delivery;
 pub mod departures;
@@ -42,6 +43,7 @@ pub mod history;
 pub mod identity;
 pub mod in_order;
 pub mod input;
+pub mod inside;
 pub mod interest;
 pub mod journal;
 pub mod limits;
@@ -76,3 +78,4 @@ pub mod undelivered;
 pub mod wall_clock;
 pub mod watch;
 pub mod writer;
+pub mod zenoh;

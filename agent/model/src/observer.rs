@@ -7,13 +7,16 @@
 mod announcements;
 mod calendar;
 mod calls;
+mod chains;
 mod clock;
+mod inside;
 mod lists;
 mod report;
 mod samples;
 mod settings;
+mod zenoh;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -22,13 +25,15 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::record::{Body, Handover, flag};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::{self, Envelope, Outcome};
-use ros2probe_wire::{DomainId, Guid, Reason, Record, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Reason, Record, SequenceNumber, Timestamp};
 
+use super::chain::Chains;
 use super::discovery::{Caps, Change, Discovery, Endpoint, Memory, Priority};
 use super::discovery_fragments::DiscoveryFragments;
 use super::event::TEXT;
 use super::examiner::Examiner;
 use super::input::{Input, Output};
+use super::inside::Inside;
 use super::interest::Interest;
 use super::journal::Journal;
 use super::measurement::Measurement;
@@ -46,7 +51,8 @@ use super::trace::{Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
 use crate::watch::Watchlist;
-use lists::traits;
+use crate::zenoh::Zenoh;
+use lists::{traced_share, traits};
 pub use settings::Settings;
 
 /// Interval at which leases, windows and gaps are checked.
@@ -98,7 +104,14 @@ pub struct Observer {
     sample_requests: Arc<Vec<SampleRequest>>,
     pub(super) receivers: Receivers,
     pub(super) services: Services,
+    pub(super) inside: Inside,
+    pub(super) chains: Chains,
     pub(super) tracer: Tracer,
+    pub(super) zenoh: Zenoh,
+    /// Number of the last change of the graph of Zenoh.
+    zenoh_changes: SequenceNumber,
+    /// Writers of Zenoh with a verdict, and their gids.
+    zenoh_keys: HashMap<Guid, Guid>,
     pub(super) examiner: Examiner,
     pub(super) decode_errors: BTreeMap<(&'static str, &'static str), u64>,
     pub(super) datagrams: u64,
@@ -135,7 +148,12 @@ impl Observer {
             sample_requests: Arc::default(),
             receivers: Receivers::new(settings.deliveries, settings.participants),
             services: Services::default(),
+            inside: Inside::default(),
+            chains: Chains::default(),
             tracer: Tracer::new(settings.directed),
+            zenoh: Zenoh::default(),
+            zenoh_changes: zenoh::FIRST_CHANGE,
+            zenoh_keys: HashMap::new(),
             examiner: Examiner::default(),
             decode_errors: BTreeMap::new(),
             datagrams: 0,
@@ -177,6 +195,7 @@ impl Observer {
             }
             Input::SharedMemoryGap(now) => self.profiler.uncertain(self.wall_clock.model_time(now)),
             Input::ProbesDetached => self.profiler.end_exact_view(),
+            Input::Zenoh(report) => self.zenoh_report(report),
             Input::Record(record) => self.count(record),
             Input::ParticipantAlive(prefix, at) => {
                 let at = self.wall_clock.model_time(at);
@@ -185,9 +204,12 @@ impl Observer {
             Input::Socket(facts) => self.receivers.socket(facts),
             Input::SocketClosed(cookie) => self.receivers.socket_closed(cookie),
             Input::SocketForgotten(cookie) => self.receivers.socket_forgotten(cookie),
+            Input::Inside(report) => self.report_inside(report),
             Input::DecodeError { stage, reason } => self.decode_error(stage, reason),
             Input::Watchlist(watchlist) => self.set_watchlist(watchlist),
             Input::SampleRequests(sample_requests) => self.set_sample_requests(sample_requests),
+            Input::ExpectedChains(chains) => self.chains.expect(chains),
+            Input::CausalPublication(publication) => self.chain_published(publication),
             Input::Restored { memory, now } => self.restore(memory, now),
             Input::End => self.settle(),
         }
@@ -200,7 +222,9 @@ impl Observer {
             events: self.journal.events.take(),
             samples: self.payloads.take(),
             spans: self.tracer.take(),
+            chain_spans: self.chains.take_spans(),
         };
+        self.zenoh_interest(&mut output.interest);
         self.wall_clock.convert_events(&mut output.events);
         self.wall_clock.convert_dispatches(&mut output.samples);
         self.wall_clock.convert_spans(&mut output.spans);
@@ -236,7 +260,12 @@ impl Observer {
             sample_requests,
             receivers,
             services,
+            inside,
+            chains,
             tracer,
+            zenoh,
+            zenoh_changes: _,
+            zenoh_keys,
             examiner,
             decode_errors,
             datagrams: _,
@@ -266,7 +295,12 @@ impl Observer {
         ));
         sizes.extend(receivers.sizes());
         sizes.extend(services.sizes());
+        sizes.extend(inside.sizes(settings.participants));
+        sizes.extend(chains.sizes(settings.endpoints));
         sizes.extend(tracer.sizes());
+        sizes.extend(zenoh.sizes());
+        let keys = Size::new("zenoh.keys", zenoh_keys.len(), settings.endpoints);
+        sizes.push(keys);
         sizes.extend(examiner.sizes(settings.endpoints));
         sizes.extend(journal.sizes());
         // Each stage has every reason at most once.
@@ -303,6 +337,7 @@ impl Observer {
 
     /// Restores saved state, valid for at most one lease from `now` on.
     fn restore(&mut self, memory: &Memory, now: Timestamp) {
+        let captured = now;
         let now = self.wall_clock.model_time(now);
         self.discovery.restore(memory, now);
         self.examiner.forget();
@@ -310,19 +345,24 @@ impl Observer {
         for prefix in prefixes {
             self.announce(prefix);
         }
+        let endpoints = self.discovery.endpoints();
+        self.zenoh.restore(&memory.zenoh, endpoints, captured);
         self.follow_up(now);
     }
 
     /// Returns the discovery state to save for the next start.
     #[must_use]
     pub fn memory(&self) -> Memory {
-        self.discovery.memory()
+        Memory {
+            zenoh: self.zenoh.memory(),
+            ..self.discovery.memory()
+        }
     }
 
     /// Returns a number that increases with every change of [`Self::memory`].
     #[must_use]
     pub const fn memory_revision(&self) -> u64 {
-        self.discovery.revision()
+        self.discovery.revision() + self.zenoh.revision()
     }
 
     /// Returns the latest discovery events and losses.
@@ -367,7 +407,11 @@ impl Observer {
         }
         let evidence = Priority {
             watched: false,
-            local: self.receivers.learn(record),
+            local: match record.flags & flag::STREAM {
+                0 => self.receivers.learn(record),
+                // A router's socket sends samples of many sessions.
+                _ => self.receivers.is_local(&sender),
+            },
             sends: record.is_sample()
                 && record.flags & UNDELIVERED == 0
                 && !writer.entity.is_builtin(),
@@ -396,6 +440,7 @@ impl Observer {
             RecordOutcome::Unmeasured if measures_calls => {}
             RecordOutcome::Unmeasured => self.call_seen(record),
             RecordOutcome::Measured => {
+                self.chain_seen(record);
                 if self.payloads.is_unsettled(writer) {
                     self.came_again(writer, record);
                     self.turn(writer, at);
@@ -404,6 +449,8 @@ impl Observer {
             }
             RecordOutcome::Counted(counted) => {
                 self.report_missing();
+                self.chain_counted(writer, &counted);
+                self.chain_seen(record);
                 self.counted(writer, &counted);
                 return;
             }
@@ -433,16 +480,13 @@ impl Observer {
             let endpoint = discovery.endpoints().get(&record.writer())?;
             let naming = naming(endpoint)?;
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
-            let covering = topic.judgements.iter();
-            let ratios =
-                covering.filter_map(|(index, _)| Some(watchlist.watches().get(*index)?.trace));
             let subject = WriterDescription {
                 domain_id: topic.domain_id,
                 topic: topic.naming.name.bounded(TEXT),
                 message_type: endpoint.message_type.bounded(TEXT),
-                reliable: traits(endpoint).reliable,
+                reliable: traits(record.writer(), endpoint).reliable,
             };
-            (topic.watched == Watched::Yes).then(|| (subject, ratios.fold(0.0, f64::max)))
+            (topic.watched == Watched::Yes).then(|| (subject, traced_share(topic, watchlist)))
         });
     }
 
@@ -479,7 +523,7 @@ impl Observer {
                     let Some(endpoint) = self.discovery.endpoints().get(&guid) else {
                         continue;
                     };
-                    self.profiler.learn(guid, traits(endpoint));
+                    self.profiler.learn(guid, traits(guid, endpoint));
                 }
                 Change::Gone(guid, endpoint) => self.gone(guid, &endpoint, now),
             }

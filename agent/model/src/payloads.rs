@@ -362,6 +362,13 @@ impl Payloads {
         }
     }
 
+    /// Gives an unknown writer the GUID by which it is announced.
+    pub fn rename(&mut self, before: Guid, guid: Guid) {
+        if let Some(samples) = self.unknown_writers.remove(&before) {
+            self.unknown_writers.insert(guid, samples);
+        }
+    }
+
     /// Returns the number of unknown writers remembered.
     #[must_use]
     pub fn unknown_writers(&self) -> usize {

@@ -17,6 +17,7 @@ use super::in_order::Progress;
 use super::journal::Journal;
 use super::measurement::Measurement;
 use super::receivers::GraphView;
+use super::route::Destination;
 use super::samples::Budget;
 use super::size::{Size, largest};
 use super::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContext};
@@ -298,7 +299,7 @@ impl Profiler {
         let writer_ref = measured.writer_ref(guid);
         let mut novelty = RecordNovelty::New;
         // HEARTBEATs in shared memory do not show which readers receive the samples.
-        if measured.topic.is_some() && record.flags & flag::SHM == 0 {
+        if measured.topic.is_some() && record.flags & (flag::SHM | flag::RELAYED) == 0 {
             let mut context = self.shared.writer_context(writer_ref, now, journal, graph);
             let subscribers = measured
                 .subscribers
@@ -321,7 +322,7 @@ impl Profiler {
                 .shared
                 .measurement_context(writer_ref, now, journal, graph.wall_clock),
         );
-        if novelty == RecordNovelty::Duplicate && record.flags & flag::HOST != 0 {
+        if novelty == RecordNovelty::Duplicate && record.flags & (flag::HOST | flag::STREAM) != 0 {
             measured.writer.came_again();
         }
         if let Some(subscribers) = &mut measured.subscribers
@@ -336,6 +337,17 @@ impl Profiler {
     pub fn uncertain(&mut self, now: Timestamp) {
         for measured in self.writers.values_mut() {
             measured.writer.uncertain(now);
+        }
+    }
+
+    /// Records that bytes for this destination were not captured.
+    pub fn missed(&mut self, destination: Destination, at: Timestamp) {
+        for measured in self.writers.values_mut() {
+            if let Some(subscribers) = &mut measured.subscribers
+                && subscribers.missed(destination, at)
+            {
+                measured.opened = at;
+            }
         }
     }
 
@@ -375,6 +387,19 @@ impl Profiler {
         measured.opened = opened;
         measured.allow_incomplete(now);
         self.writers.insert(guid, measured);
+    }
+
+    /// Gives an unknown writer the GUID by which it is announced.
+    pub fn rename(&mut self, before: Guid, guid: Guid) {
+        if self.unknown_writers.contains(&before)
+            && !self.writers.contains_key(&guid)
+            && let Some(mut measured) = self.writers.remove(&before)
+        {
+            measured.writer.rename(guid);
+            self.unknown_writers.remove(&before);
+            self.unknown_writers.insert(guid);
+            self.writers.insert(guid, measured);
+        }
     }
 
     /// Updates the properties of a writer from discovery.

@@ -125,7 +125,8 @@ impl Receivers {
         &self.sockets
     }
 
-    /// Returns the owner of the socket by which each participant sends, if known.
+    /// Returns the owner of the socket by which each participant sends, if known. If it was closed,
+    /// another socket of the same process stands for it.
     #[must_use]
     pub fn holders(&self) -> HashMap<GuidPrefix, &SocketFacts> {
         let mut holders: HashMap<GuidPrefix, &SocketFacts> = HashMap::new();
@@ -140,6 +141,12 @@ impl Receivers {
                 if better(facts) < better(holder) {
                     *holder = facts;
                 }
+            }
+        }
+        for facts in self.sockets.iter() {
+            let candidates = facts.process_id.and_then(|id| self.processes.get(&id));
+            for sender in candidates.into_iter().flat_map(|known| &known.0) {
+                holders.entry(*sender).or_insert(facts);
             }
         }
         holders
@@ -246,6 +253,37 @@ impl Receivers {
         }
         self.generation += 1;
         is_local
+    }
+
+    /// Records that this participant owns a socket of this host.
+    pub fn sends(&mut self, socket: u64, owner: GuidPrefix) {
+        let is_known = self.users.contains_key(&socket);
+        if !is_known && self.users.len() >= self.limit {
+            return;
+        }
+        let known = self.users.entry(socket).or_default();
+        known.senders = Candidates(vec![owner]);
+        if self.local.len() < self.limit * MAX_CANDIDATES {
+            self.local.insert(owner);
+        }
+        let facts = self.sockets.get(socket);
+        if let Some(process) = facts.and_then(|facts| facts.process_id)
+            && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+        {
+            self.processes.entry(process).or_default().add(owner);
+        }
+        self.generation += 1;
+    }
+
+    /// Records that this participant may not own a socket, contrary to [`Self::sends`].
+    pub fn sends_no_longer(&mut self, socket: u64, owner: GuidPrefix) {
+        let users = self.users.get_mut(&socket).map(|users| &mut users.senders);
+        let process = self.sockets.get(socket).and_then(|facts| facts.process_id);
+        let process = process.and_then(|process| self.processes.get_mut(&process));
+        for candidates in users.into_iter().chain(process) {
+            candidates.0.retain(|known| *known != owner);
+        }
+        self.generation += 1;
     }
 
     /// Records the announced unicast addresses of a participant.

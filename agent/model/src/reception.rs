@@ -392,7 +392,7 @@ const fn whole_data(sample: record::Sample<'_>) -> CompleteSample {
         unconfirmed: false,
         source: sample.source_timestamp(),
         stamp: sample.header_stamp(),
-        began: Timestamp(sample.record().time),
+        began: sample.record().began(),
         repaired_after: 0,
     }
 }

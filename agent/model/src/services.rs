@@ -184,23 +184,55 @@ impl Services {
         at: Timestamp,
     ) -> Result<bool, WireError> {
         let guid = found.record.writer();
-        let Some(writer) = self.writers.get_mut(&guid) else {
+        let Some(half) = self.writers.get(&guid).map(|writer| writer.half) else {
             return Ok(false);
         };
-        if writer.is_over_budget(found.payload.len(), at) {
-            let until = at + SUSPENDED;
-            writer.suspended = Some(until);
-            let key = writer.service.key.clone();
-            self.suspend(&key, until, at);
+        if self.charge(guid, found.payload.len(), at) {
             return Ok(true);
         }
         if sample.is_message()
-            && let Some(identity) = identity(writer.half, found, sample, vendor)?
+            && let Some(identity) = identity(half, found, sample, vendor)?
         {
             self.identities
                 .put((guid, sample.sequence_number()), identity);
         }
         Ok(false)
+    }
+
+    /// Records the identity of a captured request or reply that its middleware sends beside
+    /// the payload. Returns the same as [`Self::identify`].
+    pub fn identified(
+        &mut self,
+        guid: Guid,
+        number: SequenceNumber,
+        call: CallId,
+        payload: &[u8],
+        at: Timestamp,
+    ) -> bool {
+        if !self.writers.contains_key(&guid) {
+            return false;
+        }
+        if self.charge(guid, payload.len(), at) {
+            return true;
+        }
+        let identity = Identity::of(call, payload.get(ENCAPSULATION..).unwrap_or_default());
+        self.identities.put((guid, number), identity);
+        false
+    }
+
+    /// Charges captured bytes of a writer; returns whether it has exceeded its budget.
+    fn charge(&mut self, guid: Guid, bytes: usize, at: Timestamp) -> bool {
+        let Some(writer) = self.writers.get_mut(&guid) else {
+            return false;
+        };
+        if !writer.is_over_budget(bytes, at) {
+            return false;
+        }
+        let until = at + SUSPENDED;
+        writer.suspended = Some(until);
+        let key = writer.service.key.clone();
+        self.suspend(&key, until, at);
+        true
     }
 
     /// Records a copy of a request or reply; `receiver` determines which participant receives it.
@@ -537,11 +569,18 @@ fn identity(
     } else {
         &[]
     };
-    Ok(Some(Identity {
-        call,
-        goal: body.first_chunk().copied(),
-        first: body.first().copied().unwrap_or_default(),
-    }))
+    Ok(Some(Identity::of(call, body)))
+}
+
+impl Identity {
+    /// Returns the identity of a message with this body.
+    fn of(call: CallId, body: &[u8]) -> Self {
+        Self {
+            call,
+            goal: body.first_chunk().copied(),
+            first: body.first().copied().unwrap_or_default(),
+        }
+    }
 }
 
 /// Bytes of the encapsulation header (RTPS 2.5, 10.2).

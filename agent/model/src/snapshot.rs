@@ -13,16 +13,20 @@ use ros2probe_wire::qos::Qos;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, RtpsDuration, Timestamp};
 
+pub use super::chain::path::{ChainFacts, ChainsFacts};
 pub use super::churn::ChurnCount;
 use super::diagnosis::Diagnoses;
 use super::discovery::Addresses;
 pub use super::expectation::WatchState;
+use super::inside::facts::{InsideFacts, TopicInside};
+pub use super::inside::source::Source;
 pub use super::measurement::{Breakdown, Delivered, Measurement, SampledFacts};
 use super::names::{DdsName, NodeName, TopicName, TypeName};
 pub use super::route::Direction;
 pub use super::sockets::SocketFacts;
 use super::topic_kind::TopicKind;
 use super::watch::Watch;
+pub use crate::zenoh::ZenohFacts;
 pub use delivery::{AcknowledgementFacts, DeliveryFacts, Subscriber};
 pub use service::{ActionFacts, GoalCounts, LatencyFacts, ServiceFacts};
 
@@ -47,6 +51,12 @@ pub struct Snapshot {
     pub services: Vec<ServiceFacts>,
     /// Actions with goals, sorted by domain and name.
     pub actions: Vec<ActionFacts>,
+    /// Facts from inside processes; `None` while that source is off.
+    pub inside: Option<Arc<InsideFacts>>,
+    /// Figures of Zenoh; `None` until something of it was seen.
+    pub zenoh: Option<ZenohFacts>,
+    /// Chains of messages.
+    pub chains: ChainsFacts,
     /// Problems of the graph; the same value while nothing changes.
     pub diagnoses: Arc<Diagnoses>,
     /// Time at which each problem appeared, in the same order.
@@ -165,6 +175,12 @@ pub struct TopicFacts {
     pub transports: Vec<TransportCount>,
     /// Whether a subscription requests its samples.
     pub is_read: bool,
+    /// Where its messages, their rate and the time of the last one come from.
+    pub source: Source,
+    /// What observed processes show of it.
+    pub inside: Option<Box<TopicInside>>,
+    /// Number of pairs for each transport whose both ends are observed processes.
+    pub observed_pairs: Vec<TransportCount>,
 }
 
 /// Transport between a writer and a reader, as both announce it.
@@ -225,6 +241,8 @@ impl Transport {
 pub struct EndpointFacts {
     /// GUID.
     pub guid: Guid,
+    /// Identity that ROS prints: the GUID, or with Zenoh the hash of the liveliness token.
+    pub gid: [u8; 16],
     /// Node name, if `ros_discovery_info` announces it.
     pub node: Option<NodeName>,
     /// Quality of service.
@@ -239,6 +257,16 @@ pub struct EndpointFacts {
     pub measurement: Option<Box<Measurement>>,
     /// Set of the transports to its counterparts, as [`Transport::bit`].
     pub transports: u8,
+}
+
+impl TopicFacts {
+    /// Returns the number of pairs with this transport whose both ends are observed processes.
+    #[must_use]
+    pub fn observed_pairs(&self, transport: Transport) -> usize {
+        let mut observed = self.observed_pairs.iter();
+        let own = observed.find(|count| count.transport == transport);
+        own.map_or(0, |count| count.pairs)
+    }
 }
 
 impl EndpointFacts {
@@ -304,7 +332,7 @@ pub struct DecodeErrorCount {
 pub struct TableFacts {
     /// `participants`, `endpoints`, `topics`, `nodes`, `writers`, `unknown_writers`, `samples`,
     /// `reassembly`, `interest`, `deliveries`, `sockets`, `diagnoses`, `spans`, `calls`,
-    /// `payloads`, `history`.
+    /// `chains`, `chain_messages`, `payloads`, `history`.
     pub table: &'static str,
     /// Number of entries (bytes for `reassembly` and `payloads`).
     pub size: u64,

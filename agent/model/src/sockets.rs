@@ -89,6 +89,11 @@ impl Sockets {
         self.sockets.get(&cookie)
     }
 
+    /// Iterates over all sockets, by cookie.
+    pub fn iter(&self) -> impl Iterator<Item = &SocketFacts> {
+        self.sockets.values()
+    }
+
     /// Returns the number of sockets, its cap, and those refused or dropped because of a cap.
     #[must_use]
     pub fn size(&self) -> (usize, usize, u64) {

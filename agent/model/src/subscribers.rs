@@ -27,8 +27,7 @@ use super::journal::Journal;
 use super::measurement::Breakdown;
 use super::receivers::{GraphView, Matched};
 use super::reception::CompleteSample;
-use super::route::Direction;
-use super::route::Route;
+use super::route::{Destination, Direction, Route};
 use super::routes::{KnownRoute, Routes};
 use super::samples::Budget;
 use super::size::Size;
@@ -148,6 +147,19 @@ impl Subscribers {
             };
             (delivery, self.routes.iter().filter(leads_there).collect())
         })
+    }
+
+    /// Records that bytes for this destination were not captured: what is missing before `at` may
+    /// have arrived.
+    pub fn missed(&mut self, destination: Destination, at: Timestamp) -> bool {
+        let mut is_affected = false;
+        for delivery in &mut self.deliveries {
+            if delivery.main().destination == destination {
+                delivery.open(at);
+                is_affected = true;
+            }
+        }
+        is_affected
     }
 
     /// Returns the sums over all deliveries, including former ones.

@@ -65,6 +65,9 @@ pub struct Topic {
     pub published: Timestamp,
     /// Time at which its last endpoint vanished.
     pub vanished: Option<Timestamp>,
+    /// Whether an observed process has a publisher or subscription of it, also without an
+    /// announced endpoint.
+    pub is_held: bool,
 }
 
 /// All topics of all domains.
@@ -177,6 +180,7 @@ impl Topics {
                 reader_appeared: _,
                 published: _,
                 vanished: _,
+                is_held: _,
             } = topic;
             let members = writers.len() + readers.len() + buffer_endpoints.len();
             (members, judgements.len())
@@ -264,13 +268,54 @@ impl Topics {
         let is_empty = topic.writers.is_empty()
             && topic.readers.is_empty()
             && topic.buffer_endpoints.is_empty();
-        if is_empty && topic.vanished.is_none() {
+        if is_empty && !topic.is_held && topic.vanished.is_none() {
             topic.vanished = Some(now);
             self.vanished.insert((now, id));
             if topic.watched == Watched::Yes {
                 self.vanished_watched.insert((now, id));
             }
         }
+    }
+
+    /// Keeps a topic of an observed process, also without an endpoint. Returns it and whether it is
+    /// new; `None` if there are `cap` topics already.
+    pub fn hold(
+        &mut self,
+        domain_id: DomainId,
+        naming: &Naming,
+        cap: usize,
+        now: Timestamp,
+    ) -> Option<(TopicId, bool)> {
+        let (id, is_new) = match self.find(domain_id, naming) {
+            Some(id) => (id, false),
+            None => {
+                self.shrink(cap.saturating_sub(1));
+                if self.topics.len() >= cap {
+                    return None;
+                }
+                (self.create(domain_id, naming), true)
+            }
+        };
+        let topic = self.topics.get_mut(&id)?;
+        topic.is_held = true;
+        if is_new {
+            topic.published = now;
+        }
+        if let Some(at) = topic.vanished.take() {
+            self.vanished.remove(&(at, id));
+            self.vanished_watched.remove(&(at, id));
+        }
+        Some((id, is_new))
+    }
+
+    /// Ends [`Self::hold`]: the topic vanishes if it has no endpoint.
+    pub fn release(&mut self, id: TopicId, now: Timestamp) {
+        let Some(topic) = self.topics.get_mut(&id).filter(|topic| topic.is_held) else {
+            return;
+        };
+        topic.is_held = false;
+        // No endpoint has this GUID.
+        self.leave(id, Guid::default(), now);
     }
 
     /// Renumbers the watchlist entries: `moved` has the new index for each old one.
@@ -284,13 +329,13 @@ impl Topics {
         }
     }
 
-    /// Applies the watchlist and the sample requests to one topic, within the cap. A topic that is
-    /// watched by exact name displaces the latest other one, which is returned.
+    /// Applies the watchlist and the sample requests to one topic, within the cap. The last part of
+    /// the lists states whether a configured chain needs the topic. A topic that is watched by exact
+    /// name displaces the latest other one, which is returned.
     pub fn apply_lists(
         &mut self,
         id: TopicId,
-        watchlist: &Watchlist,
-        sample_requests: &[SampleRequest],
+        (watchlist, sample_requests, is_needed): (&Watchlist, &[SampleRequest], bool),
         cap: usize,
         now: Timestamp,
     ) -> Option<TopicId> {
@@ -300,7 +345,7 @@ impl Topics {
         let requested = RequestIds::of(topic.domain_id, &topic.naming, sample_requests);
         let before = topic.watched;
         let mut displaced = None;
-        let after = if covering.is_empty() && requested.is_none() {
+        let after = if covering.is_empty() && requested.is_none() && !is_needed {
             Watched::No
         } else if before == Watched::Yes
             || self.watched < cap
@@ -406,6 +451,7 @@ impl Topics {
                 reader_appeared: Timestamp(0),
                 published: Timestamp(0),
                 vanished: None,
+                is_held: false,
             }),
         );
         id

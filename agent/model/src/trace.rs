@@ -5,6 +5,8 @@
 //! message is traced follows from its identity, so all agents that see it decide alike without
 //! communication. The number of open messages is bounded, and dropped ones are counted.
 
+pub mod share;
+
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,6 +20,7 @@ use super::names::{TopicName, TypeName};
 use super::route::Destination;
 use super::samples::{Budget, Progress, Samples};
 use super::size::{Size, largest};
+use share::Share;
 
 /// Largest number of writers whose messages may be traced.
 const MAX_WRITERS: usize = 4096;
@@ -41,8 +44,6 @@ const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
 const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
 /// Index of the loopback interface in every network namespace.
 const LOOPBACK: u32 = 1;
-/// The bits of a trace id that decide about sampling, as in OpenTelemetry's samplers.
-const RANDOM: u64 = (1 << 56) - 1;
 
 /// The stage that a span covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -137,7 +138,7 @@ struct WriterTrace {
     description: Arc<WriterDescription>,
     /// Identity of its messages, before the sequence number is added.
     identity: Identity,
-    threshold: u64,
+    share: Share,
     samples: Samples,
     /// Whether it sends from this host. The kernel shows a multicast's local copies before its
     /// departure, so the first message arrives before this is known.
@@ -201,19 +202,19 @@ impl Tracer {
     pub fn record(
         &mut self,
         record: &Record,
-        about: impl FnOnce() -> Option<(WriterDescription, f64)>,
+        about: impl FnOnce() -> Option<(WriterDescription, Option<Share>)>,
     ) {
         const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
         let writer = record.writer();
         if !self.writers.contains_key(&writer) {
-            let Some((description, ratio)) = about() else {
+            let Some((description, share)) = about() else {
                 return;
             };
             if self.writers.len() >= MAX_WRITERS {
                 self.shared.evictions += 1;
                 return;
             }
-            let traced = WriterTrace::new(writer, description, ratio).map(Box::new);
+            let traced = share.map(|share| WriterTrace::new(writer, description, share).into());
             self.writers.insert(writer, traced);
         }
         let Some(Some(traced)) = self.writers.get_mut(&writer) else {
@@ -307,7 +308,7 @@ impl WriterTrace {
         let Self {
             description: _,
             identity: _,
-            threshold: _,
+            share: _,
             samples,
             is_local: _,
             under_way,
@@ -337,35 +338,24 @@ impl WriterTrace {
         own.into_iter().chain(samples.sizes())
     }
 
-    /// Returns `None` if no message of the writer is traced.
-    fn new(writer: Guid, description: WriterDescription, ratio: f64) -> Option<Self> {
-        if ratio.is_nan() || ratio <= 0.0 {
-            return None;
-        }
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            clippy::cast_precision_loss,
-            reason = "a part of 2^56"
-        )]
-        let threshold = ((1.0 - ratio.min(1.0)) * RANDOM as f64) as u64;
-        Some(Self {
+    fn new(writer: Guid, description: WriterDescription, share: Share) -> Self {
+        Self {
             description: Arc::new(description),
             identity: of_writer(writer),
-            threshold,
+            share,
             samples: Samples::default(),
             is_local: false,
             under_way: VecDeque::new(),
             arrived: VecDeque::new(),
             waiting: VecDeque::new(),
             done: VecDeque::new(),
-        })
+        }
     }
 
     fn sample(&mut self, sample: Sample<'_>, directed: bool, shared: &mut Shared) {
         let (record, number) = (sample.record(), sample.sequence_number());
         let trace_id = numbered(self.identity, number);
-        if (trace_id as u64 & RANDOM) < self.threshold {
+        if !self.share.takes(trace_id) {
             return;
         }
         let on_wire = record.flags & flag::HOST == 0;

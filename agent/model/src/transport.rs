@@ -18,17 +18,19 @@ const MAX_PAIRS: usize = 1024;
 const NODES_WITHIN: Duration = Duration::from_secs(30);
 const NODE_WITHIN: Duration = Duration::from_secs(10);
 
-/// Counts the pairs of these writers and readers by transport, and passes each endpoint its
-/// transports.
+/// Counts the pairs of these writers and readers by transport: all pairs, and those with both ends
+/// in observed processes. Passes each endpoint its transports.
 pub(super) fn transports(
     discovery: &Discovery,
     writers: &mut [EndpointFacts],
     readers: &mut [EndpointFacts],
-) -> Vec<TransportCount> {
-    let mut counts = Transport::ALL.map(|transport| TransportCount {
+    is_observed: impl Fn(Guid) -> bool,
+) -> (Vec<TransportCount>, Vec<TransportCount>) {
+    let none = Transport::ALL.map(|transport| TransportCount {
         transport,
         pairs: 0,
     });
+    let (mut counts, mut observed) = (none, none);
     let mut left = MAX_PAIRS;
     for writer in writers.iter_mut() {
         for reader in readers.iter_mut().take(left) {
@@ -38,9 +40,12 @@ pub(super) fn transports(
             };
             writer.transports |= transport.bit();
             reader.transports |= transport.bit();
-            let count = counts.iter_mut().find(|count| count.transport == transport);
-            if let Some(count) = count {
-                count.pairs += 1;
+            let both = is_observed(writer.guid) && is_observed(reader.guid);
+            for (list, counts_here) in [(&mut counts, true), (&mut observed, both)] {
+                let count = list.iter_mut().find(|count| count.transport == transport);
+                if let Some(count) = count.filter(|_| counts_here) {
+                    count.pairs += 1;
+                }
             }
         }
     }
@@ -53,7 +58,9 @@ pub(super) fn transports(
             endpoint.transports = all;
         }
     }
-    counts.into_iter().filter(|count| count.pairs > 0).collect()
+    let shown =
+        |counts: [TransportCount; 5]| counts.into_iter().filter(|count| count.pairs > 0).collect();
+    (shown(counts), shown(observed))
 }
 
 /// Returns whether a participant on this writer's host may receive its samples through Fast DDS's
@@ -92,6 +99,9 @@ pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
 fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transport> {
     let endpoints = discovery.endpoints();
     let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
+    if writer.prefix.is_zenoh() != reader.prefix.is_zenoh() {
+        return None;
+    }
     if is_one_process(discovery, writer.prefix, reader.prefix) {
         return Some(Transport::SameProcess);
     }

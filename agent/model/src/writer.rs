@@ -170,6 +170,11 @@ impl Writer {
         self.reception.allow_incomplete(until);
     }
 
+    /// Sets the GUID by which the writer is announced.
+    pub const fn rename(&mut self, guid: Guid) {
+        self.guid = guid;
+    }
+
     /// Returns the properties from discovery and HEARTBEATs.
     #[must_use]
     pub const fn traits(&self) -> Traits {
@@ -442,7 +447,8 @@ impl Writer {
             Outcome::Open => {}
             // A copy at another socket is no retransmission; the caller can distinguish them.
             Outcome::Duplicate => {
-                self.tally.duplicates += u64::from(record.flags & (flag::HOST | flag::SHM) == 0);
+                let elsewhere = flag::HOST | flag::SHM | flag::STREAM;
+                self.tally.duplicates += u64::from(record.flags & elsewhere == 0);
             }
             Outcome::Complete(whole) if whole.is_message => {
                 self.count(now, whole.bytes, whole.recovered);

@@ -29,11 +29,12 @@ impl File {
 }
 
 /// Every file, by its path below `/page/`; `index.html` is also served at `/`.
-pub static FILES: [File; 34] = [
+pub static FILES: [File; 37] = [
     File::new("api.js", SCRIPT, include_bytes!("../api.js")),
     File::new("app.css", CSS, include_bytes!("../app.css")),
     File::new("app.js", SCRIPT, include_bytes!("../app.js")),
     File::new("camera.js", SCRIPT, include_bytes!("../camera.js")),
+    File::new("chains.js", SCRIPT, include_bytes!("../chains.js")),
     File::new("chart.js", SCRIPT, include_bytes!("../chart.js")),
     File::new("dialogs.js", SCRIPT, include_bytes!("../dialogs.js")),
     File::new("format.js", SCRIPT, include_bytes!("../format.js")),
@@ -44,6 +45,7 @@ pub static FILES: [File; 34] = [
     ),
     File::new("icon.svg", SVG, include_bytes!("../icon.svg")),
     File::new("index.html", HTML, include_bytes!("../index.html")),
+    File::new("inside.js", SCRIPT, include_bytes!("../inside.js")),
     File::new(
         "layout-worker.js",
         SCRIPT,
@@ -88,6 +90,11 @@ pub static FILES: [File; 34] = [
         "views/agent.js",
         SCRIPT,
         include_bytes!("../views/agent.js"),
+    ),
+    File::new(
+        "views/chains.js",
+        SCRIPT,
+        include_bytes!("../views/chains.js"),
     ),
     File::new(
         "views/events.js",

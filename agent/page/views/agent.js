@@ -27,6 +27,10 @@ export function Agent() {
     ['Datagrams skipped because too many programs ran at once', data.contended_datagrams],
     ['Topics not measured because limits.topics is reached', data.topics_rejected],
     ['Active writers whose announcement was missed', data.unknown_writers],
+    ...(data.zenoh ? [['Gaps in connections of Zenoh', data.zenoh.gaps]] : []),
+    ...(data.zenoh?.unseen ?? []).map((/** @type {any} */ each) => [
+      `Connections of Zenoh ${each.text}, ${each.reason === 'shared_memory'
+        ? 'whose payloads are' : 'which are'} not read`, each.connections]),
   ]) : [];
   return html`<h1 tabindex="-1">Agent</h1>
     <${Failed} problem=${problem} what="No facts about the agent" />
@@ -48,6 +52,8 @@ export function Agent() {
       ['Watches', html`${count(data?.watches)} <a href=${address('topics', null,
         { only: 'measured' })}>measured topics</a>`],
       ['Stream', stream.status],
+      ...(data?.zenoh ? [['Zenoh', `${count(data.zenoh.connections)} connections, ${
+        count(data.zenoh.routers)} routers`]] : []),
     ]} />
     ${data && html`
     <section aria-labelledby="abilities"><h2 id="abilities">Abilities</h2><table class="short"

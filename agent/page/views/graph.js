@@ -7,6 +7,9 @@ import { address, nodeAddress, topicAddress } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { Badges, download, Failed, html, Mark, Name, PASSAGES, worst } from '../ui.js';
 import { Camera } from '../camera.js';
+import { chainsThrough, graphWords, marked, NO_CHAIN, section, throughGraph, wayOf }
+  from '../chains.js';
+import { ChainField, ChainLinks, useChains } from './chains.js';
 
 /** Delay between a change of the structure and its layout. */
 const SETTLE_MS = 500;
@@ -85,6 +88,10 @@ export function Graph({ query }) {
       (query.services && each.kind === 'service') || (query.actions && each.kind === 'action')),
     edges: asked.data.edges,
   } : null;
+  const chains = useChains();
+  const chain = query.chain ? section(chains.data?.chains ?? [], query.chain, query) : null;
+  const trail = useMemo(() => chain && throughGraph(chain), [chain && JSON.stringify([
+    chain.domain_id, wayOf(chain)])]);
   const toggled = (query.boxed ?? '').split(' ').filter(Boolean).map(decodeURIComponent);
   const options = /** @type {import('../graph-model.js').Options} */ ({
     mode: query.mode === 'nodes' ? 'nodes' : 'both',
@@ -94,9 +101,12 @@ export function Graph({ query }) {
     toggled: new Set(toggled),
     focus,
     hops,
+    shown: trail ? new Set(trail.keys.keys()) : undefined,
+    only: Boolean(query.only),
   });
   const graph = useMemo(() => build(state, options, joints), [
-    state.structure, JSON.stringify(query), asked.data]);
+    state.structure, JSON.stringify(query), asked.data, trail]);
+  const marks = useMemo(() => trail && marked(graph, trail), [graph, trail]);
   const { picture, milliseconds, failed } = useLayout(graph);
   const [chosen, choose] = useState(/** @type {string|null} */ (focus));
   const toggle = (/** @type {string} */ box) => {
@@ -126,6 +136,7 @@ export function Graph({ query }) {
           ${title}</label>`)}
       <${FocusField} focus=${focus} hops=${hops} change=${change} />
     </div>
+    <${ChainField} chains=${chains} chain=${chain} query=${query} change=${change} />
     <div class="controls">
       <button type="button" onClick=${() => download(`${host}.svg`, new Blob(
         [standalone(drawing.current)], { type: 'image/svg+xml' }))}>SVG</button>
@@ -143,9 +154,9 @@ export function Graph({ query }) {
       ? 'The selected node or topic does not exist now.' : 'No node has been announced yet.'}</p>`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
-        toggle=${toggle} own=${drawing} />
+        toggle=${toggle} own=${drawing} marks=${marks} />
       <${Panel} graph=${graph} chosen=${chosen} change=${change} toggle=${toggle}
-        choose=${choose} names=${vertexNames} /></div>`}
+        choose=${choose} names=${vertexNames} chains=${chains.data?.chains ?? []} /></div>`}
     <${Legend} />`;
 }
 
@@ -250,9 +261,11 @@ function label(edge) {
 
 /**
  * @param {{graph: import('../graph-model.js').Graph, picture: Picture, chosen: string|null,
- *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any}} props
+ *   choose: (key: string|null) => void, toggle: (key: string) => void, own: any,
+ *   marks: {vertices: Map<string, number>, edges: Set<string>}|null}} props
+ *   `marks` are the vertices and edges of a chain
  */
-function Drawing({ graph, picture, chosen, choose, toggle, own }) {
+function Drawing({ graph, picture, chosen, choose, toggle, own, marks }) {
   const stage = useRef(/** @type {SVGGElement|null} */ (null));
   const camera = useRef(/** @type {Camera|null} */ (null));
   useEffect(() => {
@@ -262,6 +275,15 @@ function Drawing({ graph, picture, chosen, choose, toggle, own }) {
   }, []);
   useEffect(() => camera.current?.frame(picture.width, picture.height),
     [picture.width, picture.height]);
+  const passed = marks ? [...marks.vertices.keys()].join('\n') : '';
+  const framed = useRef('');
+  useEffect(() => {
+    const places = [...marks?.vertices.keys() ?? []].map((key) => picture.at.get(key));
+    // The layout follows the structure some time later.
+    if (passed === framed.current || places.includes(undefined)) return;
+    framed.current = passed;
+    camera.current?.part(/** @type {any[]} */ (places));
+  }, [passed, picture]);
   const ends = brokenEnds();
   const nodes = healths();
   const near = useMemo(() => neighbours(graph), [graph]);
@@ -288,13 +310,14 @@ function Drawing({ graph, picture, chosen, choose, toggle, own }) {
   const labels = graph.edges.length <= 60;
   const few = graph.edges.length <= 400;
   return html`<div class="canvas"><svg ref=${own} role="group" onKeyDown=${keys}
+    class=${marks ? 'traced' : ''}
     aria-label="Graph of ${several(graph.nodes, 'node')}. Arrow keys move along the edges. The list
       of topics shows the same."
     onClick=${(/** @type {MouseEvent} */ event) => {
       if (event.target === own.current && !camera.current?.moved) choose(null);
     }}>
-    <defs>${ORDER.map((severity) => html`<marker id="arrow-${severity}" viewBox="0 0 8 8" refX="7"
-      refY="4" markerWidth="8" markerHeight="8" markerUnits="userSpaceOnUse" orient="auto">
+    <defs>${[...ORDER, 'passed'].map((severity) => html`<marker id="arrow-${severity}"
+      viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" markerUnits="userSpaceOnUse" orient="auto">
       <path d="M0 0.5L8 4L0 7.5Z" class="arrow ${severity}" /></marker>`)}</defs>
     <g ref=${stage}>
       ${shown.filter((each) => each.kind === 'box' && !each.closed).map((each) => html`<${Box}
@@ -307,16 +330,19 @@ function Drawing({ graph, picture, chosen, choose, toggle, own }) {
         const broken = edge.guids.some((guid) => ends.has(guid))
           && edge.topics.some((id) => state.flagsOf(id).includes('qos'));
         const health = broken ? 'error' : severity;
+        const isPassed = marks?.edges.has(edge.id);
         const active = chosen != null && (edge.from === chosen || edge.to === chosen
           || edge.id === chosen);
         const middle = points[Math.floor((points.length - 1) / 2)];
         const after = points[Math.floor((points.length - 1) / 2) + 1];
         const [x, y] = [(middle.x + after.x) / 2, (middle.y + after.y) / 2];
         return html`<g key=${edge.id} class="edge ${way(edge.passages, edge.kind)} ${health} ${active
-          ? 'active' : ''} ${measured ? '' : 'unmeasured'}" onClick=${() => choose(edge.id)}>
+          ? 'active' : ''} ${measured ? '' : 'unmeasured'} ${isPassed ? 'passed' : ''}"
+          onClick=${() => choose(edge.id)}>
           ${few && html`<path class="touch" d=${curve(points)} />`}
-          <path class="line" d=${curve(points)} stroke-width=${thickness(bytes).toFixed(1)}
-            marker-end="url(#arrow-${health})" />
+          <path class="line" d=${curve(points)} stroke-width=${Math.max(
+            isPassed ? 3 : 0, thickness(bytes)).toFixed(1)}
+            marker-end="url(#arrow-${isPassed ? 'passed' : health})" />
           ${(health === 'error' || health === 'warning') && edge.kind !== 'feeds' && html`<text
             class="sign ${health}" x=${x} y=${y + 4}>${health === 'error' ? '✖' : '▲'}</text>`}
           ${edge.kind === 'pair' && (labels || active) && html`<text class="edge-label" x=${x}
@@ -329,7 +355,8 @@ function Drawing({ graph, picture, chosen, choose, toggle, own }) {
       ${shown.filter((each) => each.kind !== 'box' || each.closed).map((each) => html`<${Shape}
         key=${each.key} vertex=${each} at=${picture.at.get(each.key)} nodes=${nodes}
         chosen=${chosen === each.key} roving=${roving === each.key} choose=${choose}
-        toggle=${toggle} camera=${camera} />`)}
+        toggle=${toggle} camera=${camera} position=${marks?.vertices.get(each.key)}
+        positions=${marks?.vertices.size} />`)}
     </g></svg>
     <div class="zoom"><button type="button" aria-label="Zoom in"
         onClick=${() => camera.current?.key('+')}>+</button>
@@ -403,7 +430,8 @@ function Box({ vertex, at, toggle, roving, choose }) {
 const SIGNS = /** @type {Record<string, string>} */ ({ error: '✖', warning: '▲' });
 
 /** @param {any} props */
-function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
+function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera, position,
+  positions }) {
   const figures = vertex.topic == null ? null : state.figuresOf(vertex.topic);
   const flags = vertex.topic == null ? [] : state.flagsOf(vertex.topic);
   let severity = vertex.topic != null ? worst(flags) : nodes.get(vertex.node) ?? 'good';
@@ -423,8 +451,10 @@ function Shape({ vertex, at, nodes, chosen, roving, choose, toggle, camera }) {
     if (vertex.closed) toggle(vertex.key);
     else choose(vertex.key);
   };
-  const words = sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '';
-  return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''}" role="button"
+  const words = (sign ? `, with ${severity === 'error' ? 'an error' : 'a warning'}` : '')
+    + (position ? `, ${position} of ${positions} in the chain` : '');
+  return html`<g class="vertex ${vertex.kind} ${severity} ${chosen ? 'chosen' : ''} ${position
+    ? 'passed' : ''}" role="button"
     tabindex=${roving ? 0 : -1} data-key=${vertex.key} onClick=${press}
     aria-expanded=${vertex.closed ? 'false' : undefined}
     aria-pressed=${vertex.closed ? undefined : chosen}
@@ -460,7 +490,7 @@ function healthOf(key, nodes) {
 }
 
 /** Describes the selection in words and with links. @param {any} props */
-function Panel({ graph, chosen, change, toggle, choose, names }) {
+function Panel({ graph, chosen, change, toggle, choose, names, chains }) {
   const vertex = graph.vertices.find((/** @type {any} */ each) => each.key === chosen);
   const edge = vertex ? null : graph.edges.find((/** @type {any} */ each) => each.id === chosen);
   const title = vertex ? html`<${Name} text=${vertex.name} />`
@@ -468,7 +498,7 @@ function Panel({ graph, chosen, change, toggle, choose, names }) {
       text=${names.get(edge.to) ?? ''} />` : 'Details';
   const link = (/** @type {string} */ key) => html`<button type="button" class="plain"
     onClick=${() => choose(key)}><${Name} text=${names.get(key) ?? key} /></button>`;
-  const ends = (/** @type {string} */ name, /** @type {any[]} */ edges,
+  const sides = (/** @type {string} */ name, /** @type {any[]} */ edges,
     /** @type {'from'|'to'} */ side) => edges.length > 0 && html`<h3>${name} (${count(edges.length)})</h3>
     <ul>${edges.slice(0, 40).map((each) => html`<li key=${each.id}>${link(each[side])}
       <span class="dim">${wayWords(each)}${each.topics.length > 1
@@ -476,6 +506,9 @@ function Panel({ graph, chosen, change, toggle, choose, names }) {
   const topic = vertex?.topic != null ? state.topics.get(vertex.topic) : null;
   const node = vertex?.node != null ? state.nodes.get(vertex.node) : null;
   const figures = topic && state.figuresOf(topic.id);
+  const place = topic ?? node;
+  const through = place ? chainsThrough(chains, { domain: place.domain,
+    [topic ? 'topic' : 'node']: place.name }) : [];
   return html`<aside class="panel" id="graph-panel" tabindex="-1" aria-label="Details">
     <h2>${title}</h2>
     ${!vertex && !edge && html`<p class="dim">Choose a node, a topic or an edge.</p>`}
@@ -492,8 +525,12 @@ function Panel({ graph, chosen, change, toggle, choose, names }) {
         || (node && finding.node === node.id)).slice(0, 8).map((finding) => html`<p
         key=${finding.id}><${Mark} severity=${finding.severity} /> <${Name}
         text=${finding.text} /></p>`)}
-      ${ends('From', graph.edges.filter((/** @type {any} */ each) => each.to === chosen), 'from')}
-      ${ends('To', graph.edges.filter((/** @type {any} */ each) => each.from === chosen), 'to')}`}
+      ${through.length > 0 && html`<p>In ${through.length === 1 ? 'the chain' : 'the chains'}${' '}
+        <${ChainLinks} chains=${through} filter=${place?.name ?? ''} />${' '}
+        <button type="button" class="small" onClick=${() => change({ ...NO_CHAIN,
+          ...graphWords(through[0]) })}>Highlight${through.length > 1 ? ' the first' : ''}</button></p>`}
+      ${sides('From', graph.edges.filter((/** @type {any} */ each) => each.to === chosen), 'from')}
+      ${sides('To', graph.edges.filter((/** @type {any} */ each) => each.from === chosen), 'to')}`}
     ${edge && html`<p>${wayWords(edge)}</p><ul>${edge.topics.map((/** @type {number} */ id) => {
       const each = state.topics.get(id);
       const own = state.figuresOf(id);

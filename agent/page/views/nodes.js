@@ -4,10 +4,12 @@ import { useRef } from '../vendor/hooks.mjs';
 import { named } from '../api.js';
 import { bytes, calls, count, date, percent, several } from '../format.js';
 import { nodeKey } from '../graph-model.js';
+import { Inside } from '../inside.js';
 import { address } from '../router.js';
 import { replaceAddress, state, useLive, usePoll } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
+import { InChains } from './chains.js';
 import { Findings } from './overview.js';
 
 const EVERY_MS = 2000;
@@ -159,6 +161,7 @@ export function NodeView({ name, query }) {
   return html`<h1 tabindex="-1"><${Name} text=${node.name} /></h1>
     <p class="facts">${state.hasDomains() && html`<span class="dim">Domain</span> ${node.domain} `}
       <a href=${address('graph', null, { focus: nodeKey(node), hops: 1 })}>In the graph</a></p>
+    <${InChains} domain=${node.domain} node=${node.name} />
     ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
       </section>`}
     <section aria-labelledby="where"><h2 id="where">${instances.length > 1
@@ -166,7 +169,7 @@ export function NodeView({ name, query }) {
     <div class="scroll" tabindex="0" role="group" aria-labelledby="where"><table><thead><tr>
       <th scope="col">Process</th><th scope="col">Host</th><th scope="col" class="number">CPU</th>
       <th scope="col" class="number">Memory</th><th scope="col" class="number">Threads</th>
-      <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">DDS</th></tr></thead>
+      <th scope="col">Started</th><th scope="col">Control group</th><th scope="col">Participant</th></tr></thead>
     <tbody>${instances.map((own) => {
       const process = own && byId.get(own.pid ?? -1);
       return own && html`<tr key=${own.guid}><th scope="row"><${Name} text=${[own.process, own.pid]
@@ -183,6 +186,7 @@ export function NodeView({ name, query }) {
     <p>Parameters: ${services.data
       ? known.length ? 'the node has parameter services.' : 'the node has no parameter services.'
       : '–'}</p>
+    <${Inside} inside=${data?.inside} />
     ${list('Publishers', data?.publishers, 'topics')}
     ${list('Subscriptions', data?.subscriptions, 'topics')}
     ${list('Services', data?.services, null)}

@@ -85,6 +85,9 @@ function rest(finding) {
 /** A link to a finding's subject. @param {{finding: import('../state.js').Finding}} props */
 function Place({ finding }) {
   const topic = finding.topic == null ? null : state.topics.get(finding.topic);
+  if (finding.kind === 'slow_chain') {
+    return html`<a href=${address('chains', null, { filter: topic?.name })}>Chains</a>:`;
+  }
   if (topic) return html`<a href=${topicAddress(topic)}><${Name} text=${topic.name} /></a>:`;
   const node = finding.node == null ? null : state.nodes.get(finding.node);
   if (node) return html`<a href=${nodeAddress(node)}><${Name} text=${node.name} /></a>:`;

@@ -10,6 +10,8 @@ import { LiveMessage } from '../message.js';
 import { Endpoints, Offered } from '../qos.js';
 import { state, stream, useLive, usePoll } from '../store.js';
 import { Badges, Failed, Figure, html, Mark, Name, PASSAGES, Text } from '../ui.js';
+import { Inside } from '../inside.js';
+import { InChains } from './chains.js';
 import { Findings } from './overview.js';
 import { Measure } from './topics.js';
 
@@ -41,11 +43,14 @@ export function Topic({ name, query }) {
       <a href=${address('graph', null, { focus: topicKey(topic), hops: 1 })}>In the graph</a>
       <a href=${address('events', null, { filter: topic.name })}>Events</a></p>
     <p><${Badges} flags=${state.flagsOf(topic.id)} /></p>
+    <${InChains} domain=${topic.domain} topic=${topic.name} />
     ${findings.length > 0 && html`<section aria-label="Findings"><${Findings} list=${findings} />
       </section>`}
     ${reasons.length > 0 && html`<ul class="findings">${reasons.map((/** @type {any} */ reason) =>
       html`<li key=${reason.code}><${Mark} severity="note" /> <${Name} text=${reason.detail} /></li>`)}
       </ul>`}
+    ${details.data?.source === 'inside' && html`<p class="dim">Rate and messages come from inside
+      the processes; the network shows none, and sizes are unknown.</p>`}
     <div class="figures">
       <${Figure} label="rate" value=${rate(figures.rate)} />
       <${Figure} label="bandwidth" value=${bandwidth(figures.bandwidth)} />
@@ -60,6 +65,7 @@ export function Topic({ name, query }) {
     ${details.data && html`
       <${Endpoints} details=${details.data} topic=${topic} />
       <${Offered} details=${details.data} />
+      <${Inside} inside=${details.data.inside} />
       <${Waterfall} details=${details.data} />
       <${Passages} details=${details.data} />`}
     <${Definition} key=${`definition ${topic.id}`} path=${named('topics', apiName(topic),
@@ -221,7 +227,8 @@ function Passages({ details }) {
   return html`<section aria-labelledby="ways"><h2 id="ways">Paths of messages</h2>
     ${passages.length > 0 && html`<p>${passages.map((/** @type {any} */ each) =>
       `${PASSAGES[each.passage] ?? each.passage}: ${count(each.pairs)} ${each.pairs === 1
-        ? 'pair' : 'pairs'}${each.view ? ` (view: ${each.view})` : ''}`).join('; ')}</p>`}
+        ? 'pair' : 'pairs'}${each.observed_pairs
+        ? `, ${count(each.observed_pairs)} seen inside` : ''}${each.view ? ` (view: ${each.view})` : ''}`).join('; ')}</p>`}
     ${spent.length > 0 && html`<table><caption>Delays on this host</caption><thead><tr>
       <th scope="col">Part</th><th scope="col" class="number">p50</th>
       <th scope="col" class="number">p99</th></tr></thead><tbody>${spent.map(([key, name]) => html`

@@ -29,6 +29,7 @@ pub mod rotel;
 pub mod sample_robot;
 pub mod truth;
 pub mod viewer;
+pub mod zenoh;
 
 use std::path::{Path, PathBuf};
 

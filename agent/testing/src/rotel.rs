@@ -26,6 +26,8 @@ pub struct Item {
     pub attributes: BTreeMap<String, String>,
     /// Counts of a histogram's buckets.
     pub buckets: Vec<u64>,
+    /// Traces and spans that a span links to.
+    pub links: Vec<BTreeMap<String, String>>,
 }
 
 /// Content of one request.
@@ -169,7 +171,14 @@ pub fn exports(text: &str) -> Vec<Export> {
                     item.buckets
                         .push(value.trim_start_matches("Count: ").parse().unwrap_or(0));
                 }
-                (Some(item), None) if !line.starts_with("     ->") => {
+                (Some(item), None) if name == "Trace ID" && is_listed(line) => {
+                    item.links.push(BTreeMap::from([(name, value.to_owned())]));
+                }
+                (Some(item), None) if name == "ID" && is_listed(line) => {
+                    let link = item.links.last_mut();
+                    link.and_then(|link| link.insert(name, value.to_owned()));
+                }
+                (Some(item), None) if !is_listed(line) => {
                     item.fields.insert(name, value.to_owned());
                 }
                 _ => drop(family.insert(name, value.to_owned())),
@@ -177,6 +186,11 @@ pub fn exports(text: &str) -> Vec<Export> {
         }
     }
     exports
+}
+
+/// Returns whether the line is an attribute, or a field of a link.
+fn is_listed(line: &str) -> bool {
+    line.starts_with("     ->")
 }
 
 /// Returns the value in `Str(value)` or `Int(value)`.

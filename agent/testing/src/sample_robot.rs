@@ -1,5 +1,7 @@
 //! A robot of any size as the model describes it, with every fact filled in.
 
+pub mod inside;
+
 use std::net::Ipv4Addr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -8,6 +10,9 @@ use ros2probe_daemon::agent_facts::{
     AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
 use ros2probe_daemon::state::StateFacts;
+use ros2probe_model::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
+use ros2probe_model::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
+use ros2probe_model::chain::trace::{HopTimes, Method, Path, Point};
 use ros2probe_model::diagnosis::{
     Diagnoses, Diagnosis, Policies, Policy, QosPairs, TopicKey, Unmatched,
 };
@@ -17,16 +22,84 @@ use ros2probe_model::services::latency::Latencies;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
     DeliveryFacts, Direction, EndpointFacts, GoalCounts, LatencyFacts, Measurement, NodeFacts,
-    ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts, Subscriber,
-    TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts, WatchFacts, WatchState,
-    WatchedTopicFacts,
+    ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts, Source,
+    Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts, WatchFacts,
+    WatchState, WatchedTopicFacts,
 };
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_model::watch::Watch;
+use ros2probe_model::zenoh::{Counters, ZenohFacts};
 use ros2probe_wire::discovery::TypeHash;
 use ros2probe_wire::qos::{History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+
+/// Returns a chain of 100 messages from /points to /cmd_vel, configured with a limit of 15 ms.
+fn chains() -> ChainsFacts {
+    let topic = |name: &str, node: &str| (name.into(), Some(node.into()));
+    let path = Arc::new(Path {
+        domain_id: DomainId(0),
+        method: Method::Stamps,
+        topics: vec![
+            topic("/points", "/lidar"),
+            topic("/filtered", "/filter"),
+            topic("/cmd_vel", "/controller"),
+        ],
+    });
+    let trace = |number: u64| {
+        let begin = Timestamp(1_699_999_990_000_000_000 + number * 50_000_000);
+        let point = |published: u64, arrived: Option<u64>| Point {
+            published: begin + Duration::from_micros(published),
+            arrived: arrived.map(|at| begin + Duration::from_micros(at)),
+            started: None,
+        };
+        vec![
+            point(0, Some(300)),
+            point(12_000 + number, Some(12_200 + number)),
+            point(16_000 + number, None),
+        ]
+    };
+    let traces: Vec<_> = (0..100).map(trace).collect();
+    let mut histogram = Histogram::default();
+    let mut hops = vec![HopHistograms::default(); 2];
+    for points in &traces {
+        let seconds =
+            |input: &Point, output: &Point| HopTimes::between(input, output).whole.as_secs_f64();
+        histogram.observe(seconds(&points[0], &points[2]));
+        for (hop, ends) in hops.iter_mut().zip(points.windows(2)) {
+            let times = HopTimes::between(&ends[0], &ends[1]);
+            hop.whole.observe(times.whole.as_secs_f64());
+            hop.transit.observe(times.transit.unwrap().as_secs_f64());
+            hop.node.observe(times.node.unwrap().as_secs_f64());
+        }
+    }
+    let ends = traces
+        .iter()
+        .map(|points| HopTimes::between(&points[0], &points[2]).whole);
+    ChainsFacts {
+        expected: vec![ExpectedFacts {
+            chain: ExpectedChain {
+                domain_id: None,
+                from: "/points".into(),
+                to: "/cmd_vel".into(),
+                max_latency: Some(Duration::from_millis(15)),
+            },
+            domain_id: Some(DomainId(0)),
+            method: Some(Method::Stamps),
+            state: ChainState::Slow,
+            histogram,
+            latency: Quantiles::of(ends),
+        }],
+        chains: vec![ChainFacts {
+            path,
+            count: 100,
+            last: traces[99][2].published,
+            traces: Arc::new(traces.into()),
+            whole: histogram,
+            hops,
+        }],
+    }
+}
 
 /// Returns an agent's full state for a robot with topics of these names, all watched by `/**`.
 pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
@@ -82,6 +155,20 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
         }],
         services: vec![service()],
         actions: vec![action()],
+        inside: Some(Arc::new(inside::inside())),
+        zenoh: Some(ZenohFacts {
+            connections: 3,
+            routers: 1,
+            counters: Counters {
+                batches: 7000,
+                gaps: 2,
+                foreign: 4,
+                incomplete: 1,
+            },
+            unseen: [1, 0, 0, 0, 0, 0],
+            evictions: 0,
+        }),
+        chains: chains(),
         diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
         diagnoses: Arc::new(diagnoses()),
         churn: vec![ChurnCount {
@@ -160,7 +247,7 @@ fn diagnoses() -> Diagnoses {
     };
     let mut policies = Policies::default();
     policies.insert(Policy::Reliability);
-    let list = vec![
+    let mut list = vec![
         Diagnosis::QosIncompatible {
             topic: topic.clone(),
             writer,
@@ -205,7 +292,18 @@ fn diagnoses() -> Diagnoses {
             participant,
             domains: vec![DomainId(0), DomainId(5)],
         },
+        Diagnosis::RestampingNode {
+            topic: topic.clone(),
+            node: "/lidar".into(),
+            input: "/scan".into(),
+        },
+        Diagnosis::SlowChain {
+            topic: topic.clone(),
+            from: "/scan".into(),
+            max_latency: Duration::from_millis(15),
+        },
     ];
+    list.extend(inside::findings(&topic));
     let qos_pairs = vec![QosPairs {
         topic,
         policy: Policy::Reliability,
@@ -241,6 +339,7 @@ pub fn agent() -> AgentFacts {
             writes: 3,
             failures: 0,
         }),
+        inside: Some(inside::source()),
         exact: vec![ExactFacts {
             library: "/opt/ros/humble/lib/libfastrtps.so.2.6".to_owned(),
             refused: None,
@@ -260,6 +359,7 @@ pub fn topic(name: &str) -> TopicFacts {
     let guid = |entity: u8| Guid::new(GuidPrefix([1; 12]), EntityId([0, 0, entity, 3]));
     let endpoint = |guid: Guid| EndpointFacts {
         guid,
+        gid: guid.to_bytes(),
         node: Some("/lidar".into()),
         qos: Arc::new(Qos {
             reliability: Reliability::RELIABLE,
@@ -308,6 +408,9 @@ pub fn topic(name: &str) -> TopicFacts {
             pairs: 1,
         }],
         is_read: false,
+        source: Source::Wire,
+        inside: Some(Box::new(inside::topic())),
+        observed_pairs: Vec::new(),
     }
 }
 

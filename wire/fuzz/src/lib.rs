@@ -1,7 +1,7 @@
 //! Bodies of the fuzz targets: plain functions, so that the tests run them too, over the committed
 //! seeds and all their truncations (`wire/tests/fuzz_seeds.rs`). In this directory: `cargo +nightly
-//! fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery` and `entities` with
-//! their directories under `seeds`.
+//! fuzz run datagram corpus/datagram ../tests/data/datagrams`, and `discovery`, `entities` and
+//! `zenoh` with their directories under `seeds`.
 //!
 //! Each reads its bytes as the agent does and asserts what must hold for any bytes: it never
 //! panics, no list exceeds its bound, and nothing is kept that does not exist in the input. The
@@ -17,9 +17,15 @@ use ros2probe_wire::{EntityId, Guid, SequenceNumber};
 
 #[path = "../../tests/oracle/mod.rs"]
 pub mod oracle;
+mod zenoh;
 
 use oracle::sets::SequenceNumberSet;
 use oracle::{Body, Message, Submessage};
+
+/// Reads a batch of Zenoh with every parser.
+pub fn zenoh(bytes: &[u8]) {
+    zenoh::read(bytes);
+}
 
 /// Reads a UDP payload with every parser.
 pub fn datagram(bytes: &[u8]) {

@@ -18,6 +18,8 @@ pub struct EndpointAnnouncement {
     pub guid: Guid,
     /// GUID of its participant.
     pub participant: Guid,
+    /// Identity that ROS prints: the GUID, or with Zenoh the hash of the liveliness token.
+    pub gid: [u8; 16],
     /// Writer or reader.
     pub role: Role,
     /// Vendor of its DDS implementation.
@@ -47,6 +49,35 @@ pub struct EndpointAnnouncement {
 }
 
 impl EndpointAnnouncement {
+    /// Creates an announcement of the identity, topic and type, with the defaults for all else.
+    #[must_use]
+    pub fn new(
+        guid: Guid,
+        role: Role,
+        vendor: VendorId,
+        topic: DdsTopic,
+        type_name: DdsType,
+    ) -> Self {
+        Self {
+            guid,
+            participant: Guid::new(guid.prefix, EntityId::PARTICIPANT),
+            gid: guid.to_bytes(),
+            role,
+            vendor,
+            topic,
+            type_name,
+            qos: Qos::defaults(role, vendor),
+            type_hash: None,
+            service_type_hash: None,
+            unicast: Vec::new(),
+            multicast: Vec::new(),
+            datasharing: false,
+            content_filter: false,
+            is_secured: false,
+            is_truncated: false,
+        }
+    }
+
     /// Parses a payload of the SEDP writer for `role`.
     ///
     /// # Errors
@@ -69,30 +100,16 @@ impl EndpointAnnouncement {
             return Err(bad("PID_ENDPOINT_GUID"));
         }
         // Cyclone DDS omits it. A different one would assign the endpoint to another participant.
-        let participant = Guid::new(guid.prefix, EntityId::PARTICIPANT);
         if let Some(mut value) = parameters.find(ParameterId::PARTICIPANT_GUID)?
-            && Guid::from_bytes(value.array("PID_PARTICIPANT_GUID")?) != participant
+            && Guid::from_bytes(value.array("PID_PARTICIPANT_GUID")?)
+                != Guid::new(guid.prefix, EntityId::PARTICIPANT)
         {
             return Err(bad("PID_PARTICIPANT_GUID"));
         }
         let vendor = vendor(parameters, sender)?;
-        let mut endpoint = Self {
-            guid,
-            participant,
-            role,
-            vendor,
-            topic: DdsTopic::read(&mut required(ParameterId::TOPIC_NAME, "PID_TOPIC_NAME")?)?,
-            type_name: DdsType::read(&mut required(ParameterId::TYPE_NAME, "PID_TYPE_NAME")?)?,
-            qos: Qos::defaults(role, vendor),
-            type_hash: None,
-            service_type_hash: None,
-            unicast: Vec::new(),
-            multicast: Vec::new(),
-            datasharing: false,
-            content_filter: false,
-            is_secured: false,
-            is_truncated: false,
-        };
+        let topic = DdsTopic::read(&mut required(ParameterId::TOPIC_NAME, "PID_TOPIC_NAME")?)?;
+        let type_name = DdsType::read(&mut required(ParameterId::TYPE_NAME, "PID_TYPE_NAME")?)?;
+        let mut endpoint = Self::new(guid, role, vendor, topic, type_name);
         for parameter in parameters {
             let parameter = parameter?;
             endpoint.apply(parameter.id.known(), parameter.value)?;

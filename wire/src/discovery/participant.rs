@@ -75,23 +75,12 @@ pub struct ParticipantAnnouncement {
 }
 
 impl ParticipantAnnouncement {
-    /// Parses an SPDP payload.
-    ///
-    /// # Errors
-    /// Fails if the list is malformed or lacks the participant's GUID.
-    pub fn parse(payload: &[u8], sender: VendorId) -> Result<Self, WireError> {
-        let parameters = ParameterList::encapsulated(payload)?;
-        let nobody = WireError {
-            what: "PID_PARTICIPANT_GUID",
-            offset: 4,
-            reason: Reason::BadValue,
-        };
-        let guid = guid(parameters, ParameterId::PARTICIPANT_GUID)?
-            .filter(|guid| guid.entity == EntityId::PARTICIPANT)
-            .ok_or(nobody)?;
-        let mut participant = Self {
+    /// Creates an announcement of nothing but the identity, with the defaults for all else.
+    #[must_use]
+    pub fn new(guid: Guid, vendor: VendorId) -> Self {
+        Self {
             guid,
-            vendor: vendor(parameters, sender)?,
+            vendor,
             protocol_version: ProtocolVersion::default(),
             lease: DEFAULT_LEASE,
             domain_id: None,
@@ -106,7 +95,24 @@ impl ParticipantAnnouncement {
             builtin_endpoints: BuiltinEndpoints::default(),
             is_secured: false,
             is_truncated: false,
+        }
+    }
+
+    /// Parses an SPDP payload.
+    ///
+    /// # Errors
+    /// Fails if the list is malformed or lacks the participant's GUID.
+    pub fn parse(payload: &[u8], sender: VendorId) -> Result<Self, WireError> {
+        let parameters = ParameterList::encapsulated(payload)?;
+        let invalid = WireError {
+            what: "PID_PARTICIPANT_GUID",
+            offset: 4,
+            reason: Reason::BadValue,
         };
+        let guid = guid(parameters, ParameterId::PARTICIPANT_GUID)?
+            .filter(|guid| guid.entity == EntityId::PARTICIPANT)
+            .ok_or(invalid)?;
+        let mut participant = Self::new(guid, vendor(parameters, sender)?);
         for parameter in parameters {
             let parameter = parameter?;
             participant.apply(parameter.id.known(), parameter.value)?;

@@ -1,11 +1,12 @@
-//! IPv4 (RFC 791) and IPv6 (RFC 8200) down to UDP (RFC 768).
+//! IPv4 (RFC 791) and IPv6 (RFC 8200) down to UDP (RFC 768) and TCP (RFC 9293).
 //!
 //! Packets whose lengths make the receiving kernel discard them are errors here, so that nothing
 //! counts that no socket can have received.
 
-use super::{Datagram, Fragment, Packet, Payload};
+use super::{Datagram, Fragment, Packet, Payload, Segment};
 use crate::cursor::{Cursor, Reason, WireError};
 
+const TCP: u8 = 6;
 const UDP: u8 = 17;
 const UDP_HEADER: usize = 8;
 /// Offsets of fragments are limited to 16 bits.
@@ -31,8 +32,10 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     cursor.u16("IPv4 checksum")?;
     let source = mapped(cursor.array("IPv4 source")?);
     let destination = mapped(cursor.array("IPv4 destination")?);
-    if protocol != UDP {
-        // Precedes the checks of lengths: segmentation offload shows TCP with a total length of 0.
+    let more = fragmentation & 0x2000 != 0;
+    let offset = u32::from(fragmentation & 0x1fff) * 8;
+    let is_fragment = more || offset != 0;
+    if protocol != UDP && (protocol != TCP || is_fragment) {
         return Ok(Packet {
             source,
             destination,
@@ -42,15 +45,20 @@ pub(super) fn v4(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     let options = header_length
         .checked_sub(20)
         .ok_or(start.error("IPv4 header length", Reason::BadLength))?;
+    // Segmentation offload shows long TCP segments with a total length of 0.
+    let total_length = match total_length {
+        0 if protocol == TCP => available,
+        length => length,
+    };
     let body_length = total_length
         .checked_sub(header_length)
         .filter(|_| total_length <= available)
         .ok_or(start.error("IPv4 total length", Reason::BadLength))?;
     cursor.take("IPv4 options", options)?;
     let body = Body::new(cursor, body_length)?;
-    let more = fragmentation & 0x2000 != 0;
-    let offset = u32::from(fragmentation & 0x1fff) * 8;
-    let payload = if more || offset != 0 {
+    let payload = if protocol == TCP {
+        Payload::Segment(body.segment()?)
+    } else if is_fragment {
         Payload::Fragment(body.fragment(id, offset, more)?)
     } else {
         Payload::Datagram(body.datagram(false)?)
@@ -80,9 +88,14 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
         destination,
         payload,
     };
-    if !matches!(next_header, UDP | 0 | 43 | 44 | 51 | 60) {
+    if !matches!(next_header, TCP | UDP | 0 | 43 | 44 | 51 | 60) {
         return Ok(packet(Payload::Other(next_header)));
     }
+    // As with IPv4, long TCP segments have a length of 0; a jumbogram's option precedes them.
+    let payload_length = match payload_length {
+        0 if matches!(next_header, TCP | 0) => available.saturating_sub(40),
+        length => length,
+    };
     if payload_length.saturating_add(40) > available {
         return Err(start.error("IPv6 payload length", Reason::BadLength));
     }
@@ -90,6 +103,7 @@ pub(super) fn v6(mut cursor: Cursor<'_>, length: usize) -> Result<Packet<'_>, Wi
     for _ in 0..MOST_EXTENSION_HEADERS {
         match next_header {
             UDP => return Ok(packet(Payload::Datagram(body.datagram(true)?))),
+            TCP => return Ok(packet(Payload::Segment(body.segment()?))),
             // Hop-by-hop options, routing, destination options: length in units of 8 after the
             // first 8 octets.
             0 | 43 | 60 => {
@@ -169,6 +183,32 @@ impl<'a> Body<'a> {
             more,
             bytes: self.cursor.rest(),
             length,
+        })
+    }
+
+    /// Parses a TCP segment.
+    fn segment(mut self) -> Result<Segment<'a>, WireError> {
+        let start = self.cursor;
+        let source_port = self.cursor.u16("TCP source port")?;
+        let destination_port = self.cursor.u16("TCP destination port")?;
+        let sequence_number = self.cursor.u32("TCP sequence number")?;
+        self.cursor.take("TCP acknowledgement", 4)?;
+        let [offset, flags] = self.cursor.array("TCP flags")?;
+        self.cursor.take("TCP window, checksum and pointer", 6)?;
+        let header = usize::from(offset >> 4) * 4;
+        let wrong = start.error("TCP data offset", Reason::BadLength);
+        let length = self.length.checked_sub(header).ok_or(wrong)?;
+        let options = header.checked_sub(20).ok_or(wrong)?;
+        self.cursor.take("TCP options", options)?;
+        Ok(Segment {
+            source_port,
+            destination_port,
+            sequence_number,
+            syn: flags & 0x02 != 0,
+            fin: flags & 0x01 != 0,
+            rst: flags & 0x04 != 0,
+            payload: self.cursor.rest(),
+            length: u32::try_from(length).map_err(|_| wrong)?,
         })
     }
 

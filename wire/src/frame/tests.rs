@@ -356,6 +356,7 @@ fn one_wrong_byte_never_reads_outside() {
                     let (held, length) = match packet.payload {
                         Payload::Datagram(datagram) => (datagram.payload.len(), datagram.length),
                         Payload::Fragment(part) => (part.bytes.len(), part.length),
+                        Payload::Segment(part) => (part.payload.len(), part.length),
                         Payload::Other(_) => (0, 0),
                     };
                     assert_eq!(held, usize::try_from(length).unwrap());

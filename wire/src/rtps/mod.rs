@@ -37,6 +37,9 @@ impl VendorId {
     pub const CYCLONE: Self = Self([0x01, 0x10]);
     /// Atostek RustDDS.
     pub const RUSTDDS: Self = Self([0x01, 0x12]);
+    /// Eclipse Zenoh, which is no DDS and has no number of the OMG: all numbers of the OMG begin
+    /// with 1.
+    pub const ZENOH: Self = Self(*b"Ze");
 
     /// Returns the product's name for people and for labels; `None` if the number is unknown.
     #[must_use]
@@ -55,6 +58,7 @@ impl VendorId {
             [0x01, 0x12] => "Atostek RustDDS",
             [0x01, 0x15] => "SafeDDS",
             [0x01, 0x20] => "ADLINK Cloud",
+            [b'Z', b'e'] => "Eclipse Zenoh",
             _ => return None,
         })
     }

@@ -33,15 +33,18 @@ pub(super) struct HostHook {
     layout: KernelLayout,
     tracepoints: Option<Tracepoints>,
     egress: ProgramFd,
+    /// The programs for TCP segments of Zenoh, or why the kernel refuses them.
+    zenoh: Result<[ProgramFd; 2], FilterError>,
     links: Vec<OwnedFd>,
     /// Values are [`Socket`]s.
-    sockets: HashMap<MapData, u64, [u64; 2]>,
+    sockets: HashMap<MapData, u64, [u64; 3]>,
 }
 
 /// The host hook's programs, to be linked to a cgroup.
 pub struct Links {
     ingress: OwnedFd,
     egress: OwnedFd,
+    zenoh: Option<[OwnedFd; 2]>,
 }
 
 /// One piece of a captured datagram, read in place; dropping it frees its room in the ring.
@@ -76,6 +79,8 @@ impl Filter {
         let mut ebpf = open(settings, true, &sizes, Some(&layout), 0)?;
         let ingress = load_program(&mut ebpf, "host_ingress")?;
         let egress = load_program(&mut ebpf, "host_egress")?;
+        let zenoh = load_program(&mut ebpf, "zenoh_ingress")
+            .and_then(|ingress| Ok([ingress, load_program(&mut ebpf, "zenoh_egress")?]));
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
         let mut filter = Self::with_maps(&mut ebpf, ingress, None)?;
         filter.host = Some(HostHook {
@@ -83,6 +88,7 @@ impl Filter {
             layout,
             tracepoints: None,
             egress,
+            zenoh,
             links: Vec::new(),
             sockets,
         });
@@ -117,6 +123,13 @@ impl Filter {
         Ok(Links {
             ingress: own(self.program()).map_err(FilterError::Attach)?,
             egress: own(host.egress.as_fd()).map_err(FilterError::Attach)?,
+            zenoh: match &host.zenoh {
+                Ok([ingress, egress]) => {
+                    let ingress = own(ingress.as_fd()).map_err(FilterError::Attach)?;
+                    Some([ingress, own(egress.as_fd()).map_err(FilterError::Attach)?])
+                }
+                Err(_) => None,
+            },
         })
     }
 
@@ -149,6 +162,15 @@ impl Filter {
     #[must_use]
     pub fn egress_program(&self) -> Option<BorrowedFd<'_>> {
         self.host.as_ref().map(|host| host.egress.as_fd())
+    }
+
+    /// Returns the programs for received and sent TCP segments of Zenoh; `None` on the wire hook.
+    ///
+    /// # Errors
+    /// Returns why the kernel refuses them.
+    pub fn zenoh_programs(&self) -> Option<Result<[BorrowedFd<'_>; 2], &FilterError>> {
+        let programs = self.host.as_ref()?.zenoh.as_ref();
+        Some(programs.map(|programs| programs.each_ref().map(ProgramFd::as_fd)))
     }
 
     /// Returns a descriptor that is readable when the ring of captured datagrams is half full;
@@ -196,10 +218,12 @@ impl Links {
     /// # Errors
     /// Fails as [`Filter::attach`] does.
     pub fn create(&self, cgroup: &File) -> Result<Vec<OwnedFd>, FilterError> {
-        let programs = [(&self.ingress, INGRESS), (&self.egress, EGRESS)];
-        let links = programs.map(|(program, direction)| link(program, cgroup, direction));
-        links
+        let zenoh = self.zenoh.iter();
+        let zenoh = zenoh.flat_map(|[one, other]| [(one, INGRESS), (other, EGRESS)]);
+        [(&self.ingress, INGRESS), (&self.egress, EGRESS)]
             .into_iter()
+            .chain(zenoh)
+            .map(|(program, direction)| link(program, cgroup, direction))
             .collect::<io::Result<_>>()
             .map_err(|error| match error.raw_os_error() {
                 Some(libc::EPERM) => FilterError::AttachNotPermitted(error),

@@ -57,6 +57,8 @@ impl Filter {
             ("PIECES", ring_size(settings.piece_ring_bytes)),
             ("FLOWS", UNUSED),
             ("SOCKETS", UNUSED),
+            ("CONNECTIONS", UNUSED),
+            ("CANDIDATES", UNUSED),
         ];
         let mut ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
         for form in [Form::Whole, Form::List] {

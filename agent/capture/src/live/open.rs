@@ -10,8 +10,9 @@ use super::super::uprobe::Uprobe;
 use super::super::wire_tap::{WireTap, WireTapSettings};
 use super::CaptureError;
 use crate::error_chain::in_words;
+use crate::inside::Inside;
 use crate::reassembly::Limits;
-use crate::settings::{CaptureSettings, ExactChoice, SourceChoice};
+use crate::settings::{CaptureSettings, ExactChoice, InsideChoice, SourceChoice};
 
 /// Least share of a namespace: one fragmented datagram fits, however many namespaces share the cap.
 const LEAST_REASSEMBLY: usize = 1 << 17;
@@ -46,6 +47,7 @@ pub(super) fn open_host(
         cgroup: settings.cgroup.clone(),
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,
+        zenoh_ports: settings.zenoh_ports.clone(),
     });
     match opened {
         Ok(host) => Ok((Some(host), None)),
@@ -80,6 +82,17 @@ pub(super) fn open_exact(
     }
 }
 
+/// Returns the programs inside processes, or why they are unavailable.
+pub(super) fn open_inside(settings: &CaptureSettings) -> (Option<Inside>, Option<String>) {
+    if settings.inside == InsideChoice::Off {
+        return (None, None);
+    }
+    match Inside::open(settings.inside, settings.cgroup.as_deref()) {
+        Ok(inside) => (Some(inside), None),
+        Err(error) => (None, Some(in_words(&error))),
+    }
+}
+
 /// Opens a tap for this namespace and for each configured one.
 pub(super) fn open_wires(
     settings: &CaptureSettings,
@@ -97,6 +110,7 @@ pub(super) fn open_wires(
         ring_bytes: settings.ring_bytes,
         record_ring_bytes: settings.record_ring_bytes,
         reassembly: limits,
+        zenoh_ports: settings.zenoh_ports.clone(),
     };
     let mut wires = vec![WireTap::open(&wire, 0, None)?];
     for (number, path) in (1..).zip(&settings.network_namespaces) {

@@ -368,7 +368,7 @@ fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
                 let key = FlowKey::new(0, interface, outgoing, &packet, &part);
                 whole += u64::from(reassembly.fragment(captured.time, key, &part).is_some());
             }
-            Payload::Other(_) => {}
+            Payload::Segment(_) | Payload::Other(_) => {}
         }
     }
     (reader.packets(), whole, reassembly.counters())

@@ -1,5 +1,5 @@
-//! Finds the function of a Fast DDS library that copies a message into shared memory, in its symbol
-//! table.
+//! Finds functions of a library in its symbol table, above all the one of Fast DDS that copies a
+//! message into shared memory.
 //!
 //! The file is untrusted, perhaps a container's: every read is bounded, nothing is mapped, and no
 //! more is allocated than the file holds. Reads ELF64 of this machine (System V ABI, gABI chapters
@@ -99,11 +99,49 @@ struct Segment {
     size: u64,
 }
 
-/// Finds the function.
+/// Finds the function that copies messages into shared memory.
 ///
 /// # Errors
 /// Fails if the file is malformed, or does not name the function.
 pub fn find(file: &File) -> Result<Entry, LibraryError> {
+    let mut found = None;
+    let header = visit(file, |name, address| {
+        let parameters = name.strip_prefix(FUNCTION.as_bytes());
+        let form = parameters.and_then(|parameters| match parameters {
+            _ if parameters.starts_with(WHOLE.as_bytes()) => Some(Form::Whole),
+            _ if parameters.starts_with(LIST.as_bytes()) => Some(Form::List),
+            _ => None,
+        });
+        found = found.or(form.map(|form| (address, form)));
+    })?;
+    let (address, form) = found.ok_or(LibraryError::NoSymbol)?;
+    let offset = place(file, &header, address)?;
+    Ok(Entry { offset, form })
+}
+
+/// Returns the offset in the file of each function of these names, in the same order; `None` for
+/// one that the library does not have.
+///
+/// # Errors
+/// Fails if the file is malformed.
+pub fn functions(file: &File, names: &[&str]) -> Result<Vec<Option<u64>>, LibraryError> {
+    let mut found = vec![None; names.len()];
+    let header = visit(file, |name, address| {
+        let name = name.split(|byte| *byte == 0).next().unwrap_or_default();
+        let index = names.iter().position(|each| each.as_bytes() == name);
+        if let Some(found) = index.and_then(|index| found.get_mut(index)) {
+            *found = Some(address);
+        }
+    })?;
+    let offsets = found.into_iter().map(|address| {
+        let offset = address.map(|address| place(file, &header, address));
+        offset.transpose()
+    });
+    offsets.collect()
+}
+
+/// Calls `with` with the name, and what follows it, and the address of each function of a library.
+fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, LibraryError> {
     let bytes: [u8; HEADER] = array(file, 0)?;
     let header = Header::read(&bytes)?;
     let sections = table(file, header.sections, header.section_count, SECTION)?;
@@ -120,13 +158,10 @@ pub fn find(file: &File) -> Result<Entry, LibraryError> {
             let Some(names) = names.and_then(|index| sections.get(index)) else {
                 continue;
             };
-            if let Some((address, form)) = search(file, symbols, names)? {
-                let offset = directory(file, &header, address)?;
-                return Ok(Entry { offset, form });
-            }
+            search(file, symbols, names, &mut with)?;
         }
     }
-    Err(LibraryError::NoSymbol)
+    Ok(header)
 }
 
 /// Positions of the tables, from the file header.
@@ -168,12 +203,13 @@ impl Header {
     }
 }
 
-/// Returns the function's address in these symbols, and how it receives its message.
+/// Calls `with` for each function in these symbols.
 fn search(
     file: &File,
     symbols: &Section,
     names: &Section,
-) -> Result<Option<(u64, Form)>, LibraryError> {
+    with: &mut impl FnMut(&[u8], u64),
+) -> Result<(), LibraryError> {
     if symbols.size > MAX_TABLE || names.size > MAX_NAMES {
         return Err(LibraryError::Foreign);
     }
@@ -191,21 +227,15 @@ fn search(
             continue;
         }
         let name = usize::try_from(name).ok().and_then(|at| names.get(at..));
-        let parameters = name.and_then(|name| name.strip_prefix(FUNCTION.as_bytes()));
-        let form = parameters.and_then(|parameters| match parameters {
-            _ if parameters.starts_with(WHOLE.as_bytes()) => Some(Form::Whole),
-            _ if parameters.starts_with(LIST.as_bytes()) => Some(Form::List),
-            _ => None,
-        });
-        if let Some(form) = form {
-            return Ok(Some((address, form)));
+        if let Some(name) = name {
+            with(name, address);
         }
     }
-    Ok(None)
+    Ok(())
 }
 
 /// Returns the file offset of the code loaded at this address, behind a landing pad.
-fn directory(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
+fn place(file: &File, header: &Header, address: u64) -> Result<u64, LibraryError> {
     let segments = table(file, header.segments, header.segment_count, SEGMENT)?;
     let (segments, _) = segments.as_chunks::<SEGMENT>();
     for bytes in segments {

@@ -5,6 +5,7 @@
 //! it is copied, so names, samples and losses are as exact as at a socket. It sees messages passed
 //! to the transport, even those that a full port or segment then refuses.
 
+pub mod attachments;
 pub mod library;
 pub mod processes;
 pub mod search;
@@ -47,6 +48,9 @@ pub enum UprobeError {
     /// The kernel does not expose a process's control group to programs.
     #[error("uprobes limited to one control group (capture.cgroup) need Linux 5.16")]
     Scope(#[source] FilterError),
+    /// The same, for the programs inside processes.
+    #[error("observing the processes of one control group (capture.cgroup) needs Linux 5.16")]
+    InsideScope(#[source] FilterError),
     /// The kernel programs cannot be loaded.
     #[error(transparent)]
     Filter(#[from] FilterError),
@@ -74,7 +78,7 @@ pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
 
 /// Returns the missing capabilities of the calling thread; empty if its capabilities cannot be
 /// read.
-fn missing() -> Vec<&'static str> {
+pub(crate) fn missing() -> Vec<&'static str> {
     capabilities(None).map_or_else(|_| Vec::new(), |sets| lacking(sets.effective))
 }
 
@@ -117,7 +121,7 @@ impl Uprobe {
             Scope::Cgroup(path.to_path_buf())
         });
         Ok(Self {
-            reader: FilterReader::new(filter),
+            reader: FilterReader::new(filter, &[]),
             search: LibrarySearch::new(probes, scope, on_demand),
             was_attached: false,
         })
@@ -191,7 +195,7 @@ impl Uprobe {
 }
 
 /// Returns a control group's id: the inode of its directory.
-fn inode(path: &Path) -> Result<u64, UprobeError> {
+pub(crate) fn inode(path: &Path) -> Result<u64, UprobeError> {
     let metadata = File::open(path).and_then(|directory| directory.metadata());
     let metadata = metadata.map_err(|source| UprobeError::Cgroup {
         path: path.to_path_buf(),

@@ -1,4 +1,4 @@
-//! Finds the processes that use Fast DDS, and the files of their libraries.
+//! Finds the processes that use a library, and the files of it.
 //!
 //! Reads `/proc/<pid>/maps` of new processes, of young ones for a while, and of the others
 //! occasionally: a library may be loaded late. Reads no process memory.
@@ -46,10 +46,10 @@ pub struct Mapped {
     pub range: String,
 }
 
-/// Files of Fast DDS that a process maps.
+/// Files of the library, and of Fast DDS's shared memory, that a process maps.
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
 pub struct Use {
-    /// Libraries of Fast DDS.
+    /// Files of the library.
     pub libraries: Vec<Mapped>,
     /// Whether it maps files of Fast DDS's shared memory.
     pub shares: bool,
@@ -59,6 +59,7 @@ pub struct Use {
 #[derive(Debug)]
 pub struct Processes {
     scope: Scope,
+    is_library: fn(&str) -> bool,
     known: HashMap<u32, Process>,
 }
 
@@ -71,9 +72,9 @@ struct Process {
 }
 
 impl Use {
-    /// Parses the text of a map.
+    /// Parses the text of a map. `is_library`: whether a file of this name is the library.
     #[must_use]
-    pub fn parse(text: &str) -> Self {
+    pub fn parse(text: &str, is_library: fn(&str) -> bool) -> Self {
         let mut found = Self::default();
         for line in text.lines() {
             // Range, permissions, offset, device, inode; the rest is the path.
@@ -100,11 +101,11 @@ impl Use {
         found
     }
 
-    fn read(process: u32) -> io::Result<Self> {
+    fn read(process: u32, is_library: fn(&str) -> bool) -> io::Result<Self> {
         let mut bytes = Vec::new();
         let file = File::open(format!("/proc/{process}/maps"))?;
         file.take(MAX_TEXT).read_to_end(&mut bytes)?;
-        Ok(Self::parse(&String::from_utf8_lossy(&bytes)))
+        Ok(Self::parse(&String::from_utf8_lossy(&bytes), is_library))
     }
 
     /// Returns whether the process uses Fast DDS at all.
@@ -115,11 +116,12 @@ impl Use {
 }
 
 impl Processes {
-    /// Creates an empty set.
+    /// Creates an empty set. `is_library`: whether a file of this name is the library.
     #[must_use]
-    pub fn new(scope: Scope) -> Self {
+    pub fn new(scope: Scope, is_library: fn(&str) -> bool) -> Self {
         Self {
             scope,
+            is_library,
             known: HashMap::new(),
         }
     }
@@ -134,6 +136,7 @@ impl Processes {
         };
         Self {
             scope: Scope::Directories(Vec::new()),
+            is_library,
             known: HashMap::from([(process, known)]),
         }
     }
@@ -152,7 +155,7 @@ impl Processes {
                         .is_some_and(|known| !known.use_of_it.is_any());
             let mut process = match known {
                 Some(known) if !is_asked => known,
-                _ => match Use::read(pid) {
+                _ => match Use::read(pid, self.is_library) {
                     Ok(use_of_it) => Process {
                         met,
                         use_of_it,
@@ -197,9 +200,12 @@ impl Processes {
 /// Returns whether a file of this name is Fast DDS's library.
 #[must_use]
 pub fn is_library(name: &str) -> bool {
-    let version = LIBRARIES
-        .iter()
-        .find_map(|library| name.strip_prefix(library));
+    LIBRARIES.iter().any(|library| is_version_of(library, name))
+}
+
+/// Returns whether a file of this name is the library, or a version of it.
+pub(crate) fn is_version_of(library: &str, name: &str) -> bool {
+    let version = name.strip_prefix(library);
     version.is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
 }
 
@@ -227,7 +233,7 @@ mod tests {
 7f3dab000000-7f3dab100000 rw-s 00000000 00:1a 5    /dev/shm/fastrtps_0011aabbccddeeff
 7f3dac000000-7f3dac100000 rw-p 00000000 00:00 0    [heap]
 ";
-        let found = Use::parse(text);
+        let found = Use::parse(text, is_library);
         let libraries: Vec<_> = found
             .libraries
             .iter()
@@ -265,9 +271,10 @@ mod tests {
             "",
         ] {
             let line = format!("7f0000000000-7f0000001000 r-xp 00000000 fe:00 1 {path}\n");
-            assert!(!Use::parse(&line).is_any(), "{path}");
+            assert!(!Use::parse(&line, is_library).is_any(), "{path}");
         }
-        assert!(!Use::parse("nonsense /usr/lib/libfastdds.so").is_any());
+        let nonsense = "nonsense /usr/lib/libfastdds.so";
+        assert!(!Use::parse(nonsense, is_library).is_any());
     }
 
     #[test]
@@ -287,7 +294,7 @@ mod tests {
 
     #[test]
     fn this_process_is_met_and_uses_none_of_it() {
-        let mut processes = Processes::new(Scope::AllProcesses);
+        let mut processes = Processes::new(Scope::AllProcesses, is_library);
         processes.find(true);
         let own = std::process::id();
         assert!(processes.known.contains_key(&own));

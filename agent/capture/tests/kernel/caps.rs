@@ -139,7 +139,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
     const SAMPLES: u32 = 32;
     let mut kernel = Kernel::load_hook(Hook::Ingress);
     kernel.set_interest(&BTreeMap::from([(writer(0), Verdict::Meter)]));
-    let mut intake = FilterReader::new(kernel.filter);
+    let mut intake = FilterReader::new(kernel.filter, &[]);
     let mut observer = Observer::new(Settings::default());
     let counter = |intake: &FilterReader, which| {
         let counters = intake.filter().counters().unwrap();

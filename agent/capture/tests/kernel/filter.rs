@@ -211,14 +211,20 @@ fn foreign_and_damaged_frames_are_never_kept() {
 fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
     let object = root.join("agent-ebpf");
-    let list = std::fs::read_to_string(object.join("filter.bpf.sha256")).unwrap();
-    let listed: BTreeSet<_> = list
-        .lines()
+    let lists = ["filter.bpf.sha256", "inside.bpf.sha256"];
+    let text = lists.map(|list| std::fs::read_to_string(object.join(list)).unwrap());
+    let listed: BTreeSet<_> = text
+        .iter()
+        .flat_map(|list| list.lines())
         .filter_map(|line| Some(line.split_once("  ")?.1))
         .collect();
-    for entry in std::fs::read_dir(object.join("src")).unwrap() {
-        let name = entry.unwrap().file_name().into_string().unwrap();
-        assert!(listed.contains(&*format!("src/{name}")), "{name}");
+    for directory in ["src", "src/inside"] {
+        for entry in std::fs::read_dir(object.join(directory)).unwrap() {
+            let entry = entry.unwrap();
+            let name = format!("{directory}/{}", entry.file_name().into_string().unwrap());
+            let is_listed = entry.path().is_dir() || listed.contains(&*name);
+            assert!(is_listed, "{name}");
+        }
     }
     // Files that a hand-written list once omitted.
     for name in [
@@ -230,7 +236,7 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
         assert!(listed.contains(&*format!("../wire/src/{name}")), "{name}");
     }
     let place = tempfile::tempdir().unwrap();
-    for name in listed.iter().copied().chain(["filter.bpf.sha256"]) {
+    for name in listed.iter().copied().chain(lists) {
         let copy = place.path().join("agent-ebpf").join(name);
         let parts: PathBuf = copy.components().fold(PathBuf::new(), |path, part| {
             if part == std::path::Component::ParentDir {
@@ -248,10 +254,13 @@ fn a_change_of_any_source_of_the_kernel_object_is_noticed() {
         command.output().unwrap().status.success()
     };
     // The list as it would be just after a build.
-    let sums = "{ head -n 1 filter.bpf.sha256; sed 1d filter.bpf.sha256 | cut -c67- | xargs sha256sum; } \
-                > new && mv new filter.bpf.sha256";
-    assert!(run("bash", sums));
-    assert!(run("bash", "./build.sh --stale"));
-    std::fs::write(place.path().join("wire/src/frame.rs"), "// changed").unwrap();
-    assert!(!run("bash", "./build.sh --stale"));
+    let sums = "for list in filter inside; do list=$list.bpf.sha256
+                { head -n 1 $list; sed 1d $list | cut -c67- | xargs sha256sum; } > new && mv new $list
+                done";
+    for changed in ["wire/src/frame.rs", "agent-ebpf/src/inside/names.rs"] {
+        assert!(run("bash", sums));
+        assert!(run("bash", "./build.sh --stale"));
+        std::fs::write(place.path().join(changed), "// changed").unwrap();
+        assert!(!run("bash", "./build.sh --stale"), "{changed}");
+    }
 }

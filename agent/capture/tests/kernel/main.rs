@@ -13,4 +13,6 @@ mod filter;
 mod handed;
 mod host_hook;
 mod inside;
+mod inside_processes;
 mod maps;
+mod zenoh;

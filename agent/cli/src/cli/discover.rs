@@ -1,8 +1,9 @@
-//! `rp discover`: options for the participants and the requests.
+//! `rp discover`: options for the participants, the router and the requests.
 
 use std::path::PathBuf;
 
 use clap::Args;
+use ros2probe_daemon::discover::zenoh::address::RouterAddress;
 use ros2probe_daemon::discover::{GuidPrefix, participants};
 
 #[derive(Debug, Args)]
@@ -13,14 +14,18 @@ requests the announcements again: at most 6 unicast packets for each, from a par
 for a few milliseconds and says goodbye. A running agent on this host sees the answers too. Without
 --participant and --all it lists the participants.
 Participants with DDS security receive no requests. Needs the same capabilities as `rp run`.
+With rmw_zenoh, --router requests the graph from a Zenoh router instead: 4 messages over one TCP
+connection, as a client that declares nothing. It needs no capability.
 Exit codes: 0 all answered, 77 a capability is missing, 78 the configuration is invalid, 1 otherwise.
 
 Examples:
   sudo rp discover --all --dry-run                print what would be sent
   sudo rp discover --all                          all participants
-  sudo rp discover --participant 010f1a2b3c4d5e6f00000000")]
+  sudo rp discover --participant 010f1a2b3c4d5e6f00000000
+  rp discover --router                            the Zenoh router of this host
+  rp discover --router 10.0.0.5:7447 --dry-run    print what would be sent to another router")]
 pub(crate) struct Discover {
-    /// Only participants of this domain
+    /// Only participants of this domain, or with --router its nodes
     #[arg(long, value_name = "N")]
     pub(crate) domain: Option<u32>,
     /// Request from this participant, by its GUID prefix: 24 hexadecimal digits
@@ -29,6 +34,11 @@ pub(crate) struct Discover {
     /// Request from every participant found
     #[arg(long)]
     pub(crate) all: bool,
+    /// Request the graph from the Zenoh router at this address [default: localhost:7447]
+    #[arg(long, value_name = "HOST:PORT", num_args = 0..=1,
+        default_missing_value = "localhost:7447", value_parser = RouterAddress::parse,
+        conflicts_with_all = ["participant", "all", "no_nodes", "interface", "listen", "config"])]
+    pub(crate) router: Option<RouterAddress>,
     /// Print what would be sent, but send nothing
     #[arg(long)]
     pub(crate) dry_run: bool,

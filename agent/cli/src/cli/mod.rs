@@ -3,6 +3,7 @@
 
 mod action;
 mod bag;
+mod chain;
 mod convert;
 mod discover;
 mod doctor;
@@ -10,6 +11,7 @@ mod echo;
 mod events;
 mod follow;
 mod foxglove;
+mod inside;
 mod interrupt;
 mod learn;
 mod node;
@@ -80,10 +82,14 @@ pub(crate) enum Question {
     Service(service::Service),
     /// List and inspect actions, as `ros2 action` does
     Action(action::Action),
+    /// Show chains of messages through nodes, with the time of each hop
+    Chain(chain::Chain),
     /// Check what is visible on this host and what is not, with remedies
     Doctor(doctor::Doctor),
     /// Show a robot's topics live in the terminal: rates, losses, latencies, problems
     Top(top::Top),
+    /// Print what processes publish, take and call, and how long callbacks take
+    Inside(inside::Inside),
     /// Write a watchlist with the expectations that a healthy robot meets
     Learn(learn::Learn),
     /// Print the address of the page that shows the robot in a browser
@@ -104,8 +110,10 @@ impl Question {
             Self::Node(node) => node.ask(),
             Self::Service(service) => service.ask(),
             Self::Action(action) => action.ask(),
+            Self::Chain(chain) => chain.ask(),
             Self::Doctor(doctor) => doctor.ask(),
             Self::Top(top) => top.ask(),
+            Self::Inside(inside) => inside.ask(),
             Self::Learn(learn) => learn.ask(),
             Self::Page(page) => page.ask(),
             Self::Foxglove(foxglove) => foxglove.ask(),
@@ -120,7 +128,9 @@ impl Question {
             Self::Node(_)
             | Self::Service(_)
             | Self::Action(_)
+            | Self::Chain(_)
             | Self::Doctor(_)
+            | Self::Inside(_)
             | Self::Page(_)
             | Self::Foxglove(_) => Some(interrupt::INTERRUPTED),
             // `top` restores the terminal first, and `learn` writes what it has learnt.

@@ -164,7 +164,7 @@ impl<'a> Notes<'a> {
             match self.agent.get::<Topic<'_>>(&path) {
                 Ok(topic) => {
                     let why = topic.reasons.iter().find_map(|reason| self.words(reason));
-                    if let Some(why) = why {
+                    if let Some(why) = counted_inside(&topic).or(why) {
                         eprintln!("rp: no message on {}: {}", visible(name), visible(&why));
                     }
                 }
@@ -201,16 +201,16 @@ impl<'a> Notes<'a> {
                  record on the robot with `rp bag record`"
             }
             ReasonCode::DataSharing => {
-                "subscribers read the publisher's memory (data sharing), which cannot be observed: \
-                 turn data sharing off, or subscribe from another host"
+                "subscribers read the publisher's memory (data sharing), where no single message \
+                 is seen: turn data sharing off, or count them with `capture.inside: topics`"
             }
             ReasonCode::SameProcess => {
                 "publisher and subscriber share one process; nothing crosses the network: subscribe \
-                 from another process"
+                 from another process, or count them with `capture.inside: topics`"
             }
             ReasonCode::Iceoryx => {
-                "messages pass through iceoryx, which cannot be observed: turn shared memory off in \
-                 Cyclone DDS"
+                "messages pass through iceoryx, where no single message is seen: turn shared memory \
+                 off in Cyclone DDS, or count them with `capture.inside: topics`"
             }
             ReasonCode::SharedMemory => {
                 return Some(format!(
@@ -304,6 +304,19 @@ pub(crate) fn is_sampled(topic: &PublishedTopic) -> bool {
     topic.subscribed && topic.other_transport.as_deref() == Some("shared_memory")
 }
 
+/// Text about a topic whose messages are counted inside processes only. `None` for others.
+fn counted_inside(topic: &Topic<'_>) -> Option<String> {
+    let measured = topic
+        .measurement
+        .as_ref()
+        .filter(|_| topic.source == "inside")?;
+    Some(format!(
+        "its figures come from inside the processes, where no single message is seen: {} messages, \
+         {:.1} Hz (`rp top`, `rp inside`)",
+        measured.messages, measured.rate_hertz
+    ))
+}
+
 /// Text about sampled topics: the consequence and the remedy. `None` without a topic.
 pub(crate) fn sampled(topics: &[String], consequence: &str) -> Option<String> {
     let names = few(topics);
@@ -341,6 +354,25 @@ mod tests {
         assert!(miss(1).is_empty());
         assert_eq!(missing.due(true), ["1 message on /t was dropped"]);
         assert!(missing.due(true).is_empty());
+    }
+
+    #[test]
+    fn a_topic_that_is_counted_inside_processes_names_that_source() {
+        let mut topic = Topic {
+            source: "inside".into(),
+            measurement: Some(ros2probe_api::measurement::Measurement {
+                messages: 200,
+                rate_hertz: 20.04,
+                ..Default::default()
+            }),
+            ..Topic::default()
+        };
+        let text = counted_inside(&topic).unwrap();
+        let begin = "its figures come from inside the processes, ";
+        assert!(text.starts_with(begin), "{text}");
+        assert!(text.contains(": 200 messages, 20.0 Hz ("), "{text}");
+        topic.source = "wire".into();
+        assert_eq!(counted_inside(&topic), None);
     }
 
     #[test]

@@ -10,7 +10,8 @@ use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use super::privileges::is_installed;
-use ros2probe_api::health::{Foxglove, Health, Limit};
+use crate::top::text::counted;
+use ros2probe_api::health::{Foxglove, Health, Limit, Zenoh};
 use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
@@ -36,6 +37,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings.extend(evictions(health));
     findings.push(watches(answers));
     findings.extend(health.foxglove.as_ref().map(foxglove));
+    findings.extend(health.zenoh.iter().flat_map(zenoh));
     if health.source != "replay" {
         findings.push(kept(health));
     }
@@ -314,7 +316,30 @@ fn watches(answers: &Answers) -> Finding {
     }
 }
 
-/// Finding for the listener for viewers: its address, who may connect, and who does.
+/// Findings about connections of Zenoh that cannot be read.
+fn zenoh(facts: &Zenoh) -> Vec<Finding> {
+    let findings = facts.unseen.iter().map(|unseen| {
+        let connections = counted(unseen.connections, "connection");
+        let which = format!("{connections} of Zenoh {}", unseen.text);
+        let finding = |severity, sentence| {
+            let count = unseen.connections.to_string();
+            let source = format!("{FROM} zenoh.unseen");
+            Finding::new(AREA, "zenoh", severity, sentence).seen(count, source)
+        };
+        match &*unseen.reason {
+            "shared_memory" => {
+                let sentence =
+                    format!("payloads of {which} cannot be read; rates and sizes are right");
+                finding(Severity::Note, sentence)
+            }
+            _ => finding(Severity::Warning, format!("{which} cannot be read"))
+                .configure("capture: {inside: topics}    # counts them inside the processes"),
+        }
+    });
+    findings.collect()
+}
+
+/// Finding for the listener for viewers: its address, the rights of viewers, and their number.
 fn foxglove(listener: &Foxglove) -> Finding {
     let Foxglove {
         address,

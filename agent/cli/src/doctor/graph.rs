@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 
 use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
+use crate::top::text::counted;
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
@@ -54,7 +55,7 @@ fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: 
             ),
             _ => report(
                 Severity::Note,
-                "the agent sees no participant: no DDS traffic".to_owned(),
+                "the agent sees no participant: no DDS or Zenoh traffic".to_owned(),
             ),
         };
     }
@@ -220,10 +221,20 @@ fn off_the_network(answers: &Answers) -> Vec<Finding> {
         let topics = answers.topics.topics.iter();
         let topics: Vec<&Topic<'_>> = topics
             .filter(|topic| !topic.vanished && off_network(topic) == Some(each.transport))
+            .filter(|topic| each.transport == "shared_memory" || !is_counted_inside(topic))
             .collect();
         each.finding(&topics)
     });
     findings.collect()
+}
+
+/// Whether calls inside the processes show the topic's messages.
+fn is_counted_inside(topic: &Topic<'_>) -> bool {
+    let is_observed = topic
+        .passages
+        .iter()
+        .all(|it| it.observed_pairs == it.pairs);
+    topic.source == "inside" || is_observed
 }
 
 /// Texts about topics on one transport other than the network.
@@ -346,10 +357,7 @@ fn listed(topics: &[&Topic<'_>]) -> String {
 }
 
 fn many(count: usize, what: &str) -> String {
-    match count {
-        1 => format!("1 {what}"),
-        _ => format!("{count} {what}s"),
-    }
+    counted(count as u64, what)
 }
 
 #[cfg(test)]
@@ -480,6 +488,10 @@ mod tests {
             severity(&of("same_process", ""), "same_process"),
             Some(Severity::Note)
         );
+        // Calls inside both processes show the messages.
+        let seen = r#"{"passage":"same_process","pairs":2,"observed_pairs":2}"#;
+        let findings = check(&answers(WELL, &topic("/x", seen), ""), None);
+        assert_eq!(severity(&findings, "same_process"), None);
         // One pair on the network suffices to count the messages.
         let both = format!("{},{}", pairs("network"), pairs("data_sharing"));
         let findings = check(&answers(WELL, &topic("/x", &both), ""), None);

@@ -29,7 +29,7 @@ use finding::Finding;
 use host_state::HostState;
 use processes::Processes;
 use report::Report;
-use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice};
+use ros2probe_daemon::config::{CaptureSettings, Config, ExactChoice, InsideChoice};
 use ros2probe_daemon::host_examination::error_in_words;
 use ros2probe_daemon::privilege;
 use ros2probe_daemon::run;
@@ -124,6 +124,7 @@ fn tried(host: &HostState, settings: &CaptureSettings) -> Vec<Finding> {
     }
     let mut settings = settings.clone();
     settings.shm.exact = ExactChoice::Off;
+    settings.inside = InsideChoice::Off;
     match run::probe(&settings) {
         Ok(facts) => visibility::check(&Visibility::of_trial(facts)),
         Err(error) => visibility::failed(&error_in_words(&error)),

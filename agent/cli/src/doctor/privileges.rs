@@ -5,7 +5,7 @@ use super::answers::Answers;
 use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use ros2probe_api::health::Health;
-use ros2probe_daemon::config::{CaptureSettings, ExactChoice, ShmMode};
+use ros2probe_daemon::config::{CaptureSettings, ExactChoice, InsideChoice, ShmMode};
 use ros2probe_daemon::privilege;
 
 const AREA: Area = Area::Privileges;
@@ -110,21 +110,26 @@ fn containers(answers: &Answers) -> Option<Finding> {
     ))
 }
 
-/// Finding for exact mode, if it is configured.
+/// Finding for uprobes, if they are configured.
 fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
-    if settings.shm.mode == ShmMode::Off || settings.shm.exact == ExactChoice::Off {
-        return None;
-    }
-    let missing = ros2probe_daemon::host_examination::exact_mode_lacks(host.capabilities);
+    let is_exact = settings.shm.mode != ShmMode::Off && settings.shm.exact != ExactChoice::Off;
+    let is_inside = settings.inside != InsideChoice::Off;
+    let keys = match (is_exact, is_inside) {
+        (false, false) => return None,
+        (true, false) => "capture.shm.exact needs",
+        (false, true) => "capture.inside needs",
+        (true, true) => "capture.shm.exact and capture.inside need",
+    };
+    let missing = ros2probe_daemon::host_examination::uprobes_lack(host.capabilities);
     if missing.is_empty() {
         return None;
     }
     let missing = missing.join(" and ");
-    let sentence = format!("capture.shm.exact needs {missing}, which this shell lacks");
+    let sentence = format!("{keys} {missing}, which this shell lacks");
     let finding = Finding::new(AREA, "probes", Severity::Note, sentence);
     let finding = finding.seen(&missing, "CapEff, this process");
     Some(finding.elsewhere(
-        "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open, with systemctl edit ros2probe",
+        "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open process_vm_readv, with systemctl edit ros2probe",
     ))
 }
 
@@ -290,11 +295,14 @@ mod tests {
     }
 
     #[test]
-    fn exact_mode_is_checked_where_it_is_asked_for() {
+    fn uprobes_are_checked_where_they_are_asked_for() {
         let (_directory, host) = host(&[]);
         let mut settings = Config::default().capture;
         assert_eq!(probes(&host, &settings), None);
         settings.shm.exact = ExactChoice::Uprobe;
         assert_eq!(probes(&host, &settings).unwrap().severity, Severity::Note);
+        settings.inside = InsideChoice::Topics;
+        let both = probes(&host, &settings).unwrap();
+        assert!(both.sentence.contains("capture.inside need "), "{both:?}");
     }
 }

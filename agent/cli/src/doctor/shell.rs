@@ -7,6 +7,8 @@ use super::variables::{Range, Variables};
 
 const AREA: Area = Area::Shell;
 const FROM: &str = "this shell";
+/// The implementation without UDP ports of a domain and without DDS's discovery.
+const ZENOH: &str = "rmw_zenoh_cpp";
 const PORTS: &str = "/proc/sys/net/ipv4/ip_local_port_range";
 /// RTPS 2.5, 9.6.2.3: first port of domain 0, and ports per domain.
 const PORT_BASE: u32 = 7400;
@@ -24,13 +26,19 @@ pub fn check(host: &HostState) -> Vec<Finding> {
         return vec![none(host)];
     }
     let mut findings = vec![domain(host, &variables), implementation(&variables)];
-    findings.push(range(&variables));
-    findings.extend(server(&variables));
+    if !is_zenoh(&variables) {
+        findings.push(range(&variables));
+        findings.extend(server(&variables));
+    }
     findings.extend(transports(&variables));
     findings.extend(profiles(host, &variables));
     findings.extend(cyclone(host, &variables));
     findings.extend(security(&variables));
     findings
+}
+
+fn is_zenoh(variables: &Variables) -> bool {
+    variables.shown("RMW_IMPLEMENTATION").as_deref() == Some(ZENOH)
 }
 
 fn none(host: &HostState) -> Finding {
@@ -67,7 +75,7 @@ fn domain(host: &HostState, variables: &Variables) -> Finding {
         )
         .remedy("export ROS_DOMAIN_ID=0    # 0 to 101, and 215 to 232"),
         Ok(domain) => match ephemeral(host) {
-            Some((first, last)) if overlaps(domain, first, last) => report(
+            Some((first, last)) if !is_zenoh(variables) && overlaps(domain, first, last) => report(
                 Severity::Warning,
                 format!(
                     "the ports of domain {domain} are in the ephemeral range ({first} to \
@@ -102,18 +110,13 @@ fn implementation(variables: &Variables) -> Finding {
             Severity::Ok,
             "the default implementation of ROS (Fast DDS)".to_owned(),
         ),
-        Some(name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp")) => {
-            report(Severity::Ok, name.to_owned())
-        }
+        Some(
+            name @ ("rmw_fastrtps_cpp" | "rmw_fastrtps_dynamic_cpp" | "rmw_cyclonedds_cpp" | ZENOH),
+        ) => report(Severity::Ok, name.to_owned()),
         Some(name @ ("rmw_connextdds" | "rmw_connextddsmicro")) => report(
             Severity::Note,
             format!("{name}: messages in its own shared memory are not visible"),
         ),
-        Some(name) if name.starts_with("rmw_zenoh") => report(
-            Severity::Warning,
-            format!("{name} is not DDS: its nodes are not visible"),
-        )
-        .remedy("export RMW_IMPLEMENTATION=rmw_cyclonedds_cpp    # or another RTPS implementation"),
         Some(name) => report(
             Severity::Note,
             format!("{name}: visible where it uses RTPS over UDP"),
@@ -389,6 +392,17 @@ mod tests {
     }
 
     #[test]
+    fn a_shell_of_zenoh_has_neither_ports_of_a_domain_nor_a_discovery_range() {
+        let findings = found(&[
+            ("RMW_IMPLEMENTATION", "rmw_zenoh_cpp"),
+            ("ROS_DOMAIN_ID", "102"),
+        ]);
+        let shown: Vec<_> = findings.iter().map(|each| &*each.sentence).collect();
+        assert_eq!(shown, ["domain 102", "rmw_zenoh_cpp"]);
+        assert!(findings.iter().all(|each| each.severity == Severity::Ok));
+    }
+
+    #[test]
     fn domains_without_ports_are_distinguished_from_valid_ones() {
         for (domain, severity) in [
             ("0", Severity::Ok),
@@ -407,7 +421,7 @@ mod tests {
     #[test]
     fn each_variable_has_its_consequence() {
         let (note, warning) = (Severity::Note, Severity::Warning);
-        gives("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw", warning);
+        gives("RMW_IMPLEMENTATION", "rmw_zenoh_cpp", "rmw", Severity::Ok);
         gives("RMW_IMPLEMENTATION", "rmw_connextdds", "rmw", note);
         gives("RMW_IMPLEMENTATION", "rmw_of_mine", "rmw", note);
         gives("ROS_LOCALHOST_ONLY", "1", "range", note);

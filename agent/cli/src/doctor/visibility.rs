@@ -142,6 +142,7 @@ const fn words(ability: Ability) -> &'static str {
         Ability::Forwarded => "traffic merely forwarded by this host",
         Ability::SharedMemory => "Fast DDS's shared memory, in samples",
         Ability::SharedMemoryExact => "each message in Fast DDS's shared memory",
+        Ability::Inside => "counts from inside processes, whatever the transport",
     }
 }
 
@@ -193,6 +194,12 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
             "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
             Some("capture: {shm: {exact: uprobe}}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
         ),
+        Ability::Inside => (
+            Severity::Note,
+            "messages within one process, with data sharing, iceoryx or security are not counted"
+                .to_owned(),
+            Some("capture: {inside: topics}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
+        ),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };
     if let Some(reason) = reason {
@@ -229,6 +236,25 @@ mod tests {
         let findings = check(&host(&Ability::ALL));
         assert_eq!(findings.len(), 2);
         assert!(findings.iter().all(|each| each.severity == Severity::Ok));
+    }
+
+    #[test]
+    fn counts_from_inside_processes_are_an_ability_with_the_key_that_switches_them_on() {
+        let findings = check(&host(&Ability::ALL));
+        let seen = &find(&findings, "abilities").unwrap().sentence;
+        assert!(seen.contains("counts from inside processes"), "{seen}");
+        let mut able = Ability::ALL.to_vec();
+        able.retain(|each| *each != Ability::Inside);
+        let mut visibility = host(&able);
+        let findings = check(&visibility);
+        let off = find(&findings, "inside").unwrap();
+        assert_eq!(off.severity, Severity::Note);
+        assert!(off.sentence.ends_with("or security are not counted"));
+        visibility.reasons = vec![(Ability::Inside, "it lacks CAP_SYS_ADMIN".to_owned())];
+        let findings = check(&visibility);
+        let unavailable = &find(&findings, "inside").unwrap().sentence;
+        let reason = "are not counted: it lacks CAP_SYS_ADMIN";
+        assert!(unavailable.ends_with(reason), "{unavailable}");
     }
 
     #[test]

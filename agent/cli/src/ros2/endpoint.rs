@@ -27,7 +27,7 @@ pub fn block(endpoint: &Endpoint<'_>, kind: &str, dialect: Dialect) -> String {
         let _ = writeln!(text, "Topic type hash: {hash}");
     }
     let _ = writeln!(text, "Endpoint type: {kind}");
-    let _ = writeln!(text, "GID: {}", gid(&endpoint.guid, dialect));
+    let _ = writeln!(text, "GID: {}", gid(endpoint, dialect));
     let _ = writeln!(text, "QoS profile:");
     qos(&mut text, &endpoint.qos, "  ");
     text
@@ -47,8 +47,13 @@ fn node<'a>(endpoint: &'a Endpoint<'_>) -> [&'a str; 2] {
 }
 
 /// Bytes of a GID with points between.
-fn gid(guid: &str, dialect: Dialect) -> String {
-    let digits: Vec<char> = guid.chars().filter(|digit| *digit != '.').collect();
+fn gid(endpoint: &Endpoint<'_>, dialect: Dialect) -> String {
+    // Older agents report the GUID only.
+    let text = match endpoint.gid.as_str() {
+        "" => &endpoint.guid,
+        gid => gid,
+    };
+    let digits: Vec<char> = text.chars().filter(|digit| *digit != '.').collect();
     let mut bytes: Vec<String> = digits.chunks(2).map(|byte| byte.iter().collect()).collect();
     if dialect == Dialect::Humble {
         bytes.extend(std::iter::repeat_n("00".to_owned(), PADDING));

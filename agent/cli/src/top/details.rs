@@ -10,6 +10,7 @@ use ros2probe_api::measurement::{Bucket, Delivered, Distribution, Measurement};
 use ros2probe_api::topics::{ReasonCode, Topic, TopicDetails, Watching};
 
 use super::event_pane::{shown, shown_list};
+use super::inside;
 use super::row::{is_measured, shown_name};
 use super::text::{beginning, bound, bytes, counted, end, rate, ratio, safe, seconds};
 use super::theme::{Kind, Theme};
@@ -39,6 +40,9 @@ pub fn lines(details: &TopicDetails<'_>, width: usize, theme: Theme) -> Vec<Styl
         lines.push(expectation(watch));
     }
     measured(topic, &mut lines);
+    if let Some(inside) = &topic.inside {
+        lines.push((inside::counts(inside), Kind::Plain));
+    }
     for finding in &topic.diagnoses {
         lines.push((format!("! {}", diagnosis(finding, topic)), Kind::Problem));
     }
@@ -265,10 +269,19 @@ fn diagnosis(finding: &Finding<'_>, topic: &Topic<'_>) -> String {
         Open::Known(Diagnosis::HangingCall { writer }) => {
             format!("{} receives no reply", name(writer))
         }
-        // Findings about nodes, not topics.
-        Open::Known(Diagnosis::DuplicateNode { .. } | Diagnosis::NodeInSeveralDomains { .. }) => {
-            finding.kind().to_owned()
+        Open::Known(Diagnosis::RestampingNode { node, input }) => format!(
+            "{} replaces the stamps of {}: chains end here",
+            safe(node),
+            safe(input)
+        ),
+        Open::Known(Diagnosis::SlowChain {
+            from,
+            max_latency_ms,
+        }) => {
+            let from = safe(from);
+            format!("the chain from {from} takes longer than {max_latency_ms} ms")
         }
+        Open::Known(other) => inside::problem(other).unwrap_or_else(|| other.kind().to_owned()),
         Open::Unknown(attributes) => {
             let all = attributes.0.iter();
             let all = all.map(|(key, value)| format!("{}={}", safe(key), shown(value)));

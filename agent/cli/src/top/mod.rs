@@ -9,13 +9,14 @@ mod details;
 mod event_pane;
 mod header;
 mod help;
+mod inside;
 mod measure_requests;
 mod poller;
 mod row;
 mod server_sent;
 mod table;
 mod terminal;
-mod text;
+pub(crate) mod text;
 mod theme;
 mod view;
 

@@ -74,15 +74,20 @@ fn binaries_are_static_and_of_their_architecture() {
 }
 
 #[test]
-fn the_same_kernel_object_is_in_each_binary_byte_for_byte() {
-    let object = std::fs::read(data("../../agent-ebpf/filter.bpf.o")).unwrap();
-    for path in program::all() {
-        let binary = std::fs::read(&path).unwrap();
+fn the_same_kernel_objects_are_in_each_binary_byte_for_byte() {
+    let objects = ["filter", "inside"]
+        .map(|name| std::fs::read(data(&format!("../../agent-ebpf/{name}.bpf.o"))).unwrap());
+    let all = program::all();
+    for (path, object) in all
+        .iter()
+        .flat_map(|path| objects.iter().map(move |o| (path, o)))
+    {
+        let binary = std::fs::read(path).unwrap();
         // Its offset is a multiple of 8, because it is read in place.
         let found = binary
             .chunks_exact(8)
             .zip((0..).step_by(8))
-            .any(|(chunk, at)| chunk == &object[..8] && binary[at..].starts_with(&object));
+            .any(|(chunk, at)| chunk == &object[..8] && binary[at..].starts_with(object));
         assert!(found, "not in {}", path.display());
     }
 }

@@ -2,13 +2,14 @@
 
 use std::fs;
 use std::path::PathBuf;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 
-use anyhow::Result;
+use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::agent::{Agent, at_the_sockets_of};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::shared_memory::SharedMemory;
+use ros2probe_testing::harness::wait_until;
 use tempfile::TempDir;
 
 use crate::installed;
@@ -34,6 +35,7 @@ pub enum Middleware {
     FastExact(&'static str),
     FastUdp,
     Cyclone,
+    Zenoh,
 }
 
 /// The host, with its own `/dev/shm` and a directory for files.
@@ -78,6 +80,18 @@ impl<'n> Host<'n> {
         Agent::start(self.network, RP, &configuration)
     }
 
+    /// Starts an agent as [`Self::agent`] does, which also observes processes from inside.
+    pub fn agent_inside(&self, lines: &str) -> Result<Agent<'n>> {
+        let configuration = self.file("ros2probe.yaml");
+        let settings = self.settings(lines);
+        let (capture, others) = settings.split_once("}\n").context("no capture")?;
+        fs::write(
+            &configuration,
+            format!("{capture}, inside: full}}\n{others}"),
+        )?;
+        Agent::start(self.network, RP, &configuration)
+    }
+
     /// Returns the configuration of [`Self::agent`].
     pub fn settings(&self, lines: &str) -> String {
         let capture = match self.middleware {
@@ -97,6 +111,7 @@ impl<'n> Host<'n> {
     pub fn enter(&self) -> Vec<String> {
         let rmw = match self.middleware {
             Middleware::Cyclone => "rmw_cyclonedds_cpp",
+            Middleware::Zenoh => "rmw_zenoh_cpp",
             _ => "rmw_fastrtps_cpp",
         };
         let mut enter = self.shared_memory.inside(self.network);
@@ -120,6 +135,41 @@ impl<'n> Host<'n> {
             .into_iter()
             .chain(arguments.iter().copied());
         Process::start_with(&self.enter(), "bash", words, errors)
+    }
+
+    /// Starts the router, if the middleware has one.
+    pub fn router_if_any(&self) -> Result<Option<Process>> {
+        let has_router = self.middleware == Middleware::Zenoh;
+        has_router.then(|| self.router("")).transpose()
+    }
+
+    /// Starts the router of rmw_zenoh, with these settings besides the default ones.
+    pub fn router(&self, settings: &str) -> Result<Process> {
+        let program = installed::prefix().join("lib/rmw_zenoh_cpp/rmw_zenohd");
+        let log = self.file("router.log");
+        let line = format!(
+            "export ZENOH_CONFIG_OVERRIDE='{settings}'; exec {} > {} 2>&1",
+            program.display(),
+            log.display()
+        );
+        fs::write(&log, "")?;
+        let router = self.run(&line, &[], Stdio::inherit())?;
+        wait_until("the router has started", || {
+            Ok(fs::read_to_string(&log)?.contains("Started Zenoh router"))
+        })?;
+        Ok(router)
+    }
+
+    /// Returns what `rp` prints with these arguments, of the host's agent.
+    pub fn rp(&self, arguments: &[&str]) -> Result<String> {
+        let output = Command::new(RP)
+            .args(arguments)
+            .args(["--socket", &self.socket()])
+            .env_remove("ROS_DOMAIN_ID")
+            .env("ROS_DISTRO", "humble")
+            .output()?;
+        ensure!(output.status.success(), "{output:?}");
+        Ok(String::from_utf8(output.stdout)?)
     }
 
     /// Runs a script of this directory with Python.

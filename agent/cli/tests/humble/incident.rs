@@ -41,8 +41,9 @@ fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<(
     let host = Host::new(&network, Middleware::Cyclone)?;
     let bags = host.file("bags");
     let agent = host.agent(&format!(
-        "recordings:\n  directory: {}\n  snapshots:\n    - {{name: incident, topics: [/chatter], \
-         seconds: 3, seconds_after: 2, trigger: [qos_incompatible]}}\n",
+        "recordings:\n  directory: {}\n  reserve_percent: 0\n  reserve_bytes: 0\n  snapshots:\n    \
+         - {{name: incident, topics: [/chatter], seconds: 3, seconds_after: 2, \
+         trigger: [qos_incompatible]}}\n",
         bags.display()
     ))?;
 

@@ -7,11 +7,16 @@
     reason = "a test that meets the unexpected has failed"
 )]
 
+mod chains;
+mod cost;
+mod discover;
 mod echo;
 mod host;
 mod incident;
+mod inside;
 mod installed;
 mod learn;
 mod robot;
 mod ros2_daemon;
 mod services;
+mod zenoh;

@@ -10,6 +10,7 @@ its DDS writer), and the time.
 
 import heapq
 import json
+import os
 import sys
 import threading
 import time
@@ -17,6 +18,7 @@ import time
 import rclpy
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
+from rclpy.qos import HistoryPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, Imu, PointCloud2
 from std_msgs.msg import Header, Int64
@@ -25,6 +27,10 @@ from tf2_msgs.msg import TFMessage
 SECONDS = 10
 # All of the fastest topic: Fast DDS repairs after up to 3 s, and what is overwritten by then is lost.
 DEPTH = 2000
+# Zenoh drops messages of a congested connection, unless the publisher keeps all.
+IS_ZENOH = os.environ["RMW_IMPLEMENTATION"] == "rmw_zenoh_cpp"
+HISTORY = HistoryPolicy.KEEP_ALL if IS_ZENOH else HistoryPolicy.KEEP_LAST
+QOS = QoSProfile(depth=DEPTH, history=HISTORY)
 DIGITS = "%08d"
 
 
@@ -95,7 +101,7 @@ def spin(node):
 def publish(log):
     node = rclpy.create_node("driver")
     publishers = {
-        name: (node.create_publisher(kind, name, DEPTH), Template(kind, message))
+        name: (node.create_publisher(kind, name, QOS), Template(kind, message))
         for name, (kind, _, message) in TOPICS.items()
     }
     threading.Thread(target=spin, args=(node,), daemon=True).start()
@@ -128,7 +134,7 @@ def subscribe(log):
         def receive(data, name=name, template=template):
             log.write(name, template.number(data))
 
-        node.create_subscription(kind, name, receive, DEPTH, raw=True)
+        node.create_subscription(kind, name, receive, QOS, raw=True)
     say("ready")
     spin(node)
 

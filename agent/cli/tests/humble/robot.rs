@@ -60,12 +60,19 @@ fn cyclone_dds_is_recorded_to_the_message() -> Result<()> {
     holds_what_was_published(Middleware::Cyclone)
 }
 
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn zenoh_is_recorded_to_the_message() -> Result<()> {
+    holds_what_was_published(Middleware::Zenoh)
+}
+
 fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     let network = Namespace::alone()?;
     let robot = Robot {
         host: Host::new(&network, middleware)?,
     };
     let agent = robot.host.agent("watch: ['/**']\n")?;
+    let _router = robot.host.router_if_any()?;
     let mut subscriber = robot.node("subscribe")?;
     subscriber.wait_for("ready", PATIENCE)?;
     let mut publisher = robot.node("publish")?;

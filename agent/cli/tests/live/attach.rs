@@ -22,6 +22,8 @@ use ros2probe_testing::harness::witness::Witness;
 use tempfile::TempDir;
 
 const DIRECTIONS: [Direction; 2] = [Direction::Ingress, Direction::Egress];
+/// Programs of an agent in each direction: for UDP, and for TCP of Zenoh.
+const PROGRAMS: u32 = 2;
 /// On a busy machine.
 const PATIENCE: Duration = Duration::from_secs(60);
 const ROUNDS: u64 = 20;
@@ -74,7 +76,10 @@ fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
     let other = configuration.start(&link.monitor)?;
     for direction in DIRECTIONS {
         let attached = bpf::attached(above.path(), direction)?;
-        ensure!(attached == 3, "{attached} programs of three owners");
+        ensure!(
+            attached == 1 + 2 * PROGRAMS,
+            "{attached} programs of three owners"
+        );
     }
     let later = Link::below(&above)?;
     let stream = Stream {
@@ -92,7 +97,7 @@ fn nodes_lose_nothing_while_agents_come_and_go() -> Result<()> {
         ensure!(scrape.sum("ros2_topic_lost_messages_total", &[("topic", "/later")]) == 0.0);
     }
     drop(one);
-    ensure_nothing_attached(above.path(), 2)?;
+    ensure_nothing_attached(above.path(), 1 + PROGRAMS)?;
     drop(other);
     ensure_nothing_attached(above.path(), 1)?;
     talks
@@ -178,7 +183,7 @@ fn a_recreated_cgroup_is_seen_again_and_reported_while_it_is_missing() -> Result
         tells("\"ros2probe.capture.seeing\"", round)?;
         for direction in DIRECTIONS {
             let attached = bpf::attached(above.path(), direction)?;
-            ensure!(attached == 1, "{attached} programs are attached");
+            ensure!(attached == PROGRAMS, "{attached} programs are attached");
         }
     }
     agent.process.terminate()?;
@@ -209,7 +214,7 @@ fn a_briefly_missing_cgroup_is_reported_and_seen_again() -> Result<()> {
     }
     for direction in DIRECTIONS {
         let attached = bpf::attached(above.path(), direction)?;
-        ensure!(attached == 1, "{attached} programs are attached");
+        ensure!(attached == PROGRAMS, "{attached} programs are attached");
     }
     let link = Link::below(&above)?;
     talk(&link, &Stream::small(200))?;

@@ -2,7 +2,9 @@
 //! without rights, and while the agent or the tab is away. Each test plays a scenario of
 //! `agent/cli/tests/page`, in which nothing may leave the agent's origin or reach the console.
 
+mod calls;
 mod crowd;
+mod pipelines;
 pub(crate) mod player;
 pub(crate) mod robot;
 
@@ -16,11 +18,20 @@ use flate2::read::MultiGzDecoder;
 use player::{play, watch};
 use robot::{Place, Robot};
 use ros2probe_testing::harness::bpf::interest_of;
-use ros2probe_testing::local_agent::LocalAgent;
+use ros2probe_testing::local_agent::{self, LocalAgent};
 use serde_json::{Value, json};
 
 /// Topics of the large robot.
 const CROWD: usize = 500;
+/// Chains of hostile names, and hops of the longest one.
+const CHAIN_COUNT: usize = 20;
+const LONG_CHAIN: usize = 31;
+/// Chains of the capture `chain-1ns`: one too slow, one within its limit, and none.
+const CHAINS: &str = "chains:
+  - {from: /points, to: /cmd, max_latency_ms: 20}
+  - {from: /points, to: /filtered, max_latency_ms: 50}
+  - {from: /camera, to: /steering, max_latency_ms: 100}
+";
 /// The API of an agent whose host is its own.
 const PAGE: &str = "http://127.0.0.1:17401/";
 
@@ -180,6 +191,58 @@ fn five_hundred_hostile_names_stay_text() -> Result<()> {
     let capture = large_robot(true, 20)?;
     let agent = replay(capture.path(), &[]);
     watch(&[], "hostile", &[&page(&agent), &CROWD.to_string()])
+}
+
+#[test]
+fn the_hops_of_a_chain_are_a_waterfall_and_a_way_through_the_graph() -> Result<()> {
+    let mut configured = tempfile::NamedTempFile::with_suffix(".yaml")?;
+    configured.write_all(CHAINS.as_bytes())?;
+    let path = configured.path().to_str().context("no path")?.to_owned();
+    let capture = data("fastrtps-udp/chain-1ns");
+    let mut agent = Some(replay(&capture, &["--config", &path]));
+    let address = page(agent.as_ref().context("no agent")?);
+    let mut answers = |question: &str| {
+        if question == "end" {
+            agent = None;
+            return Ok(json!({}));
+        }
+        let agent = agent.as_ref().context("no agent")?;
+        let (status, answer) = local_agent::ask(agent.api, "GET", question, "");
+        ensure!(status == 200, "{question}: {status}");
+        Ok(answer)
+    };
+    play(&[], "chains", &[&address], &mut answers)
+}
+
+#[test]
+fn chains_of_hostile_names_stay_text() -> Result<()> {
+    let mut capture = tempfile::NamedTempFile::with_suffix(".pcap")?;
+    let mut lengths = vec![LONG_CHAIN];
+    lengths.resize(CHAIN_COUNT, 2);
+    capture.write_all(&pipelines::capture(&lengths))?;
+    let agent = replay(capture.path(), &[]);
+    let arguments = [CHAIN_COUNT, LONG_CHAIN].map(|number| number.to_string());
+    let arguments = [page(&agent), arguments[0].clone(), arguments[1].clone()];
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    watch(&[], "chain-names", &arguments)
+}
+
+#[test]
+fn what_processes_show_from_inside_is_on_the_views_of_nodes_and_topics() -> Result<()> {
+    let place = Place::new()?;
+    let _agent = place.agent_inside("watch: [/**]\n")?;
+    // The graph knows the node by its participant.
+    let _node = place.publisher("/other", "/robot1/filter")?;
+    let mut filter = calls::Filter::start(&place)?;
+    let mut answers = |question: &str| {
+        match question {
+            "create" => filter.create()?,
+            "work" => filter.work()?,
+            _ => return place.ask(question),
+        }
+        Ok(json!({}))
+    };
+    play(&place.inside(), "inside", &[PAGE], &mut answers)
 }
 
 #[test]

@@ -15,7 +15,7 @@ use ros2probe_testing::harness::prometheus::Prometheus;
 use serde_yaml::Value;
 
 /// Panels' queries without an answer on these robots, and why that is right.
-const RIGHTLY_EMPTY: [(&str, &str); 12] = [
+const RIGHTLY_EMPTY: [(&str, &str); 14] = [
     (
         "robot: Where latency arises B",
         "nothing is sent and received by sockets of one host",
@@ -36,6 +36,8 @@ const RIGHTLY_EMPTY: [(&str, &str); 12] = [
         "robot: Endpoints that cannot communicate C",
         "a type has one definition",
     ),
+    ("robot: Hops of chains A", "no node copies a stamp"),
+    ("robot: Hops of chains B", "no node copies a stamp"),
     ("robot: Names in conflict A", "names are taken once"),
     ("robot: Names in conflict B", "all nodes are in one domain"),
     (
@@ -267,6 +269,7 @@ fn start<'a>(host: &'a Namespace, directory: &Path) -> Result<Agent<'a>> {
          - {{topic: /scan, max_rate_hz: 1, max_latency_ms: 0.001}}\n\
          - {{topic: /quiet, max_silence_s: 1}}\n\
          - {{topic: /camera, max_silence_s: 1}}\n\
+         chains: [{{from: /scan, to: /cmd_vel, max_latency_ms: 100, domain: 0}}]\n\
          {}\
          metrics: {{listen: '0.0.0.0:17400'}}\n",
         at_the_sockets_of(host)

@@ -347,7 +347,7 @@ fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_alo
     let first = Observed::start(&link.robot, &configuration)?;
     // The metrics listener's address is taken on the first one's network.
     let mut second = Observed::start(&link.monitor, &configuration)?;
-    assert_eq!(cgroup::attached(link.robot.cgroup())?, [2, 2]);
+    assert_eq!(cgroup::attached(link.robot.cgroup())?, [4, 4]);
     let stream = Stream::small(400);
     let (mut publisher, _subscriber) = pair(&link.robot, &link.monitor, Stack::Fast, &stream)?;
     publisher.go()?;
@@ -361,7 +361,7 @@ fn two_agents_at_once_see_the_same_and_one_that_is_killed_takes_its_programs_alo
     second.agent.process.wait(PATIENCE)?;
     // The kernel lets go of a dead process's descriptors in its own time.
     let deadline = Instant::now() + PATIENCE;
-    while cgroup::attached(link.robot.cgroup())? != [1, 1] {
+    while cgroup::attached(link.robot.cgroup())? != [2, 2] {
         ensure!(Instant::now() < deadline, "a program stays");
         std::thread::sleep(Duration::from_millis(20));
     }

@@ -24,6 +24,7 @@ mod fidelity;
 mod foxglove;
 mod host;
 mod hostile;
+mod inside;
 mod late_start;
 mod learn;
 mod links;

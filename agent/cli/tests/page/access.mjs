@@ -12,6 +12,7 @@ const VIEWS = [
   ['#/graph', '.vertex'],
   ['#/graph?services=1&actions=1&boxes=process', '.vertex.service'],
   ['#/graph?mode=nodes&hubs=1', '.vertex'],
+  ['#/chains', 'main .empty, main tbody tr[data-row]'],
   ['#/nodes', 'main tbody tr[data-row]'],
   ['#/nodes/%2Flidar?domain=0', 'main ul.plain'],
   ['#/events', 'main tbody tr'],

@@ -248,8 +248,8 @@ async function keys(tab) {
   await tab.page.keyboard.press('?');
   await tab.page.getByRole('dialog', { name: 'Keys' }).waitFor();
   await tab.escape();
-  for (const [key, name] of [['t', 'Topics'], ['g', 'Graph'], ['n', 'Nodes'], ['e', 'Events'],
-    ['r', 'Recordings'], ['a', 'Agent'], ['o', 'Overview']]) {
+  for (const [key, name] of [['t', 'Topics'], ['g', 'Graph'], ['c', 'Chains'], ['n', 'Nodes'],
+    ['e', 'Events'], ['r', 'Recordings'], ['a', 'Agent'], ['o', 'Overview']]) {
     await tab.page.keyboard.press('g');
     await tab.page.keyboard.press(key);
     await tab.heading(name);

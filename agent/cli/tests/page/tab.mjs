@@ -88,6 +88,36 @@ export async function ask(question) {
   return JSON.parse(value);
 }
 
+/** Nothing that prints nothing or turns its neighbours around is in the document. */
+const UNSEEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffc]/;
+
+/** What in the document is not as it must be. */
+function looked(pattern) {
+  const unseen = new RegExp(pattern);
+  const wrong = [];
+  for (const each of document.querySelectorAll('body *')) {
+    if (/^(script|iframe|img|object|embed|style|base|meta|link|form.+)$/i.test(each.tagName)) {
+      wrong.push(`element ${each.outerHTML.slice(0, 200)}`);
+    }
+    for (const { name, value } of each.attributes) {
+      if (/^on/i.test(name)) wrong.push(`attribute ${name} of ${each.tagName}`);
+      if (/^(href|src|action|xlink:href)$/i.test(name) && !value.startsWith('#')
+        && !value.startsWith('blob:')) wrong.push(`${name}=${value.slice(0, 100)}`);
+      // A key of the page's own is on no screen and read by no one.
+      if (name !== 'data-key' && unseen.test(value)) wrong.push(`unseen in ${name} of ${each.tagName}: ${
+        encodeURIComponent(value.slice(0, 60))}`);
+    }
+  }
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  while (walk.nextNode()) {
+    const text = walk.currentNode.textContent;
+    if (unseen.test(text)) wrong.push(`unseen text ${encodeURIComponent(text.slice(0, 80))}`);
+  }
+  if (globalThis.harmed) wrong.push('code of a name ran');
+  if (Object.prototype.polluted !== undefined) wrong.push('a prototype was changed');
+  return wrong.slice(0, 10);
+}
+
 /** One tab, and what has been seen of it. */
 export class Tab {
   constructor(page, address) {
@@ -188,6 +218,11 @@ export class Tab {
       .map((node) => `    ${node.target.join(' ')}: ${node.html.slice(0, 300)}\n      ${
         node.failureSummary.replaceAll('\n', ' ')}`).join('\n')}`);
     assert.equal(words.length, 0, `${what}:\n${words.join('\n')}`);
+  }
+
+  /** Fails where a name of the network is more than text. */
+  async harmless(what) {
+    assert.deepEqual(await this.page.evaluate(looked, UNSEEN.source), [], what);
   }
 
   /** Fails where the page scrolls sideways; names what is too wide. */

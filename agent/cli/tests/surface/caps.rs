@@ -272,6 +272,25 @@ fn more_snapshots_than_may_be_configured_are_refused() {
 }
 
 #[test]
+fn more_chains_than_may_be_configured_are_refused() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("ros2probe.yaml");
+    let check = |count: usize| {
+        let entries: Vec<_> = (0..count)
+            .map(|number| format!("{{from: /a{number}, to: /b}}"))
+            .collect();
+        let entries = entries.join(", ");
+        std::fs::write(&file, format!("chains: [{entries}]\n")).unwrap();
+        let output = rp().arg("check-config").arg(&file).output().unwrap();
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    assert!(!check(64).contains("entries, at most"), "{}", check(64));
+    let refused = check(65);
+    let reason = "has 65 entries, at most 64 are allowed";
+    assert!(refused.contains(reason), "{refused}");
+}
+
+#[test]
 fn an_api_request_beyond_its_caps_is_refused_with_the_status_of_each() {
     let agent = LocalAgent::start(&mut rp(), &["--speed", "0.2"]);
     let list = "a".repeat(16_385);

@@ -129,6 +129,8 @@ fn the_schema_accepts_what_the_agent_accepts_and_refuses_what_it_refuses() {
         "otlp: {compression: zstd}",
         "otlp: {interval_s: 0}",
         "watch: [{topic: /a, trace: 1.5}]",
+        "chains: [{from: /a}]",
+        "chains: [{from: /a, to: /b, max_latency_ms: 0}]",
         "recordings: {snapshots: [{name: a b, topics: [/a]}]}",
         "recordings: {snapshots: [{name: ../a, topics: [/a]}]}",
         "recordings: {snapshots: [{name: a, topics: [/a], trigger: expectation}]}",
@@ -178,10 +180,16 @@ fn with_key(path: &str, value: f64) -> String {
             ("watch", true) => {
                 format!("{{watch: [{{topic: /a, {}]}}", text.trim_start_matches('{'))
             }
+            ("chains", true) => {
+                let rest = text.trim_start_matches('{');
+                format!("{{chains: [{{from: /a, to: /b, {rest}]}}")
+            }
             ("snapshots", true) => {
                 let rest = text.trim_start_matches('{');
                 format!("{{snapshots: [{{name: a, topics: [/a], {rest}]}}")
             }
+            // A list of numbers.
+            (key, true) => format!("{{{key}: [{text}]}}"),
             _ => format!("{{{key}: {text}}}"),
         };
     }

@@ -2,12 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
+use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::rp;
 use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
+use ros2probe_testing::repository;
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 
 /// Values that change from one reading to the next.
@@ -278,29 +280,33 @@ fn a_late_receiver_gets_all_events_as_log_records_in_order() {
     );
 }
 
-/// An agent that traces every message of the capture, and what the receiver prints of it.
-fn traced(directory: &std::path::Path) -> Vec<Item> {
+/// An agent with these watches that replays a capture, and the spans that the receiver prints until
+/// `is_whole` accepts its output.
+fn traced(
+    directory: &Path,
+    capture: &Path,
+    watches: &str,
+    is_whole: impl Fn(&str) -> bool,
+) -> Vec<Item> {
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory, None);
     let configuration = directory.join("traced.yaml");
     let yaml = format!(
-        "watch: [{{topic: /chatter, trace: 1}}]\n\
+        "watch: [{watches}]\n\
          otlp: {{endpoint: 'http://{}', metrics: false, events: false}}\n",
         receiver.address
     );
     std::fs::write(&configuration, yaml).unwrap();
-    let mut agent = LocalAgent::start(
-        &mut rp(),
-        &[
-            "--config",
-            configuration.to_str().unwrap(),
-            "--speed",
-            "max",
-        ],
-    );
+    let arguments = [
+        "--config",
+        configuration.to_str().unwrap(),
+        "--speed",
+        "max",
+    ];
+    let mut agent = LocalAgent::replay(&mut rp(), capture, &arguments);
     agent.wait_for_log("the capture has ended");
     agent.signal("-TERM");
     assert!(agent.wait().success());
-    let text = receiver.wait_for("spans have come", |text| text.contains("settle /chatter"));
+    let text = receiver.wait_for("spans have come", is_whole);
     let exports = exports(&text);
     let services = exports
         .iter()
@@ -315,8 +321,11 @@ fn traced(directory: &std::path::Path) -> Vec<Item> {
 #[test]
 fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says() {
     let directory = tempfile::tempdir().unwrap();
-    let spans = traced(directory.path());
-    let again = traced(directory.path());
+    let watch = "{topic: /chatter, trace: 1}";
+    let capture = local_agent::capture();
+    let is_whole = |text: &str| text.contains("settle /chatter");
+    let traced = || traced(directory.path(), &capture, watch, is_whole);
+    let (spans, again) = (traced(), traced());
     let identity = |span: &Item| {
         let field = |name: &str| span.fields[name].clone();
         (
@@ -359,4 +368,91 @@ fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says(
         assert_eq!(attributes[key], value, "{attributes:?}");
     }
     assert!(attributes.contains_key("source_timestamp_unix_nano"));
+}
+
+/// Commands of the capture whose whole way is in `GET /chains`.
+const COMMANDS: usize = 259;
+
+#[test]
+fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
+    let directory = tempfile::tempdir().unwrap();
+    let capture = repository("agent/testing/data/fastrtps-udp/chain-1ns/capture.pcap.gz");
+    let watches = "{topic: /points, trace: 1}, {topic: /filtered}, {topic: /cmd}";
+    // The last span is the publication of the last command, and its last attribute is the stamp.
+    let is_whole = |text: &str| {
+        let published: Vec<_> = text.split(" : publish /cmd\n").skip(1).collect();
+        let last = published.last().copied().unwrap_or_default();
+        published.len() >= COMMANDS && last.contains("-> stamp: Str(") && last.ends_with('\n')
+    };
+    let traced = || traced(directory.path(), &capture, watches, is_whole);
+    let (spans, again) = (traced(), traced());
+    let is_of_chain = |span: &&Item| span.attributes.contains_key("method");
+    let of_chains: Vec<_> = spans.iter().filter(is_of_chain).collect();
+    let again: Vec<_> = again.iter().filter(is_of_chain).collect();
+    let field = |span: &Item, name: &str| span.fields[name].clone();
+    let identity = |span: &&Item| (field(span, "Trace ID"), field(span, "ID"));
+    let identities = |spans: &[&Item]| spans.iter().map(identity).collect::<Vec<_>>();
+    assert!(identities(&of_chains) == identities(&again), "ids differ");
+
+    let mut traces: BTreeMap<String, BTreeMap<String, &Item>> = BTreeMap::new();
+    for span in of_chains {
+        let trace = traces.entry(field(span, "Trace ID")).or_default();
+        assert!(trace.insert(field(span, "Name"), span).is_none());
+    }
+    let whole = traces
+        .values()
+        .filter(|trace| trace.contains_key("publish /cmd"));
+    let whole: Vec<_> = whole.collect();
+    assert_eq!(whole.len(), COMMANDS);
+    let parents = [
+        ("publish /points", None, "/sensor"),
+        ("transit /points", Some("publish /points"), "/filter"),
+        ("node /points", Some("publish /points"), "/filter"),
+        ("publish /filtered", Some("node /points"), "/filter"),
+        (
+            "transit /filtered",
+            Some("publish /filtered"),
+            "/controller",
+        ),
+        ("node /filtered", Some("publish /filtered"), "/controller"),
+        ("publish /cmd", Some("node /filtered"), "/controller"),
+    ];
+    for trace in whole {
+        assert_eq!(trace.len(), parents.len(), "{trace:#?}");
+        for (name, parent, node) in parents {
+            let span = trace[name];
+            let parent = parent.map_or_else(String::new, |parent| field(trace[parent], "ID"));
+            assert_eq!(field(span, "Parent ID"), parent, "{name}");
+            assert_eq!(span.attributes["ros_node"], node, "{name}");
+            assert_eq!(span.attributes["method"], "stamps");
+        }
+        let time = |name: &str, end: &str| field(trace[name], end).parse::<u64>().unwrap();
+        assert_eq!(
+            time("transit /points", "End time"),
+            time("node /points", "Start time")
+        );
+        let took = time("node /points", "End time") - time("node /points", "Start time");
+        assert!(took > 12_000_000, "the filter sleeps 12 ms: {took}");
+    }
+
+    // The messages' own traces are apart. A publication on the traced topic links to its message.
+    let sent = spans
+        .iter()
+        .filter(|span| span.fields["Name"] == "send /points");
+    let sent: BTreeMap<_, _> = sent.map(|span| (field(span, "Trace ID"), span)).collect();
+    assert!(sent.len() > 250);
+    assert!(sent.keys().all(|trace| !traces.contains_key(trace)));
+    for trace in traces.values() {
+        for (name, span) in trace {
+            let [link] = &span.links[..] else {
+                assert!(span.links.is_empty() && name != "publish /points");
+                continue;
+            };
+            assert_eq!(name, "publish /points");
+            let message = sent[&link["Trace ID"]];
+            assert_eq!(link["ID"], message.fields["ID"]);
+            let number = |span: &Item| span.attributes["sequence_number"].clone();
+            assert_eq!(number(message), number(span));
+        }
+    }
 }

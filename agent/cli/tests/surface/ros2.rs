@@ -14,17 +14,17 @@ use std::process::Output;
 use crate::rp;
 use ros2probe_testing::local_agent::{self, LocalAgent};
 
-fn run(arguments: &[&str]) -> Output {
+pub fn run(arguments: &[&str]) -> Output {
     let mut rp = rp();
     rp.env_remove("ROS_DOMAIN_ID").env_remove("ROS_DISTRO");
     rp.args(arguments).output().unwrap()
 }
 
-fn stdout(output: &Output) -> String {
+pub fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()
 }
 
-fn stderr(output: &Output) -> String {
+pub fn stderr(output: &Output) -> String {
     String::from_utf8(output.stderr.clone()).unwrap()
 }
 

@@ -1,5 +1,7 @@
 //! Converts the shape into its meaning, and checks conditions that types and ranges cannot express.
 
+mod chains;
+
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -7,6 +9,7 @@ use std::time::Duration;
 
 use globset::Glob;
 use ros2probe_wire::DomainId;
+use ros2probe_wire::filter::PORT_CAPACITY;
 
 use super::check::check;
 use super::document::Node;
@@ -134,6 +137,7 @@ impl Reader {
         let has_token = api.token_file.is_some();
         Config {
             watches: self.watches(shape.watch.unwrap_or_default(), limits.watches),
+            chains: self.chains(shape.chains.unwrap_or_default()),
             limits,
             capture: self.capture(shape.capture.unwrap_or_default()),
             metrics: metrics(shape.metrics.unwrap_or_default()),
@@ -320,7 +324,13 @@ impl Reader {
                 cpu_percent: shm.cpu_percent,
                 reading_cpu_percent: shm.reading_cpu_percent,
             },
+            inside: shape.inside,
+            zenoh_ports: shape.zenoh.unwrap_or_default().ports,
         };
+        if settings.zenoh_ports.len() > PORT_CAPACITY {
+            let message = format!("has more than {PORT_CAPACITY} ports");
+            self.wrong("capture.zenoh.ports", message);
+        }
         self.check_source(&settings);
         settings
     }
@@ -399,6 +409,10 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
         "watch[]" | "watch[].topic" | "recordings.snapshots[].topics[]" => {
             check_pattern(text).map_err(|error| error.to_string())
         }
+        "chains[].from" | "chains[].to" if text.contains('*') => {
+            Err("must be the name of one topic, as in `/points`".to_owned())
+        }
+        "chains[].from" | "chains[].to" => check_pattern(text).map_err(|error| error.to_string()),
         "capture.interfaces.include[]"
         | "capture.interfaces.exclude[]"
         | "capture.mirror_interfaces[]" => {

@@ -25,9 +25,10 @@ pub use limits::markdown as limits_markdown;
 pub use mistake::{Mistake, Mistakes, Position};
 pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{
-    CaptureSettings, ExactChoice, ShmMode, ShmSettings, SourceChoice,
+    CaptureSettings, ExactChoice, InsideChoice, ShmMode, ShmSettings, SourceChoice,
 };
 use ros2probe_message::Dialect;
+pub use ros2probe_model::chain::expected::ExpectedChain;
 pub use ros2probe_model::glob;
 pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
 pub use ros2probe_model::rehearsal;
@@ -44,6 +45,8 @@ const MAX_BYTES: u64 = 1 << 20;
 pub struct Config {
     /// Topics to measure, in file order.
     pub watches: Vec<Watch>,
+    /// Chains with a limit for their latency, in file order.
+    pub chains: Vec<ExpectedChain>,
     /// Caps of the agent's tables.
     pub limits: Limits,
     /// Sources of packets.
@@ -377,6 +380,7 @@ impl Config {
     #[must_use]
     pub fn needs_restart(&self, new: &Self) -> Vec<&'static str> {
         [
+            ("chains", self.chains != new.chains),
             ("limits", self.limits != new.limits),
             ("capture", self.capture != new.capture),
             ("metrics.listen", self.metrics.listen != new.metrics.listen),
@@ -417,6 +421,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             watches: Vec::new(),
+            chains: Vec::new(),
             limits: Limits::default(),
             capture: CaptureSettings {
                 source: SourceChoice::default(),
@@ -433,6 +438,8 @@ impl Default for Config {
                     cpu_percent: defaults::SHM_CPU_PERCENT,
                     reading_cpu_percent: defaults::SHM_READING_CPU_PERCENT,
                 },
+                inside: InsideChoice::default(),
+                zenoh_ports: vec![defaults::ZENOH_PORT],
             },
             metrics: MetricsSettings {
                 listen: defaults::LISTEN.parse().ok(),
@@ -483,6 +490,7 @@ mod defaults {
 
     pub(super) const RING_BYTES: usize = 4 << 20;
     pub(super) const RECORD_RING_BYTES: usize = 1 << 20;
+    pub(super) const ZENOH_PORT: u16 = ros2probe_wire::zenoh::PORT;
     pub(super) const SHM_CPU_PERCENT: f64 = 1.5;
     pub(super) const SHM_READING_CPU_PERCENT: f64 = 25.0;
     pub(super) const LISTEN: &str = "127.0.0.1:17400";

@@ -11,7 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use super::limits::LimitsShape;
 use super::{
-    Access, Compression, ExactChoice, Level, PageChoice, Retain, ShmMode, SourceChoice, defaults,
+    Access, Compression, ExactChoice, InsideChoice, Level, PageChoice, Retain, ShmMode,
+    SourceChoice, defaults,
 };
 
 /// Configuration of the ros2probe agent. Every key is optional.
@@ -25,6 +26,9 @@ pub(super) struct ConfigShape {
     /// Topics to measure: names (`/points`), globs (`/camera/*/image_raw`, `/**`), or maps with
     /// expectations. With an empty list, only the graph is reported. Applied on reload.
     pub(super) watch: Option<Vec<WatchShape>>,
+    /// Chains of messages with a limit for their latency. The topics between their ends are measured
+    /// if their messages begin with a header.
+    pub(super) chains: Option<Vec<ChainShape>>,
     /// Caps of the agent's tables; `ros2probe_limit_reached_total` counts entries beyond them.
     pub(super) limits: Option<LimitsShape>,
     /// Sources of packets, and the memory for them.
@@ -90,7 +94,8 @@ pub(super) struct WatchEntryShape {
     #[serde(default)]
     pub(super) per_subscriber: bool,
     /// Fraction of each matching topic's messages for which spans are exported (`otlp`), 0 to 1:
-    /// the time on the wire, and the acknowledgements of each reliable reader.
+    /// the time on the wire, and the acknowledgements of each reliable reader. The same fraction of
+    /// the chains that begin with the topic is exported, too.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) trace: Option<f64>,
     /// `last`: keep the last message of each matching transient-local writer in memory, for
@@ -118,6 +123,23 @@ pub(super) struct WatchEntryShape {
     /// Minimum number of subscribers, from 10 s after the first publisher on.
     #[schemars(range(min = 1, max = 10_000))]
     pub(super) subscribers: Option<u32>,
+}
+
+/// A chain of messages from a sensor's topic to an actuator's.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields)]
+pub(super) struct ChainShape {
+    /// ROS name of the first topic.
+    pub(super) from: String,
+    /// ROS name of the last topic.
+    pub(super) to: String,
+    /// Only in this domain; default: every domain.
+    #[schemars(range(min = 0, max = 232))]
+    pub(super) domain: Option<u32>,
+    /// Maximum time from the publication on the first topic to that on the last, in milliseconds.
+    #[schemars(range(min = 0.001, max = 5000.0))]
+    pub(super) max_latency_ms: Option<f64>,
 }
 
 /// Messages of a topic kept for recordings that start later.
@@ -158,6 +180,24 @@ pub(super) struct CaptureShape {
     pub(super) record_ring_bytes: usize,
     /// Messages in Fast DDS's shared memory between processes of one host.
     pub(super) shm: Option<ShmShape>,
+    /// Calls inside ROS processes, by kernel breakpoints in their library `libtracetools.so`,
+    /// whatever their middleware. `topics`: messages published and taken, also within a process;
+    /// `full`: also callbacks, timers and lifecycle transitions. Each call costs the observed
+    /// process some microseconds.
+    pub(super) inside: InsideChoice,
+    /// Connections of Zenoh (rmw_zenoh).
+    pub(super) zenoh: Option<ZenohShape>,
+}
+
+/// Settings of Zenoh's connections.
+#[derive(Debug, Deserialize, JsonSchema)]
+#[schemars(inline)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ZenohShape {
+    /// Ports of Zenoh, TCP and QUIC, at most 8: of routers, and of sessions that listen on a fixed
+    /// port. A connection is recognized on any TCP port; on these, unreadable ones are reported, too.
+    #[schemars(length(max = 8), inner(range(min = 1, max = 65_535)))]
+    pub(super) ports: Vec<u16>,
 }
 
 /// Settings of shared memory, which is only ever read.
@@ -493,6 +533,16 @@ impl Default for CaptureShape {
             ring_bytes: defaults::RING_BYTES,
             record_ring_bytes: defaults::RECORD_RING_BYTES,
             shm: None,
+            inside: InsideChoice::default(),
+            zenoh: None,
+        }
+    }
+}
+
+impl Default for ZenohShape {
+    fn default() -> Self {
+        Self {
+            ports: vec![defaults::ZENOH_PORT],
         }
     }
 }

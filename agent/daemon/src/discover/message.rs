@@ -1,6 +1,6 @@
 //! The few RTPS messages that `rp discover` sends, byte for byte (RTPS 2.5, 8.3 and 9.4).
 //!
-//! The only encoder in the product. It announces a bare participant and one reader of
+//! The only encoder of RTPS in the product. It announces a bare participant and one reader of
 //! `ros_discovery_info`, requests samples, and says goodbye. All messages carry its own identity.
 
 use std::net::SocketAddrV4;

@@ -3,6 +3,7 @@
 
 use std::borrow::Cow;
 use std::fmt::{Display, Write as _};
+use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::names::DdsTopic;
@@ -19,6 +20,8 @@ use ros2probe_model::naming::Naming;
 use ros2probe_model::snapshot::WatchState;
 
 const SECONDS_OF_A_DAY: u64 = 86_400;
+/// State of a managed node that handles an error (`lifecycle_msgs/msg/State`).
+const ERROR_PROCESSING: &str = "errorprocessing";
 
 /// An event of the robot or of the agent.
 #[derive(Clone, Debug, PartialEq)]
@@ -181,6 +184,7 @@ impl Occurrence {
                 Appeared | Changed => &table::NODE_DISCOVERED,
                 Disposed | Expired | Cascaded => &table::NODE_LOST,
             },
+            Self::Robot(EventKind::Lifecycle(_)) => &table::LIFECYCLE_TRANSITION,
             Self::Robot(EventKind::Loss(_)) => &table::MESSAGE_LOST,
             Self::Robot(EventKind::Expectation { .. }) => &table::EXPECTATION_CHANGED,
             Self::Robot(EventKind::Silence { .. }) => &table::TOPIC_SILENT,
@@ -213,11 +217,14 @@ impl Occurrence {
         let definition = self.definition();
         let relieves = match self {
             Self::Robot(EventKind::Participant { change, .. }) => *change == churn::Event::Disposed,
+            Self::Robot(EventKind::Lifecycle(state)) => *state.state != *ERROR_PROCESSING,
             Self::Robot(EventKind::Expectation { to, .. }) => *to == WatchState::Ok,
             // Common while nodes start, and with tools that publish without a subscriber.
             Self::Robot(EventKind::Diagnosis { finding, .. }) => matches!(
                 finding,
-                Diagnosis::UnheardPublisher { .. } | Diagnosis::UnfedSubscriber { .. }
+                Diagnosis::UnheardPublisher { .. }
+                    | Diagnosis::UnfedSubscriber { .. }
+                    | Diagnosis::RestampingNode { .. }
             ),
             Self::Agent(
                 AgentEvent::RecordingEnded { reason, .. }
@@ -307,6 +314,13 @@ fn robot(kind: &EventKind, at: Timestamp) -> Values {
             ("ros_node", Some(text(name))),
             ("participant", written(participant)),
             cause(change),
+        ],
+        EventKind::Lifecycle(state) => vec![
+            domain(state.domain_id),
+            ("ros_node", state.node.as_deref().map(text)),
+            ("process_id", number(state.process)),
+            ("from", Some(text(&state.before))),
+            ("to", Some(text(&state.state))),
         ],
         EventKind::Loss(loss) => self::loss(loss),
         EventKind::Expectation {
@@ -439,7 +453,64 @@ fn finding(finding: &Diagnosis) -> Values {
             ("participants", list([participant])),
             ("domains", list(domains)),
         ],
+        Diagnosis::SlowCallback { .. }
+        | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ObservationSuspended { .. } => inside(finding),
+        Diagnosis::RestampingNode { node, input, .. } => {
+            vec![("ros_node", Some(text(node))), ("from", Some(text(input)))]
+        }
+        Diagnosis::SlowChain {
+            from, max_latency, ..
+        } => vec![
+            ("from", Some(text(from))),
+            (
+                "max_latency_ms",
+                Some(Value::Real(max_latency.as_secs_f64() * 1e3)),
+            ),
+        ],
     });
+    values
+}
+
+/// Returns the details of a finding from inside a process.
+fn inside(finding: &Diagnosis) -> Values {
+    let seconds = |duration: &Duration| Some(Value::Real(duration.as_secs_f64()));
+    let mut values = Vec::new();
+    if let Some(owner) = finding.owner() {
+        if finding.topic().is_none() {
+            values.push(domain(owner.domain_id));
+        }
+        values.push(("ros_node", owner.node.as_deref().map(text)));
+        values.push(("process_id", number(owner.process)));
+    }
+    match finding {
+        Diagnosis::SlowCallback {
+            trigger,
+            duration,
+            period,
+            ..
+        } => values.extend([
+            ("trigger", Some(text(trigger.label()))),
+            ("duration_seconds", seconds(duration)),
+            ("period_seconds", seconds(period)),
+        ]),
+        Diagnosis::ExecutorWait { trigger, wait, .. } => values.extend([
+            ("trigger", Some(text(trigger.label()))),
+            ("wait_seconds", seconds(wait)),
+        ]),
+        Diagnosis::IntraProcessOverflow {
+            overwritten_permille,
+            ..
+        } => {
+            let ratio = Duration::from_millis(*overwritten_permille);
+            values.push(("overwritten_ratio", seconds(&ratio)));
+        }
+        Diagnosis::ObservationSuspended {
+            domain_id, process, ..
+        } => values.extend([domain(*domain_id), ("process_id", number(*process))]),
+        _ => {}
+    }
     values
 }
 

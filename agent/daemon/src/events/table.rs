@@ -117,6 +117,14 @@ const FINDING: &[&str] = &[
     "ros_node",
     "participants",
     "domains",
+    "process_id",
+    "trigger",
+    "duration_seconds",
+    "period_seconds",
+    "wait_seconds",
+    "overwritten_ratio",
+    "from",
+    "max_latency_ms",
 ];
 
 pub(super) const PARTICIPANT_DISCOVERED: Definition = Definition::new(
@@ -168,6 +176,14 @@ pub(super) const NODE_LOST: Definition = Definition::new(
     &["domain_id", "ros_node", "participant", "cause"],
     "A ROS node left: it was disposed of, or its participant left.",
 );
+pub(super) const LIFECYCLE_TRANSITION: Definition = Definition::new(
+    "ros2.node.lifecycle_transition",
+    Severity::Warn,
+    &["domain_id", "ros_node", "process_id", "from", "to"],
+    "A managed node in an observed process changed its lifecycle state; WARN if it is \
+     errorprocessing now.",
+)
+.relief(Severity::Info);
 pub(super) const MESSAGE_LOST: Definition = Definition::new(
     "ros2.message.lost",
     Severity::Warn,
@@ -212,7 +228,9 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     Severity::Warn,
     FINDING,
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
-     duplicate_node, node_in_several_domains, or (INFO) unheard_publisher, unfed_subscriber.",
+     duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
+     intra_process_overflow, observation_suspended, slow_chain, or (INFO) unheard_publisher, \
+     unfed_subscriber, restamping_node.",
 )
 .relief(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(
@@ -328,6 +346,7 @@ pub const EVENTS: &[Definition] = &[
     ENDPOINT_LOST,
     NODE_DISCOVERED,
     NODE_LOST,
+    LIFECYCLE_TRANSITION,
     MESSAGE_LOST,
     EXPECTATION_CHANGED,
     TOPIC_SILENT,

@@ -5,6 +5,7 @@ use ros2probe_wire::{DomainId, Guid};
 use super::*;
 use ros2probe_model::churn;
 use ros2probe_model::event::{Event, EventKind};
+use ros2probe_model::inside::facts::LifecycleState;
 
 fn node(at: u64) -> Event {
     Event {
@@ -61,6 +62,44 @@ fn numbers_grow_by_one_and_a_reader_goes_on_where_it_was() {
     );
     let nothing = log.read(second.last, 10);
     assert_eq!((nothing.last, nothing.records.len()), (3, 0));
+}
+
+#[test]
+fn a_transition_of_a_managed_node_warns_of_errors_only() {
+    let log = EventLog::new();
+    let transition = |name: Option<&str>, from: &str, to: &str| Event {
+        kind: EventKind::Lifecycle(LifecycleState {
+            process: 70,
+            domain_id: DomainId(7),
+            node: name.map(Into::into),
+            state: to.into(),
+            before: from.into(),
+            at: Timestamp(1),
+        }),
+        ..node(1)
+    };
+    let transitions = vec![
+        transition(Some("/lidar"), "activating", "active"),
+        transition(None, "active", "errorprocessing"),
+    ];
+    log.add(taken(transitions), second(0));
+    let batch = log.read(0, 2);
+    let name = "ros2.node.lifecycle_transition";
+    assert_eq!(names(&batch), [name, name]);
+    let severities: Vec<_> = batch.records.iter().map(|each| each.severity).collect();
+    assert_eq!(severities, [Severity::Info, Severity::Warn]);
+    let text = |text: &str| Value::Text(text.to_owned());
+    assert_eq!(
+        batch.records[0].attributes,
+        [
+            ("domain_id", Value::Number(7)),
+            ("ros_node", text("/lidar")),
+            ("process_id", Value::Number(70)),
+            ("from", text("activating")),
+            ("to", text("active")),
+        ]
+    );
+    assert_eq!(batch.records[1].attribute("ros_node"), None);
 }
 
 #[test]

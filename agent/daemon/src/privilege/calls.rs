@@ -273,16 +273,28 @@ impl Allowed {
                 }
             }
             Role::Exact => {
-                allowed.always(LOOK).always(NOTICE).open_for_reading()?;
-                allowed.always(&[libc::SYS_perf_event_open]);
-                allowed.bpf([command::LINK_CREATE].into_iter())?;
-                allowed.end_perf_events()?;
-                for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
-                    allowed.when(libc::SYS_ioctl, &[equal(1, request)?])?;
-                }
+                allowed.always(NOTICE);
+                allowed.attach_probes(&[])?;
+            }
+            Role::Inside => {
+                allowed.always(&[libc::SYS_process_vm_readv]);
+                allowed.attach_probes(&command::MAPS)?;
             }
         }
         Ok(allowed)
+    }
+
+    /// Allows attaching uprobes to libraries, and further commands of `bpf`.
+    fn attach_probes(&mut self, commands: &[libc::c_int]) -> Result<(), BackendError> {
+        self.always(LOOK).open_for_reading()?;
+        self.always(&[libc::SYS_perf_event_open]);
+        let commands = commands.iter().copied();
+        self.bpf(commands.chain([command::LINK_CREATE]))?;
+        self.end_perf_events()?;
+        for request in [request::PERF_ENABLE, request::PERF_SET_BPF] {
+            self.when(libc::SYS_ioctl, &[equal(1, request)?])?;
+        }
+        Ok(())
     }
 
     fn always(&mut self, calls: &[c_long]) -> &mut Self {

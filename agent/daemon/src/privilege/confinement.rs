@@ -63,6 +63,8 @@ pub enum Role {
     },
     /// Attaching uprobes to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
     Exact,
+    /// As [`Role::Exact`], and reading the programs' maps, and the environment of observed processes.
+    Inside,
 }
 
 /// A thread could not be confined.
@@ -153,7 +155,7 @@ impl Role {
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }
-            Self::Exact => uprobe::required(),
+            Self::Exact | Self::Inside => uprobe::required(),
         }
     }
 }
@@ -232,6 +234,7 @@ pub fn spawn_source(
         Task::SharedMemory => Role::shared_memory(),
         Task::Reattach => Role::reattach(),
         Task::Probes => Role::Exact,
+        Task::Inside => Role::Inside,
     };
     spawn(role, thread, work).map_err(|error| match error {
         SpawnError::Thread(error) => error,

@@ -176,8 +176,9 @@ pub fn unobserved_lines(unobserved: &BTreeMap<String, String>) -> Vec<String> {
     lines.collect()
 }
 
-/// Count with its noun.
-fn counted(count: u64, thing: &str) -> String {
+/// Returns a count with its noun.
+#[must_use]
+pub fn counted(count: u64, thing: &str) -> String {
     let plural = if count == 1 { "" } else { "s" };
     format!("{count} {thing}{plural}")
 }

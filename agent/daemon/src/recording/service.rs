@@ -482,6 +482,9 @@ impl Recording {
         figures.active.fetch_sub(1, Ordering::Relaxed);
         drop((subscription, slot));
         let error = ended.error.as_ref().map(causes);
+        if let Some(reason) = &error {
+            tracing::warn!(recording = self.name, reason, "a recording ended early");
+        }
         events.record(AgentEvent::RecordingEnded {
             recording: self.name.clone(),
             messages: ended.report.messages,

@@ -271,7 +271,7 @@ impl Run {
             live.apply(&output.interest);
         }
         self.outputs.events.add(output.events, now);
-        self.outputs.spans.add(output.spans);
+        self.outputs.spans.add(output.spans, output.chain_spans);
         let clock = self.observer.dispatched_until(now);
         if clock + SET_BACK < self.published_until {
             self.published_until = clock;
@@ -329,6 +329,7 @@ impl Run {
         }
         let revision = self.observer.memory_revision();
         let mut snapshot = self.observer.snapshot(self.source.clock());
+        snapshot.tables.extend(self.source.tables());
         if let Some(history) = &self.history {
             snapshot.tables.push(history.table());
             // A reader that waits for this state may read the last seconds next.
@@ -345,7 +346,8 @@ impl Run {
         self.outputs.limits.note(&state);
     }
 
-    /// Returns whether the latest snapshot is read, or no longer describes the graph.
+    /// Returns whether the latest snapshot was read since the last call, or no longer describes the
+    /// graph.
     fn is_snapshot_due(&self) -> bool {
         let was_read = self.outputs.latest.was_read();
         let is_current = self.taken.is_some_and(|(at, revision)| {

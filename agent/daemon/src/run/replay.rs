@@ -15,6 +15,7 @@ use super::CaptureTime;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::{Captured, Pacer, PcapError, PcapReader, Speed, link_name};
 use ros2probe_capture::reassembly::{Limits, Reassembly};
+use ros2probe_capture::zenoh::Streams;
 use ros2probe_model::observer::Observer;
 
 /// Interval of progress reports on a terminal.
@@ -397,6 +398,12 @@ impl Replay {
     #[must_use]
     pub const fn unsupported(&self) -> &BTreeMap<u16, u64> {
         &self.unsupported
+    }
+
+    /// Connections of Zenoh, for their counters.
+    #[must_use]
+    pub const fn streams(&self) -> &Streams {
+        self.decoder.streams()
     }
 
     /// Reassembly of fragments, for its counters.

@@ -12,14 +12,17 @@ use ros2probe_wire::filter::Counter;
 use super::RunError;
 use super::replay::Replay;
 use crate::agent_facts::{
-    Ability, AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
+    Ability, AgentFacts, ExactFacts, InsideLibrary, InsideSourceFacts, InterfaceFacts,
+    SharedMemoryFacts, SourceKind,
 };
 use crate::config::CaptureSettings;
 use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
+use ros2probe_capture::zenoh::Streams;
 use ros2probe_model::observer::Observer;
+use ros2probe_model::snapshot::TableFacts;
 
 /// Source of packets.
 pub enum Source {
@@ -58,6 +61,9 @@ impl Source {
         }
         if let Some(reason) = live.without_exact() {
             tracing::warn!("capture.shm.exact not used: {reason}; shared memory is sampled");
+        }
+        if let Some(reason) = live.without_inside() {
+            tracing::warn!("capture.inside not used: {reason}");
         }
         if !live.is_on_the_wire() && !settings.network_namespaces.is_empty() {
             tracing::info!("capture.network_namespaces is not needed: all sockets are seen");
@@ -146,6 +152,29 @@ impl Source {
         }
     }
 
+    /// Returns the tables of the source: connections of Zenoh, and the bytes that wait in them.
+    pub(super) fn tables(&self) -> [TableFacts; 2] {
+        let streams: Vec<_> = match self {
+            Self::Live(live) => live.streams().collect(),
+            Self::Replay(replay) => vec![replay.streams()],
+        };
+        let evictions = streams.iter().map(|each| each.counters().evicted).sum();
+        let table = |table, index: usize| {
+            let sizes = || {
+                streams
+                    .iter()
+                    .filter_map(|each| each.sizes().get(index).copied())
+            };
+            TableFacts {
+                table,
+                size: sizes().map(|size| size.entries as u64).sum(),
+                limit: sizes().map(|size| size.cap as u64).sum(),
+                evictions,
+            }
+        };
+        [table("zenoh_streams", 0), table("zenoh_stream_bytes", 3)]
+    }
+
     pub(super) fn facts(&mut self) -> AgentFacts {
         let now = Instant::now();
         match self {
@@ -224,6 +253,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
             .iter()
             .filter(|(counter, _)| *counter != Counter::CapturedBytes)
             .map(|(counter, value)| (counter.label(), *value))
+            .chain(streams(live))
             .collect(),
         copied_bytes: live.copied_bytes(),
         records_dropped: value(Counter::RecordsLost),
@@ -241,8 +271,45 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         contended: value(Counter::Contended),
         shared_memory: live.shared_memory().map(shared_memory),
         exact: exact(live),
+        inside: inside(live),
         ..AgentFacts::new(kind(live), now)
     }
+}
+
+/// Batches and gaps that were read in connections of Zenoh.
+fn streams(live: &LiveSource) -> [(&'static str, u64); 2] {
+    let (mut batches, mut gaps) = (0, 0);
+    for counters in live.streams().map(Streams::counters) {
+        batches += counters.batches;
+        gaps += counters.gaps;
+    }
+    [("zenoh_read_batches", batches), ("zenoh_read_gaps", gaps)]
+}
+
+/// State of the source inside processes. `None` if it is off.
+fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
+    let Some(facts) = live.inside() else {
+        let reason = live.without_inside()?;
+        return Some(InsideSourceFacts {
+            reason_off: Some(reason.to_owned()),
+            ..InsideSourceFacts::default()
+        });
+    };
+    let libraries = facts.libraries.into_iter().map(|library| InsideLibrary {
+        path: library.path.display().to_string(),
+        processes: library.processes as u64,
+        refused: library.refused,
+    });
+    Some(InsideSourceFacts {
+        mode: if facts.has_callbacks {
+            "full"
+        } else {
+            "topics"
+        },
+        libraries: libraries.collect(),
+        counters: facts.counters,
+        reason_off: facts.detached,
+    })
 }
 
 /// State of exact mode for each library. Empty if it is off.
@@ -316,6 +383,9 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if live.exact().is_some_and(|facts| facts.uncovered.is_none()) {
         abilities.push(Ability::SharedMemoryExact);
     }
+    if live.inside().is_some() {
+        abilities.push(Ability::Inside);
+    }
     abilities
 }
 
@@ -333,6 +403,8 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
     let uncovered = live.exact().and_then(|facts| facts.uncovered);
     let exact = live.without_exact().map(str::to_owned).or(uncovered);
     blind.extend(exact.map(|reason| (Ability::SharedMemoryExact, reason)));
+    let inside = live.without_inside().map(str::to_owned);
+    blind.extend(inside.map(|reason| (Ability::Inside, reason)));
     blind
 }
 

@@ -6,15 +6,21 @@
 //! and `topic`; details are in one info series.
 
 mod agent;
+mod chain;
 mod delivery;
 mod diagnosis;
+mod inside;
 mod service;
+mod zenoh;
 
 use crate::stability::Stability;
 pub(super) use agent::*;
+pub(super) use chain::*;
 pub(super) use delivery::*;
 pub(super) use diagnosis::*;
+pub(super) use inside::*;
 pub(super) use service::*;
+pub(super) use zenoh::*;
 
 /// A metric family.
 #[derive(Debug, PartialEq, Eq)]
@@ -224,7 +230,8 @@ pub(super) const TOPIC_SUBSCRIPTIONS: Metric =
 pub(super) const TOPIC_MESSAGES: Metric = Metric::counter(
     "ros2_topic_messages_total",
     TOPIC,
-    "Messages seen whole, each counted once regardless of copies.",
+    "Messages seen whole, each counted once regardless of copies; publications inside processes \
+     where ros2_topic_source_info says so.",
 );
 pub(super) const TOPIC_BYTES: Metric = Metric::counter(
     "ros2_topic_bytes_total",
@@ -336,8 +343,8 @@ pub(super) const TOPIC_PAIRS: Metric = Metric::gauge(
     "ros2_topic_pairs",
     &["domain_id", "topic", "passage"],
     "Pairs of writer and reader by the path of their messages, as both announce it: network, \
-     shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are not \
-     visible).",
+     shared_memory (sampled), data_sharing, same_process, iceoryx (the last three are \
+     visible only with capture.inside).",
 );
 
 // Writers, on request.
@@ -407,6 +414,13 @@ pub const CATALOGUE: &[Metric] = &[
     ACTION_OPEN,
     ACTION_P50,
     ACTION_P99,
+    CHAIN_LATENCY,
+    CHAIN_P50,
+    CHAIN_P99,
+    HOP_LATENCY,
+    HOP_P50,
+    HOP_P99,
+    CHAIN_STATE,
     TOPIC_INFO,
     TOPIC_PUBLISHERS,
     TOPIC_SUBSCRIPTIONS,
@@ -445,6 +459,26 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_TRANSIT,
     TOPIC_TRANSFER,
     TOPIC_RETRANSMISSION,
+    TOPIC_SOURCE,
+    INSIDE_PUBLISHED,
+    INSIDE_TAKEN,
+    INSIDE_FAILED,
+    INTRA_RECEIVED,
+    INTRA_ENQUEUED,
+    INTRA_OVERWRITTEN,
+    INTRA_DEQUEUED,
+    INTRA_DEPTH,
+    INSIDE_LATENCY,
+    INTRA_WAITING,
+    CALLBACK_DURATION,
+    CALLBACK_WAIT,
+    CALLBACK_P99,
+    CALLBACK_MAX,
+    CALLBACK_WAIT_P99,
+    CALLBACK_BUSY,
+    TIMER_SKIPPED,
+    NODE_BUSY,
+    NODE_LIFECYCLE,
     WRITER_MESSAGES,
     WRITER_BYTES,
     WRITER_LOST,
@@ -486,6 +520,18 @@ pub const CATALOGUE: &[Metric] = &[
     SHM_LOOKS,
     SHM_CPU,
     SHM_EXACT_INFO,
+    INSIDE_INFO,
+    INSIDE_LIBRARY,
+    INSIDE_EVENTS,
+    INSIDE_PROCESSES,
+    CALLBACKS_NOT_SHOWN,
+    ZENOH_CONNECTIONS,
+    ZENOH_ROUTERS,
+    ZENOH_BATCHES,
+    ZENOH_GAPS,
+    ZENOH_FOREIGN,
+    ZENOH_INCOMPLETE,
+    ZENOH_UNSEEN,
     DATAGRAMS,
     RECORDS,
     DECODE_ERRORS,

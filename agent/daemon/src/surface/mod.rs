@@ -6,6 +6,7 @@ pub mod api;
 mod authority;
 mod basic_auth;
 pub mod catalogue;
+mod chain_metrics;
 mod collect;
 mod compressed_text;
 mod connection;
@@ -14,6 +15,8 @@ mod diagnosis_metrics;
 pub mod exposition;
 pub mod foxglove;
 pub mod http;
+mod inside_metrics;
+mod inside_nodes;
 mod large_responses;
 mod limited_listener;
 mod listen;
@@ -28,6 +31,7 @@ mod text;
 #[cfg(feature = "tls")]
 mod tls;
 pub mod web_config;
+mod zenoh_metrics;
 
 pub use collect::MetricSources;
 pub use exposition::{Exposition, Format};

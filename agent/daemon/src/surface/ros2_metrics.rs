@@ -304,8 +304,12 @@ pub(super) fn topics(
         (&metric::TOPIC_INCOMPLETE, |measured| measured.incomplete),
     ];
     for (metric, value) in counters {
+        let is_size = *metric == metric::TOPIC_BYTES;
         sink.family(metric, |family| {
-            measured(family, rows, |facts| Some(value(facts).into()))
+            measured(family, rows, |facts| {
+                let is_known = !is_size || has_size(facts);
+                is_known.then(|| value(facts).into())
+            })
         })?;
     }
     sink.family(&metric::TOPIC_LAST_MESSAGE, |family| {
@@ -320,7 +324,9 @@ pub(super) fn topics(
         measured(family, rows, |facts| Some(facts.rate_hz.into()))
     })?;
     sink.family(&metric::TOPIC_BANDWIDTH, |family| {
-        measured(family, rows, |facts| Some(facts.bandwidth.into()))
+        measured(family, rows, |facts| {
+            has_size(facts).then(|| facts.bandwidth.into())
+        })
     })?;
     let doubts: [(&Metric, Count); 3] = [
         (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {
@@ -340,6 +346,11 @@ pub(super) fn topics(
     }
     sampled(sink, rows)?;
     histograms(sink, rows, settings)
+}
+
+/// Returns whether the size of the messages is known: calls inside processes do not show it.
+const fn has_size(measured: &Measurement) -> bool {
+    measured.bytes > 0 || measured.messages == 0
 }
 
 /// Writes the histograms of intervals and latencies.

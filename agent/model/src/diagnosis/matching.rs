@@ -59,6 +59,15 @@ pub struct Offer<'a> {
     pub vendor: VendorId,
 }
 
+impl Offer<'_> {
+    /// Returns whether the implementations have a protocol in common, without which endpoints do
+    /// not know each other.
+    #[must_use]
+    pub fn shares_protocol(self, other: Self) -> bool {
+        (self.vendor == VendorId::ZENOH) == (other.vendor == VendorId::ZENOH)
+    }
+}
+
 impl Policy {
     /// All policies.
     pub const ALL: [Self; 9] = [
@@ -169,6 +178,10 @@ impl fmt::Debug for Policies {
 #[must_use]
 pub fn verdict(offered: Offer<'_>, requested: Offer<'_>) -> Verdict {
     let both = [offered.vendor, requested.vendor];
+    if both.iter().all(|vendor| *vendor == VendorId::ZENOH) {
+        // Zenoh has no request/offered rules: rmw_zenoh delivers whatever the QoS are.
+        return Verdict::Match;
+    }
     let all_fast = both.iter().all(|vendor| *vendor == VendorId::EPROSIMA);
     let mut policies = Policies::default();
     for policy in Policy::ALL {
@@ -386,6 +399,15 @@ mod tests {
             panic!("{fast:?}");
         };
         assert_eq!(policies.iter().collect::<Vec<_>>(), [Policy::Reliability]);
+    }
+
+    #[test]
+    fn zenoh_delivers_whatever_the_qos_are() {
+        let (mut writer, mut reader) = (qos(Role::Writer), qos(Role::Reader));
+        writer.reliability = Reliability::BEST_EFFORT;
+        reader.reliability = Reliability::RELIABLE;
+        let zenoh = [VendorId::ZENOH; 2];
+        assert_eq!(judge(&writer, &reader, zenoh), Verdict::Match);
     }
 
     #[test]

@@ -131,6 +131,7 @@ impl Discovery {
         let shared_memory =
             (!unicast.is_empty()).then(|| unicast.iter().any(Locator::is_shared_memory));
         let endpoint = Endpoint {
+            gid: announcement.gid,
             role: announcement.role,
             domain_id,
             topic: announcement.topic.as_str().into(),

@@ -123,6 +123,8 @@ pub struct Node {
 /// A writer or reader.
 #[derive(Clone, Debug)]
 pub struct Endpoint {
+    /// Identity that ROS prints: the GUID, or with Zenoh the hash of the liveliness token.
+    pub gid: [u8; 16],
     /// Writer or reader.
     pub role: Role,
     /// Domain of its participant.

@@ -23,12 +23,16 @@ use serde::{Deserialize, Serialize};
 
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
 use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
+use crate::zenoh::ZenohMemory;
 
 /// All participants with their endpoints and nodes.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Memory {
     /// Participants, sorted by GUID prefix.
     pub participants: Vec<Remembered>,
+    /// Connections of Zenoh; older agents did not save them.
+    #[serde(default)]
+    pub zenoh: ZenohMemory,
 }
 
 /// A participant with its endpoints and nodes. GUIDs and vendors are hexadecimal.
@@ -64,6 +68,9 @@ struct RememberedNode {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct RememberedEndpoint {
     guid: String,
+    /// With Zenoh, the hash of the liveliness token.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    gid: Option<String>,
     topic: String,
     message_type: String,
     type_hash: Option<String>,
@@ -115,6 +122,7 @@ impl Discovery {
         });
         Memory {
             participants: remembered.collect(),
+            zenoh: ZenohMemory::default(),
         }
     }
 
@@ -264,6 +272,7 @@ impl RememberedEndpoint {
         let qos = &endpoint.qos;
         Self {
             guid: digits(guid),
+            gid: (endpoint.gid != guid.to_bytes()).then(|| digits(Guid::from_bytes(endpoint.gid))),
             topic: endpoint.topic.to_string(),
             message_type: endpoint.message_type.to_string(),
             type_hash: endpoint.type_hash.as_ref().map(TypeHash::to_string),
@@ -306,7 +315,12 @@ impl RememberedEndpoint {
             kind: HistoryKind(kind),
             depth,
         };
+        let gid = match &self.gid {
+            Some(gid) => hexadecimal(gid)?,
+            None => guid.to_bytes(),
+        };
         let endpoint = Endpoint {
+            gid,
             role,
             domain_id,
             topic: topic.as_str().into(),
@@ -439,6 +453,7 @@ mod tests {
         qos.presentation.is_ordered = true;
         qos.representations = vec![DataRepresentation::XCDR2];
         let endpoint = Endpoint {
+            gid: guid.to_bytes(),
             role: Role::Writer,
             domain_id: DomainId(0),
             topic: "rt/points".into(),

@@ -177,6 +177,9 @@ fn compare<'a>(
                 break 'all;
             }
             open -= 1;
+            if !writer.offer.shares_protocol(reader.offer) {
+                continue;
+            }
             let hindrance = if writer.message_type != reader.message_type {
                 Some(Unmatched::Type)
             } else {

@@ -1,6 +1,6 @@
 //! Parses SPDP, SEDP and `ros_discovery_info` samples for discovery.
 
-use ros2probe_wire::discovery::{self, Role};
+use ros2probe_wire::discovery::{self, EndpointAnnouncement, ParticipantAnnouncement, Role};
 use ros2probe_wire::entities::ParticipantEntities;
 use ros2probe_wire::record::Sample;
 use ros2probe_wire::rtps::{InlineQos, Payload, StatusInfo, VendorId};
@@ -105,12 +105,8 @@ impl Observer {
     ) -> Result<(), WireError> {
         match discovery::participant(vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
-                let prefix = announcement.guid.prefix;
-                let evidence = self.evidence(prefix);
-                let journal = &mut self.journal;
-                self.discovery
-                    .participant(&announcement, origin, evidence, journal);
-                self.announce(prefix);
+                self.learn_participant(&announcement, origin);
+                self.announce(announcement.guid.prefix);
             }
             discovery::Discovery::Gone { guid, .. } => {
                 self.discovery
@@ -137,12 +133,7 @@ impl Observer {
         match discovery::endpoint(role, vendor, payload, inline_qos)? {
             discovery::Discovery::Alive(announcement) => {
                 let prefix = announcement.guid.prefix;
-                let evidence = self.evidence(prefix);
-                let journal = &mut self.journal;
-                if self
-                    .discovery
-                    .endpoint(announcement, origin, evidence, journal)
-                {
+                if self.learn_endpoint(announcement, origin) {
                     self.announce(prefix);
                 }
             }
@@ -161,15 +152,50 @@ impl Observer {
         origin: &Origin,
     ) -> Result<(), WireError> {
         let entities = ParticipantEntities::parse(payload.bytes())?;
-        let evidence = self.evidence(writer.prefix);
-        let journal = &mut self.journal;
-        self.discovery
-            .entities(&entities, writer, origin, evidence, journal);
+        self.learn_entities(&entities, writer, origin);
         Ok(())
     }
 
+    /// Records a participant that is announced.
+    pub(super) fn learn_participant(
+        &mut self,
+        announcement: &ParticipantAnnouncement,
+        origin: &Origin,
+    ) {
+        let evidence = self.evidence(announcement.guid.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .participant(announcement, origin, evidence, journal);
+    }
+
+    /// Records an endpoint that is announced. Returns whether its participant is admitted because
+    /// of it.
+    pub(super) fn learn_endpoint(
+        &mut self,
+        announcement: EndpointAnnouncement,
+        origin: &Origin,
+    ) -> bool {
+        let evidence = self.evidence(announcement.guid.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .endpoint(announcement, origin, evidence, journal)
+    }
+
+    /// Records the nodes of a participant.
+    pub(super) fn learn_entities(
+        &mut self,
+        entities: &ParticipantEntities,
+        writer: Guid,
+        origin: &Origin,
+    ) {
+        let evidence = self.evidence(writer.prefix);
+        let journal = &mut self.journal;
+        self.discovery
+            .entities(entities, writer, origin, evidence, journal);
+    }
+
     /// Returns the known priority of a participant that is announced.
-    pub(super) fn evidence(&self, prefix: GuidPrefix) -> Priority {
+    fn evidence(&self, prefix: GuidPrefix) -> Priority {
         Priority {
             watched: false,
             local: self.receivers.is_local(&prefix),

@@ -29,6 +29,10 @@ impl WallClock {
         for topic in &mut snapshot.topics {
             self.convert_topic(topic);
         }
+        if let Some(inside) = &mut snapshot.inside {
+            let inside = Arc::make_mut(inside);
+            inside.convert(|time| self.wall_time(time));
+        }
         for unknown_writer in &mut snapshot.unknown_writers {
             self.convert(&mut unknown_writer.first_seen);
             self.convert_measurement(&mut unknown_writer.measurement);
@@ -38,12 +42,13 @@ impl WallClock {
     pub(super) fn convert_events(self, taken: &mut Taken) {
         for event in &mut taken.events {
             self.convert(&mut event.at);
-            if let EventKind::Silence {
-                last_message: Some(last),
-                ..
-            } = &mut event.kind
-            {
-                self.convert(last);
+            match &mut event.kind {
+                EventKind::Silence {
+                    last_message: Some(last),
+                    ..
+                } => self.convert(last),
+                EventKind::Lifecycle(state) => self.convert(&mut state.at),
+                _ => {}
             }
         }
     }
@@ -69,6 +74,13 @@ impl WallClock {
     fn convert_topic(self, topic: &mut TopicFacts) {
         if let Some(measurement) = &mut topic.measurement {
             self.convert_measurement(measurement);
+        }
+        if let Some(last) = topic
+            .inside
+            .as_mut()
+            .and_then(|inside| inside.last.as_mut())
+        {
+            self.convert(last);
         }
         let endpoints = topic.publishers.iter_mut().chain(&mut topic.subscriptions);
         for endpoint in endpoints {

@@ -3,7 +3,7 @@
 use ros2probe_wire::record::{Sample, Verdict};
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::walk::Found;
-use ros2probe_wire::{Record, Timestamp};
+use ros2probe_wire::{Guid, Record, Timestamp};
 
 use super::{Observer, naming};
 use crate::route::Route;
@@ -19,17 +19,20 @@ impl Observer {
     ) {
         let writer = found.record.writer();
         match self.services.identify(found, sample, vendor, at) {
-            Ok(false) => {}
-            Ok(true) if self.payloads.wants_bytes(writer) => {}
-            Ok(true) => {
-                let is_measured = self.profiler.get(writer).is_some();
-                let verdict = match is_measured {
-                    true => Verdict::Meter,
-                    false => Verdict::Ignore,
-                };
-                self.interest.set(writer, verdict);
-            }
+            Ok(is_over_budget) => self.follow_call(writer, is_over_budget),
             Err(error) => self.decode_error("request", error.reason),
+        }
+    }
+
+    /// Stops capturing a writer of requests or replies that has exceeded its budget.
+    pub(super) fn follow_call(&mut self, writer: Guid, is_over_budget: bool) {
+        if is_over_budget && !self.payloads.wants_bytes(writer) {
+            let is_measured = self.profiler.get(writer).is_some();
+            let verdict = match is_measured {
+                true => Verdict::Meter,
+                false => Verdict::Ignore,
+            };
+            self.interest.set(writer, verdict);
         }
     }
 

@@ -55,6 +55,7 @@ impl Observer {
             self.payloads.give_all(writer, self.clock);
         }
         self.report_losses();
+        self.settle_chains();
         self.examine(self.clock);
     }
 
@@ -98,9 +99,11 @@ impl Observer {
             self.receivers.tidy(&self.discovery);
             self.discovery
                 .locate(|prefix| self.receivers.is_local(prefix));
+            self.settle_inside(now);
             self.promote();
             self.judge(now);
             self.advance_calls(now);
+            self.advance_chains(now);
             self.report_losses();
             self.examine(now);
             self.tracer.advance(now);
@@ -109,8 +112,13 @@ impl Observer {
 
     pub(super) fn examine(&mut self, now: Timestamp) {
         let before = Arc::clone(self.examiner.current());
-        self.examiner
-            .examine(&self.discovery, &self.topics, &self.services, now);
+        self.examiner.examine(
+            &self.discovery,
+            &self.topics,
+            &self.services,
+            (&self.inside, &self.chains),
+            now,
+        );
         let after = self.examiner.current();
         if Arc::ptr_eq(&before, after) {
             return;
@@ -160,13 +168,20 @@ impl Observer {
                         (sum, seconds.max(longest))
                     })
             };
+            let inside = self.inside.evidence(topic.domain_id, &topic.naming);
+            let (publishers, subscriptions) = inside.map_or((0, 0), |inside| inside.endpoints());
+            let seen_inside = inside.and_then(|inside| inside.last_message());
+            let recent: &dyn Fn(u64) -> (Slot, u64) = match &inside {
+                Some(inside) => &|seconds| inside.recent(seconds),
+                None => &recent,
+            };
             let evidence = Evidence {
                 now,
-                publishers: topic.writers.len(),
-                subscriptions: topic.readers.len(),
-                last_message: last_message.max(retired),
+                publishers: topic.writers.len().max(publishers),
+                subscriptions: topic.readers.len().max(subscriptions),
+                last_message: last_message.max(retired).max(seen_inside),
                 since: topic.published,
-                recent: &recent,
+                recent,
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {

@@ -14,6 +14,7 @@ use crate::header::begins_with_header;
 use crate::selection::SampleRequest;
 use crate::topic::{Topic, TopicId, Watched};
 use crate::topic_kind::TopicKind;
+use crate::trace::share::Share;
 use crate::watch::{Watch, Watchlist};
 use crate::writer::Traits;
 
@@ -79,13 +80,17 @@ impl Observer {
 
     /// Applies the lists to a topic and its endpoints.
     pub(super) fn apply_lists(&mut self, id: TopicId, now: Timestamp) {
+        let is_needed = self.topics.get(id).is_some_and(|topic| {
+            let dds_name = &topic.naming.dds_name;
+            self.chains.needs(topic.domain_id, dds_name)
+        });
         let displaced = self.topics.apply_lists(
             id,
-            &self.watchlist,
-            &self.sample_requests,
+            (&self.watchlist, &self.sample_requests, is_needed),
             self.settings.topics,
             now,
         );
+        self.chains.changed();
         if let Some(id) = displaced {
             self.apply_all(id, now);
             self.topics.forget_measurement(id);
@@ -151,7 +156,7 @@ impl Observer {
                     if topic.naming.kind.is_service() {
                         self.services.note_measured();
                     }
-                    let (traits, opened) = (traits(endpoint), topic.reader_appeared);
+                    let (traits, opened) = (traits(guid, endpoint), topic.reader_appeared);
                     self.profiler.measure(guid, id, traits, opened, now);
                 } else {
                     self.retire(guid, now);
@@ -197,9 +202,21 @@ pub(super) fn wants_bytes(topic: &Topic) -> bool {
     requested.is_some_and(|requested| !requested.payloads.is_empty())
 }
 
-pub(super) fn traits(endpoint: &Endpoint) -> Traits {
+/// Returns the share of a measured topic's messages that is traced: the largest of its watches.
+pub(super) fn traced_share(topic: &Topic, watchlist: &Watchlist) -> Option<Share> {
+    if topic.watched != Watched::Yes {
+        return None;
+    }
+    let watch = |index: &usize| watchlist.watches().get(*index);
+    let covering = topic.judgements.iter();
+    let ratios = covering.filter_map(|(index, _)| Some(watch(index)?.trace));
+    Share::of(ratios.fold(0.0, f64::max))
+}
+
+pub(super) fn traits(guid: Guid, endpoint: &Endpoint) -> Traits {
     Traits {
-        reliable: endpoint.qos.reliability == Reliability::RELIABLE,
+        // TCP repeats for Zenoh, unseen: a missing number will not come.
+        reliable: !guid.prefix.is_zenoh() && endpoint.qos.reliability == Reliability::RELIABLE,
         keeps_history: endpoint.qos.durability != Durability::VOLATILE,
         has_header: begins_with_header(&endpoint.message_type),
     }

@@ -37,6 +37,9 @@ pub(super) fn snapshot(observer: &Observer, now: Timestamp) -> Snapshot {
         watches: watches(observer),
         services: observer.services.facts(),
         actions: observer.services.action_facts(),
+        inside: observer.inside.facts().map(Arc::new),
+        zenoh: observer.zenoh.is_used().then(|| observer.zenoh.facts()),
+        chains: observer.chains.facts(observer.wall_clock.wall_time(now)),
         diagnoses: Arc::clone(observer.examiner.current()),
         diagnosed: Arc::clone(observer.examiner.since()),
         churn: observer.discovery.churn.facts(),
@@ -140,7 +143,14 @@ fn topic(
         topic.readers.len(),
         topic.readers.iter().filter_map(endpoint),
     );
-    let transports = transports(&observer.discovery, &mut publishers, &mut subscriptions);
+    let inside = observer.inside.topic(topic.domain_id, &topic.naming);
+    let is_observed = |guid: Guid| inside.is_some() && observer.inside.observes(guid.prefix);
+    let (transports, observed_pairs) = transports(
+        &observer.discovery,
+        &mut publishers,
+        &mut subscriptions,
+        is_observed,
+    );
     let all = || publishers.iter().chain(&subscriptions);
     let mut message_types: BTreeSet<_> = all().map(|each| each.message_type.clone()).collect();
     if topic.is_vanished() {
@@ -153,6 +163,7 @@ fn topic(
             .iter()
             .filter_map(|each| each.measurement.as_ref());
         own.for_each(|own| sum.add(own));
+        observer.inside.apply(topic.domain_id, &topic.naming, sum);
     }
     let totals = deliveries::totals(observer, topic);
     TopicFacts {
@@ -174,6 +185,9 @@ fn topic(
         vanished: topic.is_vanished(),
         transports,
         is_read: topic.requested.is_some(),
+        source: observer.inside.source(topic.domain_id, &topic.naming),
+        inside: inside.map(Box::new),
+        observed_pairs,
     }
 }
 
@@ -192,6 +206,8 @@ pub(super) fn measured(
                 sum.add(&own.writer.measurement(now));
             }
         }
+        let inside = &observer.inside;
+        inside.apply(topic.domain_id, &topic.naming, &mut sum);
         Some((topic.domain_id, &topic.naming.dds_name, sum))
     })
 }
@@ -223,6 +239,7 @@ fn endpoint_facts(
 ) -> EndpointFacts {
     EndpointFacts {
         guid,
+        gid: endpoint.gid,
         node: node.cloned(),
         qos: Arc::clone(&endpoint.qos),
         message_type: endpoint.message_type.clone(),
@@ -354,8 +371,11 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
     let (addresses, addresses_limit, addresses_evictions) = observer.receivers.addresses();
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
     let (spans, spans_limit, spans_evictions) = observer.tracer.size();
+    let (inside, inside_limit, inside_evictions) = observer.inside.size();
     let (calls, calls_limit, calls_evictions) = observer.services.size();
     let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
+    let (messages, messages_limit, messages_evictions) = observer.chains.size();
+    let (chains, chains_limit, chains_refused) = observer.chains.paths();
     let quota = profiler.quota();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
@@ -409,6 +429,14 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
         table("spans", spans, spans_limit, spans_evictions),
         table("calls", calls, calls_limit, calls_evictions),
+        table("inside", inside, inside_limit, inside_evictions),
+        table("chains", chains, chains_limit, chains_refused),
+        table(
+            "chain_messages",
+            messages,
+            messages_limit,
+            messages_evictions,
+        ),
         table("payloads", payloads, payloads_limit, payloads_evictions),
     ]
 }

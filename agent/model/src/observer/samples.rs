@@ -115,17 +115,22 @@ impl Observer {
 
     /// Keeps the payload of a requested sample that is not counted yet.
     pub(super) fn keep(&mut self, found: &Found<'_>) {
-        let writer = found.record.writer();
+        self.keep_payload(&found.record, found.payload);
+    }
+
+    /// Keeps the payload of a record that is not counted yet, if it is requested.
+    pub(super) fn keep_payload(&mut self, record: &Record, payload: &[u8]) {
+        let writer = record.writer();
         if self.payloads.wants_bytes(writer) {
-            let moved = self.wall_clock.model_record(&found.record);
-            let record = moved.as_ref().unwrap_or(&found.record);
+            let moved = self.wall_clock.model_record(record);
+            let record = moved.as_ref().unwrap_or(record);
             let known = self.profiler.get(writer);
             let Some(sample) = record.sample() else {
                 return;
             };
             let lacks = self.payloads.lacks(writer, sample.sequence_number());
             if lacks || known.is_some_and(|known| !known.writer.has(sample)) {
-                self.payloads.keep(sample, found.payload);
+                self.payloads.keep(sample, payload);
             }
         }
     }

@@ -90,13 +90,13 @@ fn the_cap_rejects_and_counts_until_a_place_is_free() {
             Role::Writer,
             Timestamp(1),
         );
-        topics.apply_lists(id, &all, &[], 2, Timestamp(1));
+        topics.apply_lists(id, (&all, &[], false), 2, Timestamp(1));
         ids.push(id);
     }
     let state = |topics: &Topics, index: usize| topics.get(ids[index]).unwrap().watched;
     assert_eq!((state(&topics, 2), topics.rejected), (Watched::Rejected, 1));
     topics.leave(ids[0], guid(1), Timestamp(2));
-    topics.apply_lists(ids[2], &all, &[], 2, Timestamp(3));
+    topics.apply_lists(ids[2], (&all, &[], false), 2, Timestamp(3));
     assert_eq!((state(&topics, 2), topics.watched()), (Watched::Yes, 2));
     assert!(topics.get(ids[0]).is_none());
 }

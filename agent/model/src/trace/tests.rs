@@ -61,7 +61,7 @@ fn description() -> WriterDescription {
 
 fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     for record in records {
-        tracer.record(record, || Some((description(), ratio)));
+        tracer.record(record, || Some((description(), Share::of(ratio))));
     }
     tracer.take().spans
 }
@@ -202,7 +202,7 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
                 writer: guid_words(other),
                 ..data(sample, SECOND, flag::OUTGOING)
             };
-            tracer.record(&record, || Some((description(), 1.0)));
+            tracer.record(&record, || Some((description(), Share::of(1.0))));
         }
     }
     assert!(tracer.size().0 <= MAX_OPEN, "{:?}", tracer.size());
@@ -222,7 +222,7 @@ fn a_known_writer_is_looked_up_only_once() {
         tracer.record(&data(number, number, 0), || {
             asked += 1;
             // Discovery has not announced the writer at first.
-            (asked > 1).then(|| (description(), 0.0))
+            (asked > 1).then(|| (description(), None))
         });
     }
     assert_eq!(asked, 2);

@@ -8,6 +8,7 @@ use ros2probe_model::diagnosis::{Diagnoses, Diagnosis, Policy, Unmatched};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
+use ros2probe_testing::zenoh;
 use ros2probe_wire::time::MILLISECOND;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, Timestamp};
@@ -203,6 +204,40 @@ fn endpoints_of_two_domains_are_no_pair() {
         ),
         "{unfed:?}"
     );
+}
+
+#[test]
+fn endpoints_of_dds_and_zenoh_are_no_pair() {
+    let mut world = World::with(1);
+    world.announce(reader(1, 1), "rt/chatter", STRING, &[TRANSIENT_LOCAL]);
+    let [there, back] = zenoh::connection(1000);
+    let observer = &mut world.observer;
+    let (peer, router) = ([0x11; 16], [0x22; 16]);
+    let init = zenoh::init(peer, zenoh::Role::Peer, None);
+    let ack = zenoh::init(router, zenoh::Role::Router, Some(&[]));
+    let token = zenoh::publisher(peer, 10, "/chatter");
+    let declared = zenoh::frame(7, &[zenoh::declare_token(1, &token)]);
+    for (stream, batch) in [(&there, init), (&back, ack), (&there, declared)] {
+        zenoh::send(observer, stream, START, &batch);
+    }
+    assert_eq!(world.found("qos_incompatible"), []);
+    let unfed = world.found("unfed_subscriber");
+    assert!(
+        matches!(
+            &unfed[..],
+            [Diagnosis::UnfedSubscriber {
+                reason: Unmatched::Nobody,
+                ..
+            }]
+        ),
+        "{unfed:?}"
+    );
+    let snapshot = world.observer.snapshot(Timestamp(world.now));
+    let topic = snapshot
+        .topics
+        .iter()
+        .find(|topic| *topic.name == *"/chatter");
+    assert_eq!(topic.unwrap().transports, []);
 }
 
 #[test]

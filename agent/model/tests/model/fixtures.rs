@@ -7,6 +7,7 @@
 //! repository, all of it is replayed.
 
 mod replayed;
+mod zenoh;
 
 use ros2probe_wire::DomainId;
 use std::collections::{BTreeMap, BTreeSet};
@@ -429,25 +430,30 @@ fn graph(name: &str, lines: &[GraphLine], facts: &Facts, replayed: &Replayed) {
         if !line.nodes.iter().all(|node| reported.contains(node)) {
             continue;
         }
-        let Some(view) = replayed.view_at(at) else {
-            continue;
-        };
-        compared += 1;
-        let nodes: BTreeSet<_> = line.nodes.iter().cloned().collect();
-        assert_eq!(view.nodes, nodes, "{name}: nodes at {}", line.t);
-        let topics: BTreeMap<_, _> = line
-            .topics
-            .iter()
-            .map(|(topic, facts)| (topic.clone(), (facts.types.clone(), facts.pubs, facts.subs)))
-            .collect();
-        assert_eq!(view.topics, topics, "{name}: topics at {}", line.t);
-        let services: BTreeMap<_, _> = line.services.clone().into_iter().collect();
-        assert_eq!(view.services, services, "{name}: services at {}", line.t);
+        compared += u64::from(same_graph(name, line, at, replayed));
     }
     assert!(
         compared > 0 || lines.len() < 3,
         "{name}: nothing to compare"
     );
+}
+
+/// Compares a line with the graph at `at`; returns whether that is known.
+fn same_graph(name: &str, line: &GraphLine, at: u64, replayed: &Replayed) -> bool {
+    let Some(view) = replayed.view_at(at) else {
+        return false;
+    };
+    let nodes: BTreeSet<_> = line.nodes.iter().cloned().collect();
+    assert_eq!(view.nodes, nodes, "{name}: nodes at {}", line.t);
+    let topics: BTreeMap<_, _> = line
+        .topics
+        .iter()
+        .map(|(topic, facts)| (topic.clone(), (facts.types.clone(), facts.pubs, facts.subs)))
+        .collect();
+    assert_eq!(view.topics, topics, "{name}: topics at {}", line.t);
+    let services: BTreeMap<_, _> = line.services.clone().into_iter().collect();
+    assert_eq!(view.services, services, "{name}: services at {}", line.t);
+    true
 }
 
 /// A node is removed when the real participant that stayed to the end removes it.

@@ -9,12 +9,14 @@
 
 mod allocator;
 mod bounds;
+mod chains;
 mod churn;
 mod deliveries;
 mod diagnosis;
 mod fixtures;
 mod forged;
 mod header;
+mod inside;
 mod memory;
 mod observer;
 mod order;
@@ -22,3 +24,4 @@ mod restart;
 mod room;
 mod services;
 mod tables;
+mod zenoh;

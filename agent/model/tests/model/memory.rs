@@ -2,6 +2,8 @@
 //! The tests measure the resident memory of an otherwise idle process; nextest runs each test in
 //! one. `cargo test` requires the filter `memory::`.
 
+mod inside;
+
 use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;

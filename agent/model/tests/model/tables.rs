@@ -19,8 +19,12 @@ const COLLECTIONS: [&str; 9] = [
 
 /// Files whose structs are created for one answer, and the watchlist, which `limits.watches`
 /// bounds.
-const ANSWERS: [&str; 9] = [
+const ANSWERS: [&str; 13] = [
+    "chain/recorded/hops.rs",
     "input.rs",
+    "inside/attribution.rs",
+    "inside/facts.rs",
+    "inside/report.rs",
     "snapshot.rs",
     "snapshot/delivery.rs",
     "discovery/memory.rs",
@@ -31,7 +35,21 @@ const ANSWERS: [&str; 9] = [
     "watch.rs",
 ];
 /// Further structs that are returned, live during one examination, or only contain lengths.
-const ANSWER: [&str; 5] = ["Taken", "Findings", "UnknownWriters", "SpanStage", "Past"];
+const ANSWER: [&str; 13] = [
+    "ChainFacts",
+    "ChainsFacts",
+    "Findings",
+    "Inputs",
+    "Past",
+    "Path",
+    "RememberedConnection",
+    "SameStamp",
+    "SpanStage",
+    "Taken",
+    "Through",
+    "UnknownWriters",
+    "ZenohMemory",
+];
 /// Types that the model shares with an owner elsewhere.
 const SHARED: [&str; 2] = ["Arc<", "&'"];
 

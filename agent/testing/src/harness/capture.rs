@@ -24,10 +24,15 @@ pub struct Capture {
 impl Capture {
     /// Records every frame of the host's interface into a file until [`Capture::finish`].
     pub fn start(host: &Namespace, path: &Path) -> Result<Capture> {
+        Self::start_on(host, INTERFACE, path)
+    }
+
+    /// Records every frame of this interface of the host.
+    pub fn start_on(host: &Namespace, interface: &str, path: &Path) -> Result<Capture> {
         let stderr = path.with_extension("said");
         let errors =
             File::create(&stderr).with_context(|| format!("cannot create {}", stderr.display()))?;
-        let words = ["-i", INTERFACE, "-B", BUFFER_KILOBYTES, "-Z", "root", "-w"];
+        let words = ["-i", interface, "-B", BUFFER_KILOBYTES, "-Z", "root", "-w"];
         let words = words.iter().map(AsRef::as_ref).chain([path.as_os_str()]);
         let process = Process::start_with(&host.inside(), "tcpdump", words, errors.into())?;
         let capture = Capture {

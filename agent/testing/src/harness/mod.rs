@@ -21,6 +21,7 @@ pub mod shared_memory;
 pub mod snmp;
 pub mod soak;
 pub mod switch;
+pub mod traced_program;
 pub mod usage;
 pub mod witness;
 

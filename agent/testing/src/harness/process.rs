@@ -99,17 +99,26 @@ impl Process {
 
     /// Waits until the program prints this line.
     pub fn wait_for(&mut self, line: &str, limit: Duration) -> Result<()> {
+        self.line(line, |printed| printed == line, limit).map(drop)
+    }
+
+    /// Returns the next line that ends with these words.
+    pub fn line_with_end(&mut self, end: &str, limit: Duration) -> Result<String> {
+        self.line(end, |printed| printed.ends_with(end), limit)
+    }
+
+    fn line(&mut self, what: &str, is: impl Fn(&str) -> bool, limit: Duration) -> Result<String> {
         let deadline = Instant::now() + limit;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             match self.output.recv_timeout(left) {
-                Ok(printed) if printed == line => return Ok(()),
+                Ok(printed) if is(&printed) => return Ok(printed),
                 Ok(_) => {}
                 Err(RecvTimeoutError::Timeout) => {
-                    bail!("{} did not print `{line}` within {limit:?}", self.name)
+                    bail!("{} did not print `{what}` within {limit:?}", self.name)
                 }
                 Err(RecvTimeoutError::Disconnected) => {
-                    bail!("{} ended before it printed `{line}`", self.name)
+                    bail!("{} ended before it printed `{what}`", self.name)
                 }
             }
         }

@@ -46,7 +46,7 @@ impl<'a> Prometheus<'a> {
         Prometheus::run(host, Kind::Server, &text)
     }
 
-    /// Runs with this configuration, on port 9090.
+    /// Runs with this configuration, on port 9090, and returns once it answers queries.
     pub fn run(host: &'a Namespace, kind: Kind, text: &str) -> Result<Prometheus<'a>> {
         let directory = tempfile::tempdir()?;
         let configuration = directory.path().join("prometheus.yml");
@@ -69,11 +69,25 @@ impl<'a> Prometheus<'a> {
             "--log.level=error".to_owned(),
         ]);
         let process = Process::start(&host.outside(), "prometheus", arguments).context(INSTALL)?;
-        Ok(Prometheus {
+        let prometheus = Prometheus {
             host,
             _process: process,
             _directory: directory,
-        })
+        };
+        prometheus.wait_until_ready()?;
+        Ok(prometheus)
+    }
+
+    /// Until then Prometheus answers each query with 503.
+    fn wait_until_ready(&self) -> Result<()> {
+        let deadline = Instant::now() + PATIENCE;
+        while let Err(error) = get(self.host, &format!("http://{SERVER}/-/ready")) {
+            if Instant::now() > deadline {
+                return Err(error.context("Prometheus does not become ready"));
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
+        Ok(())
     }
 
     /// Queries until an answer exists; returns the value of its first sample.

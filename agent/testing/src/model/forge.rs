@@ -193,6 +193,25 @@ pub fn endpoint_with(guid: Guid, topic: &str, type_name: &str, others: &[(u16, &
 /// Returns a `ros_discovery_info` payload: nodes by name with one writer each; gids of 16 or 24
 /// bytes.
 pub fn entities(prefix: GuidPrefix, gid_len: usize, nodes: &[(&str, &str, Guid)]) -> Vec<u8> {
+    let nodes = nodes.iter().map(|(namespace, name, writer)| AnnouncedNode {
+        namespace,
+        name,
+        readers: Vec::new(),
+        writers: vec![*writer],
+    });
+    entities_of(prefix, gid_len, &nodes.collect::<Vec<_>>())
+}
+
+/// A node in a `ros_discovery_info` payload.
+pub struct AnnouncedNode<'a> {
+    pub namespace: &'a str,
+    pub name: &'a str,
+    pub readers: Vec<Guid>,
+    pub writers: Vec<Guid>,
+}
+
+/// Returns a `ros_discovery_info` payload of these nodes; gids of 16 or 24 bytes.
+pub fn entities_of(prefix: GuidPrefix, gid_len: usize, nodes: &[AnnouncedNode<'_>]) -> Vec<u8> {
     let gid = |guid: Guid| {
         let mut bytes = guid.to_bytes().to_vec();
         bytes.resize(gid_len, 0);
@@ -204,15 +223,17 @@ pub fn entities(prefix: GuidPrefix, gid_len: usize, nodes: &[(&str, &str, Guid)]
         cdr.extend_from_slice(&u32::try_from(number).unwrap().to_le_bytes());
     };
     number(&mut cdr, nodes.len());
-    for (namespace, name, writer) in nodes {
-        for part in [namespace, name] {
+    for node in nodes {
+        for part in [node.namespace, node.name] {
             number(&mut cdr, part.len() + 1);
             cdr.extend_from_slice(part.as_bytes());
             cdr.push(0);
         }
-        number(&mut cdr, 0);
-        number(&mut cdr, 1);
-        cdr.extend_from_slice(&gid(*writer));
+        for list in [&node.readers, &node.writers] {
+            number(&mut cdr, list.len());
+            list.iter()
+                .for_each(|guid| cdr.extend_from_slice(&gid(*guid)));
+        }
     }
     [&[0, 1, 0, 0][..], &cdr].concat()
 }

@@ -135,6 +135,38 @@ fn an_agent_that_has_no_room_for_newcomers_is_a_problem_with_the_price_of_more()
 }
 
 #[test]
+fn connections_of_zenoh_that_cannot_be_read_are_named_with_what_is_missing() {
+    let health = r#"{"ready":true,"version":"1.0.0","source":"host","zenoh":{"unseen":[
+            {"reason":"tls","text":"encrypted with TLS","connections":1},
+            {"reason":"compression","text":"with compressed batches","connections":2},
+            {"reason":"shared_memory","text":"with shared memory","connections":1}]}}"#;
+    let findings = check(&answers(health, WATCHED), "here", "1.0.0");
+    let zenoh = findings.iter().filter(|finding| finding.check == "zenoh");
+    let sentences: Vec<_> = zenoh
+        .map(|finding| (finding.severity, &*finding.sentence))
+        .collect();
+    let (warning, note) = (Severity::Warning, Severity::Note);
+    assert_eq!(
+        sentences,
+        [
+            (
+                warning,
+                "1 connection of Zenoh encrypted with TLS cannot be read"
+            ),
+            (
+                warning,
+                "2 connections of Zenoh with compressed batches cannot be read"
+            ),
+            (
+                note,
+                "payloads of 1 connection of Zenoh with shared memory cannot be read; rates and \
+                 sizes are right"
+            ),
+        ]
+    );
+}
+
+#[test]
 fn viewers_are_shown_with_their_rights_and_a_busy_port_with_a_remedy() {
     let with = |foxglove: &str| {
         let health = WELL.replacen('{', &format!(r#"{{"foxglove":{foxglove},"#), 1);

@@ -7,7 +7,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 use ros2probe_testing::model::forge::{self, Message};
 
 /// When the capture begins: 2026-11-21, Unix seconds.
-const START: u64 = 1_795_219_200;
+pub(super) const START: u64 = 1_795_219_200;
 /// Topics of one participant, each with its own node.
 const TOPICS: usize = 20;
 /// Longest name in DDS.
@@ -15,7 +15,7 @@ const LONGEST: usize = 255;
 
 /// Names that harm a page which takes text for markup, for code, or for a file's path, and that the
 /// agent shows: it takes no quotation marks, control characters, nor what turns text around.
-const HARM: [&str; 16] = [
+pub(super) const HARM: [&str; 16] = [
     "<img src=x onerror=harmed=1>",
     "><script>globalThis.harmed=1</script>",
     "&quot; onmouseover=harmed=1",
@@ -155,7 +155,7 @@ fn node_name(topic: usize, hostile: bool) -> String {
 }
 
 /// Adds a UDP payload to the discovery multicast address of domain 0.
-fn put(file: &mut Vec<u8>, after: Duration, payload: &[u8]) {
+pub(super) fn put(file: &mut Vec<u8>, after: Duration, payload: &[u8]) {
     let length = u16::try_from(payload.len()).unwrap();
     let mut frame = vec![1, 0, 0x5e, 0x7f, 0, 1, 2, 0, 0, 0, 0, 1, 8, 0, 0x45, 0];
     frame.extend_from_slice(&(length + 28).to_be_bytes());

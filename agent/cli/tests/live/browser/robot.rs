@@ -43,8 +43,18 @@ impl Place {
 
     /// An agent at the sockets of the host, with this configuration besides.
     pub(crate) fn agent(&self, more: &str) -> Result<Agent<'_>> {
+        self.configured(at_the_sockets_of(&self.host) + more)
+    }
+
+    /// Starts an agent as [`Self::agent`] does, which also observes processes from inside.
+    pub(crate) fn agent_inside(&self, more: &str) -> Result<Agent<'_>> {
+        let capture = at_the_sockets_of(&self.host).replace("}\n", ", inside: full}\n");
+        self.configured(capture + more)
+    }
+
+    fn configured(&self, text: String) -> Result<Agent<'_>> {
         let configuration = self.directory.path().join("ros2probe.yaml");
-        std::fs::write(&configuration, at_the_sockets_of(&self.host) + more)?;
+        std::fs::write(&configuration, text)?;
         let log = self.directory.path().join("agent.log");
         let agent =
             Agent::start_logging(&self.host, env!("CARGO_BIN_EXE_rp"), &configuration, &log);

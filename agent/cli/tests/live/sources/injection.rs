@@ -177,7 +177,7 @@ fn datagrams(capture: &Path) -> Result<Option<Vec<Datagram>>> {
                     found((whole.source_port, whole.destination_port), whole.payload());
                 }
             }
-            Payload::Other(_) => {}
+            Payload::Segment(_) | Payload::Other(_) => {}
         }
     }
     Ok(Some(datagrams))

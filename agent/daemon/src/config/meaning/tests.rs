@@ -390,3 +390,44 @@ fn no_cut_of_a_good_file_panics() {
         let _ = parse(source.get(..end).unwrap());
     }
 }
+
+#[test]
+fn a_chain_has_two_topics_by_name_and_is_listed_once() {
+    let mistakes = |yaml: &str| Config::parse(yaml.as_bytes()).unwrap_err().report("file");
+    let same = mistakes("chains: [{from: /a, to: /a}]");
+    assert!(
+        same.contains("chains[0].to: is the same topic as `from`"),
+        "{same}"
+    );
+    let glob = mistakes("chains: [{from: /a, to: /b/*}]");
+    assert!(glob.contains("must be the name of one topic"), "{glob}");
+    let twice = mistakes("chains: [{from: /a, to: /b}, {from: /a, to: /b, max_latency_ms: 5}]");
+    assert!(twice.contains("repeats chains[0]"), "{twice}");
+    let config = Config::parse(b"chains: [{from: /a, to: /b, domain: 3, max_latency_ms: 1.5}]");
+    let chains = config.unwrap().chains;
+    assert_eq!(chains[0].max_latency, Some(Duration::from_micros(1500)));
+    assert_eq!(
+        (&*chains[0].from, chains[0].domain_id),
+        ("/a", Some(DomainId(3)))
+    );
+}
+
+#[test]
+fn ports_of_zenoh_are_few_and_none_is_zero() {
+    let ports = |source: &str| parse(source.as_bytes()).unwrap().capture.zenoh_ports;
+    assert_eq!(
+        ports("capture: {zenoh: {ports: [7447, 17447]}}"),
+        [7447, 17447]
+    );
+    assert_eq!(ports("capture: {zenoh: {ports: []}}"), [0_u16; 0]);
+    assert_eq!(ports(""), [7447]);
+    assert_eq!(
+        report("capture: {zenoh: {ports: [1, 2, 3, 4, 5, 6, 7, 8, 9]}}"),
+        "f:1:26: capture.zenoh.ports: has more than 8 ports"
+    );
+    assert_eq!(
+        report("capture: {zenoh: {ports: [0, 65536]}}"),
+        "f:1:27: capture.zenoh.ports[0]: is 0, must be between 1 and 65535\n\
+         f:1:30: capture.zenoh.ports[1]: is 65536, must be between 1 and 65535"
+    );
+}

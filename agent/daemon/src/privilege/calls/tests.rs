@@ -10,7 +10,7 @@ use seccompiler::TargetArch;
 use super::super::{Unprivileged, confine};
 use super::*;
 
-const ROLES: [Role; 8] = [
+const ROLES: [Role; 9] = [
     Role::Service,
     Role::Serve,
     Role::Export,
@@ -19,6 +19,7 @@ const ROLES: [Role; 8] = [
     Role::Reattach { needs_bpf: false },
     Role::SharedMemory { needs_nice: false },
     Role::Exact,
+    Role::Inside,
 ];
 
 /// Makes a system call. Returns its error, if it fails.
@@ -54,15 +55,10 @@ const STREAM: c_long = libc::SOCK_STREAM as c_long;
 const DATAGRAM: c_long = libc::SOCK_DGRAM as c_long;
 
 /// Calls that no role allows, with arguments that would be harmless.
-const NOBODY: [(&str, c_long, [c_long; 6]); 24] = [
+const REFUSED_TO_ALL: [(&str, c_long, [c_long; 6]); 23] = [
     ("execve", libc::SYS_execve, [0; 6]),
     ("execveat", libc::SYS_execveat, [SELF, 0, 0, 0, 0, 0]),
     ("ptrace", libc::SYS_ptrace, [16, 0, 0, 0, 0, 0]),
-    (
-        "process_vm_readv",
-        libc::SYS_process_vm_readv,
-        [1, 0, 0, 0, 0, 0],
-    ),
     (
         "process_vm_writev",
         libc::SYS_process_vm_writev,
@@ -105,7 +101,7 @@ fn socket(family: i32, kind: c_long) -> Option<i32> {
 fn no_thread_executes_debugs_mounts_enters_loads_or_makes_code() {
     for role in ROLES {
         confined(role, move || {
-            for (name, number, arguments) in NOBODY {
+            for (name, number, arguments) in REFUSED_TO_ALL {
                 assert_eq!(
                     call(number, arguments),
                     Some(libc::EPERM),
@@ -224,7 +220,7 @@ fn cannot_lead_elsewhere(role: Role) {
 }
 
 #[test]
-fn kernel_maps_are_the_captures_and_probes_the_exact_thread_s() {
+fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
     let lookup = [LOOK_UP_MAP, 0, 0, 0, 0, 0];
     let may = call(libc::SYS_bpf, lookup);
     for role in ROLES {
@@ -232,11 +228,15 @@ fn kernel_maps_are_the_captures_and_probes_the_exact_thread_s() {
         let role = if is_capture { Role::capture() } else { role };
         confined(role, move || {
             let looked_up = call(libc::SYS_bpf, lookup);
-            let expected = if is_capture { may } else { Some(libc::EPERM) };
+            let reads = is_capture || role == Role::Inside;
+            let expected = if reads { may } else { Some(libc::EPERM) };
             assert_eq!(looked_up, expected, "{role:?}");
             let open = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
-            let is_exact = role == Role::Exact;
-            assert_eq!(open != Some(libc::EPERM), is_exact, "{role:?}");
+            let probes = matches!(role, Role::Exact | Role::Inside);
+            assert_eq!(open != Some(libc::EPERM), probes, "{role:?}");
+            let memory = call(libc::SYS_process_vm_readv, [0; 6]);
+            let is_inside = role == Role::Inside;
+            assert_eq!(memory != Some(libc::EPERM), is_inside, "{role:?}");
         });
     }
 }
@@ -270,11 +270,12 @@ fn links_news_of_files_and_scheduling_are_of_the_threads_that_need_them() {
             other => other,
         };
         confined(role, move || {
-            let attaches = matches!(role, Role::Reattach { .. } | Role::Exact);
+            let attaches = matches!(role, Role::Reattach { .. } | Role::Exact | Role::Inside);
             let schedules = matches!(role, Role::SharedMemory { .. });
             assert_eq!(call(libc::SYS_bpf, link) != refused, attaches, "{role:?}");
             let notices = call(libc::SYS_inotify_init1, [0; 6]) != refused;
-            assert_eq!(notices, attaches || schedules, "{role:?}");
+            let is_noticed = attaches && role != Role::Inside;
+            assert_eq!(notices, is_noticed || schedules, "{role:?}");
             let scheduled = call(libc::SYS_sched_setscheduler, running_first) != refused;
             assert_eq!(scheduled, schedules, "{role:?}");
             let idle = call(libc::SYS_sched_setscheduler, when_idle);

@@ -236,6 +236,16 @@ impl SnapshotTask {
     }
 
     fn report(&mut self, cause: &Cause, name: String, messages: u64, reason: Option<String>) {
+        // A client of the API gets the reason as its answer.
+        let unasked = !matches!(cause, Cause::Request);
+        if let Some(reason) = reason.as_ref().filter(|_| unasked) {
+            let snapshot = self.settings.name.as_str();
+            tracing::warn!(
+                snapshot,
+                reason,
+                "failed to write a whole bag of a snapshot"
+            );
+        }
         self.recordings.events.record(AgentEvent::SnapshotTaken {
             snapshot: self.settings.name.clone(),
             trigger: cause.name(),

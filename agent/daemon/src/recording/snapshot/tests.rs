@@ -11,6 +11,8 @@ use ros2probe_model::churn;
 use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::dispatch::Sample;
 use ros2probe_model::event::{Event, EventKind, LossBurst, Taken};
+use ros2probe_model::inside::facts::Owner;
+use ros2probe_model::inside::report as inside;
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
@@ -317,7 +319,56 @@ fn findings_meet_their_kind_once_they_are_new() {
         node: "/driver".into(),
         participants: Vec::new(),
     };
-    for finding in [hanging, duplicate] {
+    let topic = TopicKey {
+        domain_id: DomainId(0),
+        dds_name: "rt/cmd".into(),
+        name: "/cmd".into(),
+        kind: TopicKind::Topic,
+    };
+    let owner = Owner {
+        process: 70,
+        handle: 1,
+        domain_id: DomainId(0),
+        node: Some("/driver".into()),
+    };
+    let period = Duration::from_millis(50);
+    let of_inside_and_chains = [
+        Diagnosis::SlowCallback {
+            topic: None,
+            callback: owner.clone(),
+            trigger: inside::Trigger::Timer(Some(period)),
+            duration: period * 2,
+            period,
+            is_own_period: true,
+        },
+        Diagnosis::ExecutorWait {
+            topic: None,
+            callback: owner.clone(),
+            trigger: inside::Trigger::Timer(Some(period)),
+            wait: period * 2,
+        },
+        Diagnosis::IntraProcessOverflow {
+            topic: topic.clone(),
+            queue: owner,
+            overwritten_permille: 10,
+        },
+        Diagnosis::ObservationSuspended {
+            domain_id: DomainId(0),
+            process: 70,
+            name: None,
+        },
+        Diagnosis::RestampingNode {
+            topic: topic.clone(),
+            node: "/driver".into(),
+            input: "/scan".into(),
+        },
+        Diagnosis::SlowChain {
+            topic,
+            from: "/scan".into(),
+            max_latency: period,
+        },
+    ];
+    for finding in of_inside_and_chains.into_iter().chain([hanging, duplicate]) {
         let mut robot = Robot::new(settings(&[finding.kind()], 1, 0));
         robot.run(20);
         let mut change = |resolved| {

@@ -15,6 +15,7 @@ pub(super) fn endpoint<'a>(facts: &'a EndpointFacts, index: &Index<'a>) -> Endpo
     let enclave = participant.and_then(|participant| participant.enclave.as_deref());
     Endpoint {
         guid: facts.guid.to_string(),
+        gid: facts.gid.iter().map(|byte| format!("{byte:02x}")).collect(),
         node: facts.node.as_deref().map(Cow::Borrowed),
         enclave: enclave.map(Cow::Borrowed),
         message_type: Cow::Borrowed(&facts.message_type),

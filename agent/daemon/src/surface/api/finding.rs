@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 
 use super::endpoint::{printed, texts};
+use super::inside::trigger;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
 use ros2probe_model::diagnosis;
 
@@ -56,6 +57,62 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
                 domains: domains.iter().map(|id| id.0).collect(),
             }
         }
+        diagnosis::Diagnosis::SlowCallback {
+            callback,
+            trigger: triggered,
+            duration,
+            period,
+            is_own_period,
+            ..
+        } => Diagnosis::SlowCallback {
+            node: callback.node.as_deref().map(Cow::Borrowed),
+            process_id: callback.process,
+            trigger: trigger(triggered),
+            duration_seconds: duration.as_secs_f64(),
+            period_seconds: period.as_secs_f64(),
+            own_period: *is_own_period,
+        },
+        diagnosis::Diagnosis::ExecutorWait {
+            callback,
+            trigger: triggered,
+            wait,
+            ..
+        } => Diagnosis::ExecutorWait {
+            node: callback.node.as_deref().map(Cow::Borrowed),
+            process_id: callback.process,
+            trigger: trigger(triggered),
+            wait_seconds: wait.as_secs_f64(),
+        },
+        diagnosis::Diagnosis::IntraProcessOverflow {
+            queue,
+            overwritten_permille,
+            ..
+        } => Diagnosis::IntraProcessOverflow {
+            node: queue.node.as_deref().map(Cow::Borrowed),
+            process_id: queue.process,
+            overwritten_ratio: thousandths(*overwritten_permille),
+        },
+        diagnosis::Diagnosis::ObservationSuspended { process, name, .. } => {
+            Diagnosis::ObservationSuspended {
+                process_id: *process,
+                process: name.as_deref().map(Cow::Borrowed),
+            }
+        }
+        diagnosis::Diagnosis::RestampingNode { node, input, .. } => Diagnosis::RestampingNode {
+            node: Cow::Borrowed(node),
+            input: Cow::Borrowed(input),
+        },
+        diagnosis::Diagnosis::SlowChain {
+            from, max_latency, ..
+        } => Diagnosis::SlowChain {
+            from: Cow::Borrowed(from),
+            max_latency_ms: max_latency.as_secs_f64() * 1e3,
+        },
     };
     Finding::Known(known)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "at most 1000")]
+fn thousandths(permille: u64) -> f64 {
+    permille as f64 / 1e3
 }

@@ -1,5 +1,6 @@
 //! `GET /health`: whether the agent observes the robot, and how completely.
 
+use ros2probe_model::zenoh::ZenohFacts;
 use std::collections::BTreeSet;
 use std::sync::LazyLock;
 use std::time::{Instant, SystemTime};
@@ -100,9 +101,26 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         unfiltered_reason: agent.sandbox.reason().map(Into::into),
         foxglove: foxglove(&context.viewers),
         ros2_daemon: ros2_daemon(&context.ros2_daemon),
+        zenoh: snapshot.and_then(|snapshot| snapshot.zenoh.as_ref().map(zenoh)),
         process_id: std::process::id(),
         uptime_seconds: started.map(|started| (now.as_secs_f64() - started).max(0.0)),
     })
+}
+
+fn zenoh(facts: &ZenohFacts) -> health::Zenoh {
+    let unseen = facts.unseen();
+    health::Zenoh {
+        connections: facts.connections,
+        routers: facts.routers,
+        gaps: facts.counters.gaps,
+        unseen: unseen
+            .map(|(reason, connections)| health::UnseenConnections {
+                reason: reason.label().into(),
+                text: reason.in_words().into(),
+                connections,
+            })
+            .collect(),
+    }
 }
 
 /// Returns the listener for viewers; `None` if it is off.

@@ -6,6 +6,7 @@
 mod actions;
 mod body;
 mod body_stream;
+mod chains;
 mod downloads;
 mod endpoint;
 mod events;
@@ -14,6 +15,7 @@ mod graph;
 mod health;
 mod history;
 mod index;
+mod inside;
 pub mod live;
 mod measured;
 mod messages;
@@ -39,6 +41,8 @@ mod services;
 mod snapshots;
 mod topics;
 mod watch;
+
+pub(crate) use chains::parts;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -158,6 +162,8 @@ fn views() -> OpenApiRouter<Context> {
         .merge(nodes::routes())
         .merge(services::routes())
         .merge(actions::routes())
+        .merge(inside::routes())
+        .merge(chains::routes())
         .merge(participants::routes())
         .merge(graph::routes())
         .merge(names::routes())

@@ -15,6 +15,7 @@ use super::Context;
 use super::endpoint::{process, vendor};
 use super::finding::diagnosis;
 use super::index::{Ends, Index};
+use super::inside;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
 use super::party::{Side, action, action_type, service_type};
@@ -190,6 +191,11 @@ impl<'a> NodeAnswers<'a> {
             action_servers: action_servers.views(),
             action_clients: action_clients.views(),
             diagnoses: self.findings(first),
+            inside: inside::node(
+                first.domain_id,
+                &first.name,
+                self.snapshot.inside.as_deref(),
+            ),
         })
     }
 
@@ -211,7 +217,9 @@ impl<'a> NodeAnswers<'a> {
             Diagnosis::NodeInSeveralDomains { node, domains, .. } => {
                 domains.contains(&own.domain_id) && *node == own.name
             }
-            _ => false,
+            _ => finding.owner().is_some_and(|owner| {
+                owner.domain_id == own.domain_id && owner.node.as_ref() == Some(&own.name)
+            }),
         });
         about.map(diagnosis).collect()
     }

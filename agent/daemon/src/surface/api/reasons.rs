@@ -8,7 +8,10 @@ use crate::config::Watchlist;
 use ros2probe_api::Open;
 use ros2probe_api::topics::{Reason, ReasonCode};
 use ros2probe_model::diagnosis::Diagnosis;
-use ros2probe_model::snapshot::{EndpointFacts, Measurement, Snapshot, TopicFacts, Transport};
+use ros2probe_model::inside::facts::TopicInside;
+use ros2probe_model::snapshot::{
+    EndpointFacts, Measurement, Snapshot, Source, TopicFacts, Transport,
+};
 
 /// Facts beyond the topic on which reasons depend.
 #[derive(Debug)]
@@ -19,6 +22,8 @@ pub(super) struct Circumstances<'a> {
     pub(super) source: SourceKind,
     /// Whether the agent samples shared memory.
     pub(super) looks_at_memory: bool,
+    /// Whether calls inside processes could be counted and are not.
+    pub(super) lacks_inside: bool,
     /// Why the agent is not ready.
     pub(super) unready: Option<String>,
 }
@@ -37,6 +42,7 @@ impl<'a> Circumstances<'a> {
             say(ReasonCode::AgentNotReady, reason.clone());
         }
         let is_connected = match (topic.publishers.len(), topic.subscriptions.len()) {
+            (0, _) | (_, 0) if topic.inside.as_deref().is_some_and(is_connected_inside) => true,
             (0, _) if topic.vanished => {
                 say(
                     ReasonCode::NoPublisher,
@@ -62,7 +68,8 @@ impl<'a> Circumstances<'a> {
                 None => true,
             },
         };
-        if let Some(secured) = self.secured(topic) {
+        let is_counted = topic.source == Source::Inside;
+        if let Some(secured) = self.secured(topic).filter(|_| !is_counted) {
             let detail = format!("participant {secured} uses DDS security");
             say(ReasonCode::Encrypted, detail);
         }
@@ -72,9 +79,12 @@ impl<'a> Circumstances<'a> {
                 say(code, detail);
             }
             Some(measured) if is_connected && measured.rate_hz == 0.0 => {
-                if let Some((code, detail)) = self.off_network(topic) {
+                if is_counted {
+                    let detail = format!("counted inside its processes: {}", self.quiet(measured));
+                    say(ReasonCode::Quiet, detail);
+                } else if let Some((code, detail)) = self.off_network(topic) {
                     say(code, detail);
-                } else if self.is_elsewhere(topic) {
+                } else if measured.last_message.is_none() && self.is_elsewhere(topic) {
                     let detail = "publishers and subscribers are on other hosts; capture.source: \
                         wire sees traffic that passes this host";
                     say(ReasonCode::OutsideView, detail.to_owned());
@@ -157,7 +167,11 @@ impl<'a> Circumstances<'a> {
         {
             return None;
         }
-        let detail = |how: &str| format!("{how}; nothing crosses the network");
+        let remedy = match self.lacks_inside {
+            true => "; `capture.inside: topics` counts such messages",
+            false => "",
+        };
+        let detail = |how: &str| format!("{how}; nothing crosses the network{remedy}");
         Some(match most.transport {
             Transport::Network => return None,
             Transport::SharedMemory if self.looks_at_memory => {
@@ -203,4 +217,9 @@ impl<'a> Circumstances<'a> {
             }
         }
     }
+}
+
+/// Returns whether observed processes publish the topic and subscribe to it.
+const fn is_connected_inside(inside: &TopicInside) -> bool {
+    inside.publishers > 0 && inside.subscriptions > 0
 }

@@ -16,6 +16,7 @@ use super::endpoint::{endpoint, printed, texts};
 use super::finding::diagnosis;
 use super::history;
 use super::index::{Index, Standing};
+use super::inside;
 use super::measured::{breakdown, buckets, delivered, measurement};
 use super::messages;
 use super::nearest::hint;
@@ -25,7 +26,7 @@ use super::reasons::Circumstances;
 use super::scope::{Domain, Scope, only};
 use super::security::Granted;
 use super::watch::expectations;
-use crate::agent_facts::Ability;
+use crate::agent_facts::{Ability, SourceKind};
 use crate::snapshot_cell::State as AgentState;
 use crate::watches::InForce;
 use ros2probe_api::topics::{
@@ -219,6 +220,8 @@ impl<'a> TopicAnswers<'a> {
                 watchlist: in_force.watchlist(),
                 source: state.agent.source,
                 looks_at_memory: state.agent.shared_memory.is_some(),
+                lacks_inside: state.agent.source != SourceKind::Replay
+                    && !abilities.contains(&Ability::Inside),
                 unready: state.ready(Instant::now()).err(),
             },
         }
@@ -232,6 +235,7 @@ impl<'a> TopicAnswers<'a> {
         let passages = facts.transports.iter().map(|count| topics::Passage {
             passage: count.transport.label().into(),
             pairs: count.pairs,
+            observed_pairs: facts.observed_pairs(count.transport),
             view: (count.transport == Transport::SharedMemory).then(|| self.view(facts).into()),
         });
         Topic {
@@ -256,6 +260,8 @@ impl<'a> TopicAnswers<'a> {
             passages: passages.collect(),
             diagnoses: findings.map(|finding| diagnosis(finding)).collect(),
             reasons: self.circumstances.reasons(facts),
+            source: facts.source.label().into(),
+            inside: inside::topic(facts),
         }
     }
 
@@ -276,7 +282,10 @@ impl<'a> TopicAnswers<'a> {
         let acknowledgements = facts.acknowledgements.iter();
         let measured = facts.measurement.as_deref();
         TopicDetails {
-            topic: self.topic(facts),
+            topic: Topic {
+                inside: inside::topic_details(facts, self.snapshot.inside.as_deref()),
+                ..self.topic(facts)
+            },
             interarrival_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.interarrival)),
             latency_buckets: measured.map_or_else(Vec::new, |it| buckets(&it.source_latency)),
             deliveries: facts.deliveries.iter().map(delivery).collect(),

@@ -22,4 +22,4 @@ pub use exporter::{Exporter, StartError};
 pub use exports::{Exports, Outcome, Reason, Signal};
 pub use resource::Host;
 pub use settings::{Settings, SettingsError};
-pub use traces::{SpanQueue, SpanSink};
+pub use traces::{QueuedSpan, SpanQueue, SpanSink};

@@ -17,10 +17,20 @@ use tonic::{Code, Status};
 
 use super::exports::{Exports, Outcome, Reason, Signal};
 use super::{Exporter, Host, Settings};
-use crate::agent_facts::{AgentFacts, SourceKind};
-use crate::config::Config;
-use crate::surface::MetricSources;
+use crate::agent_facts::{AgentFacts, InsideSourceFacts, SourceKind};
+use crate::config::{Config, Watch, Watchlist};
+use crate::surface::{Exposition, Format, MetricSources};
+use opentelemetry_proto::tonic::common::v1::any_value::Value;
+use opentelemetry_proto::tonic::metrics::v1::metric::Data;
+use opentelemetry_proto::tonic::metrics::v1::number_data_point;
+use ros2probe_model::input::Input;
+use ros2probe_model::inside::report::{
+    CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
+};
+use ros2probe_model::observer::{self, Observer};
 use ros2probe_model::snapshot::Snapshot;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Timestamp};
 
 /// Reaction of the receiver to a request.
 #[derive(Clone, Copy)]
@@ -87,10 +97,6 @@ impl Receiver {
 
 /// Starts an agent of a quiet robot that exports at this interval in seconds.
 fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, Exporter) {
-    let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
-    let config = Config::parse(yaml.as_bytes()).unwrap();
-    let host = Host::default();
-    let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
     let sources = MetricSources::new(
         SourceKind::Replay,
         crate::settings_cell::Settings::default(),
@@ -100,8 +106,182 @@ fn exporting(address: SocketAddr, interval: u32, more: &str) -> (Arc<Exports>, E
         ..AgentFacts::new(SourceKind::Replay, Instant::now())
     };
     sources.latest.publish(Snapshot::default(), agent);
-    let exporter = Exporter::start(settings.unwrap(), &sources, Arc::default()).unwrap();
+    let exporter = start(address, interval, more, &sources);
     (sources.exports, exporter)
+}
+
+fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources) -> Exporter {
+    let yaml = format!("otlp: {{endpoint: 'http://{address}', interval_s: {interval}, {more}}}");
+    let config = Config::parse(yaml.as_bytes()).unwrap();
+    let host = Host::default();
+    let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
+    Exporter::start(settings.unwrap(), sources, Arc::default()).unwrap()
+}
+
+/// Returns a snapshot of a managed node, observed from inside its process, whose timer publishes
+/// `/scan` at 20 Hz and takes 4 ms.
+fn seen_inside() -> Snapshot {
+    let start = 1_795_143_000 * SECOND;
+    let mut observer = Observer::new(observer::Settings::default());
+    observer.input(Input::Time(Timestamp(start)));
+    let watches = Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap();
+    observer.input(Input::Watchlist(Arc::new(watches)));
+    for second in 1..=10 {
+        let at = Timestamp(start + second * SECOND - SECOND / 2);
+        let mut durations = Durations::default();
+        (0..20 * second).for_each(|_| durations.observe(Duration::from_millis(4)));
+        let process = ProcessReport {
+            id: 70,
+            name: Some("lidar".into()),
+            domain_id: DomainId(3),
+            nodes: vec!["/lidar".into()],
+            shows_intra_process: true,
+            publishers: vec![PublisherReport {
+                handle: 1,
+                node: None,
+                topic: "/scan".into(),
+                middleware: Some("rmw_zenoh_cpp".into()),
+                published: 20 * second,
+                within_process: 5 * second,
+                last: at,
+                intervals: Durations::default(),
+            }],
+            callbacks: vec![CallbackReport {
+                handle: 3,
+                node: None,
+                trigger: Trigger::Timer(Some(Duration::from_millis(50))),
+                thread: 71,
+                calls: 20 * second,
+                last: at,
+                durations,
+                waits: Durations::default(),
+                skipped: 2,
+            }],
+            ..ProcessReport::default()
+        };
+        let transition = Transition {
+            process: 70,
+            node: None,
+            start: "activating".into(),
+            goal: "active".into(),
+            at,
+        };
+        observer.input(Input::Inside(Report {
+            at,
+            has_callbacks: true,
+            processes: vec![process],
+            transitions: vec![transition],
+        }));
+        observer.input(Input::Time(Timestamp(start + second * SECOND)));
+    }
+    observer.snapshot(Timestamp(start + 10 * SECOND))
+}
+
+/// Returns the points of a request as lines `name{key="value",…} value`; of a histogram its count.
+fn lines(request: &ExportMetricsServiceRequest) -> Vec<String> {
+    let scopes = request
+        .resource_metrics
+        .iter()
+        .flat_map(|each| &each.scope_metrics);
+    let mut lines = Vec::new();
+    for metric in scopes.flat_map(|scope| &scope.metrics) {
+        let mut line = |attributes: &[opentelemetry_proto::tonic::common::v1::KeyValue],
+                        value: f64| {
+            let labels = attributes.iter().map(|each| {
+                let value = each.value.as_ref().and_then(|value| value.value.as_ref());
+                match value.unwrap() {
+                    Value::StringValue(text) => format!("{}=\"{text}\"", each.key),
+                    Value::IntValue(number) => format!("{}=\"{number}\"", each.key),
+                    other => panic!("{other:?}"),
+                }
+            });
+            let mut labels: Vec<String> = labels.collect();
+            labels.sort();
+            lines.push(format!("{}{{{}}} {value}", metric.name, labels.join(",")));
+        };
+        let numbers = match metric.data.as_ref().unwrap() {
+            Data::Sum(sum) => &sum.data_points,
+            Data::Gauge(gauge) => &gauge.data_points,
+            Data::Histogram(histogram) => {
+                for point in &histogram.data_points {
+                    #[expect(clippy::cast_precision_loss, reason = "small counts")]
+                    line(&point.attributes, point.count as f64);
+                }
+                continue;
+            }
+            other => panic!("{other:?}"),
+        };
+        for point in numbers {
+            let value = match point.value.unwrap() {
+                number_data_point::Value::AsDouble(value) => value,
+                #[expect(clippy::cast_precision_loss, reason = "small counts")]
+                number_data_point::Value::AsInt(value) => value as f64,
+            };
+            line(&point.attributes, value);
+        }
+    }
+    lines
+}
+
+#[tokio::test]
+async fn figures_from_inside_processes_have_the_names_and_values_of_the_page() {
+    let (receiver, address) = Receiver::listening([]).await;
+    let sources = MetricSources::new(
+        SourceKind::Host,
+        crate::settings_cell::Settings {
+            histograms: true,
+            ..crate::settings_cell::Settings::default()
+        },
+    );
+    let agent = AgentFacts {
+        inside: Some(InsideSourceFacts {
+            mode: "full",
+            counters: vec![("hits", 777)],
+            ..InsideSourceFacts::default()
+        }),
+        ..AgentFacts::new(SourceKind::Host, Instant::now())
+    };
+    sources.latest.publish(seen_inside(), agent);
+    let page = Exposition::new(sources.clone()).render(Format::Classic);
+    let page = page.unwrap();
+    let exporter = start(address, 1, "", &sources);
+    until("an export", || receiver.requests() > 0).await;
+    exporter.finish().await;
+    let got = receiver.got.lock().unwrap();
+    let exported: Vec<String> = got.iter().flat_map(lines).collect();
+    let known = |expected: &str| exported.iter().any(|line| line == expected);
+    let callback = "domain_id=\"3\",name=\"50ms\",ros_node=\"/lidar\",trigger=\"timer\"";
+    for expected in [
+        "ros2.topic.inside_published_messages{domain_id=\"3\",topic=\"/scan\"} 200".to_owned(),
+        "ros2.topic.source_info{domain_id=\"3\",source=\"inside\",topic=\"/scan\"} 1".to_owned(),
+        format!("ros2.callback_duration{{{callback}}} 200"),
+        format!("ros2.callback_duration_max{{{callback}}} 0.004"),
+        format!("ros2.timer_skipped_periods{{{callback}}} 2"),
+        "ros2.node.lifecycle_state{domain_id=\"3\",ros_node=\"/lidar\",state=\"active\"} 1"
+            .to_owned(),
+        "ros2probe.inside_events{event=\"hits\"} 777".to_owned(),
+        "ros2probe.inside_processes{state=\"counted\"} 1".to_owned(),
+    ] {
+        assert!(known(&expected), "{expected}\n{exported:#?}");
+    }
+    // Every such metric of the page is exported under its name.
+    let of_inside = crate::surface::catalogue::CATALOGUE
+        .iter()
+        .filter(|metric| {
+            let name = metric.name;
+            ["inside", "callback", "intra_process", "lifecycle", "timer"]
+                .iter()
+                .any(|part| name.contains(part))
+                && page.lines().any(|line| line.starts_with(name))
+        });
+    let mut count = 0;
+    for metric in of_inside {
+        count += 1;
+        let name = metric.otlp_name() + "{";
+        let is_exported = exported.iter().any(|line| line.starts_with(&name));
+        assert!(is_exported, "{name}\n{exported:#?}");
+    }
+    assert!(count > 15, "{count}");
 }
 
 async fn until(what: &str, mut holds: impl FnMut() -> bool) {

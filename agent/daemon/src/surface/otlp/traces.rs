@@ -4,6 +4,8 @@
 //! A message's trace and its send span have the same ids on every agent. Ids of spans of one host
 //! depend on that host.
 
+mod chains;
+
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -21,6 +23,7 @@ use super::client::Request;
 use super::exports::{Exports, Reason, Signal};
 use super::points::{attribute, key_value, scope};
 use super::signal_sender::SignalSender;
+use ros2probe_model::chain::spans::{ChainSpan, ChainSpans};
 use ros2probe_model::identity::Identity;
 use ros2probe_model::trace::{Span, SpanStage, Spans};
 
@@ -35,8 +38,17 @@ const FLAGS: u32 = 0b11;
 /// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
 pub struct SpanQueue {
-    waiting: Mutex<VecDeque<Span>>,
+    waiting: Mutex<VecDeque<QueuedSpan>>,
     news: Notify,
+}
+
+/// A span in the queue.
+#[derive(Clone, Debug)]
+pub enum QueuedSpan {
+    /// Of a message.
+    Message(Span),
+    /// Of a chain.
+    Chain(ChainSpan),
 }
 
 /// The input of the queue, if traces are exported.
@@ -50,11 +62,14 @@ pub struct SpanSink {
 
 impl SpanSink {
     /// Queues spans if the signal is enabled.
-    pub fn add(&self, spans: Spans) {
-        let Spans { spans, lost } = spans;
+    pub fn add(&self, messages: Spans, chains: ChainSpans) {
+        let Spans { spans, lost } = messages;
+        let spans = spans.into_iter().map(QueuedSpan::Message);
+        let of_chains = chains.spans.into_iter().map(QueuedSpan::Chain);
+        let lost = lost + chains.lost;
         let mut signals = self.exports.signals();
         if signals.any(|signal| signal == Signal::Traces) {
-            let refused = self.queue.put(spans);
+            let refused = self.queue.put(spans.chain(of_chains));
             self.exports
                 .count_dropped(Signal::Traces, Reason::Overflow, refused + lost);
         }
@@ -63,20 +78,20 @@ impl SpanSink {
 
 impl SpanQueue {
     /// Appends spans and returns how many did not fit.
-    pub fn put(&self, spans: Vec<Span>) -> u64 {
-        if spans.is_empty() {
+    pub fn put(&self, spans: impl IntoIterator<Item = QueuedSpan>) -> u64 {
+        let mut spans = spans.into_iter().peekable();
+        if spans.peek().is_none() {
             return 0;
         }
         let mut waiting = self.waiting();
         let room = WAITING.saturating_sub(waiting.len());
-        let refused = spans.len().saturating_sub(room);
-        waiting.extend(spans.into_iter().take(room));
+        waiting.extend(spans.by_ref().take(room));
         drop(waiting);
         self.news.notify_one();
-        refused as u64
+        spans.count() as u64
     }
 
-    fn take(&self) -> Vec<Span> {
+    fn take(&self) -> Vec<QueuedSpan> {
         let mut waiting = self.waiting();
         let most = waiting.len().min(REQUEST);
         waiting.drain(..most).collect()
@@ -92,7 +107,7 @@ impl SpanQueue {
         }
     }
 
-    fn waiting(&self) -> MutexGuard<'_, VecDeque<Span>> {
+    fn waiting(&self) -> MutexGuard<'_, VecDeque<QueuedSpan>> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -139,13 +154,17 @@ impl Tracing {
         sender.finish(last, false).await;
     }
 
-    fn request(&self, spans: &[Span]) -> Request {
+    fn request(&self, spans: &[QueuedSpan]) -> Request {
+        let exported = |span: &QueuedSpan| match span {
+            QueuedSpan::Message(span) => self.exported(span),
+            QueuedSpan::Chain(span) => chains::exported(span, self.host),
+        };
         let request = ExportTraceServiceRequest {
             resource_spans: vec![ResourceSpans {
                 resource: Some(self.resource.clone()),
                 scope_spans: vec![ScopeSpans {
                     scope: Some(scope()),
-                    spans: spans.iter().map(|span| self.exported(span)).collect(),
+                    spans: spans.iter().map(exported).collect(),
                     schema_url: String::new(),
                 }],
                 schema_url: String::new(),
@@ -184,21 +203,33 @@ impl Tracing {
 
     /// Returns the id of the message's span at this stage.
     fn id(&self, span: &Span, stage: SpanStage) -> Vec<u8> {
-        let mut identity = Identity::of(match stage {
-            SpanStage::Send => b"send",
-            SpanStage::Receive => b"receive",
-            SpanStage::Settle(_) => b"settle",
-        });
-        identity.add(&span.message.trace_id.to_be_bytes());
+        let trace_id = span.message.trace_id;
         match stage {
-            SpanStage::Send => {}
+            SpanStage::Send => send_id(trace_id),
             // Each receiving host has its own span.
-            SpanStage::Receive => identity.add(&self.host.to_be_bytes()),
-            SpanStage::Settle(reader) => identity.add(&reader.to_bytes()),
+            SpanStage::Receive => id(b"receive", trace_id, &self.host.to_be_bytes()),
+            SpanStage::Settle(reader) => id(b"settle", trace_id, &reader.to_bytes()),
         }
-        let bits = identity.bits() as u64;
-        bits.to_be_bytes().to_vec()
     }
+}
+
+/// Returns the id of the span of the message with this trace at its departure.
+fn send_id(trace_id: u128) -> Vec<u8> {
+    let mut identity = Identity::of(b"send");
+    identity.add(&trace_id.to_be_bytes());
+    (identity.bits() as u64).to_be_bytes().to_vec()
+}
+
+fn id(stage: &[u8], trace_id: u128, of: &[u8]) -> Vec<u8> {
+    let mut identity = Identity::of(stage);
+    identity.add(&trace_id.to_be_bytes());
+    identity.add(of);
+    (identity.bits() as u64).to_be_bytes().to_vec()
+}
+
+fn int(key: &str, value: u64) -> KeyValue {
+    let value = i64::try_from(value).unwrap_or(i64::MAX);
+    key_value(key, Value::IntValue(value))
 }
 
 /// Returns the attributes: OpenTelemetry's messaging conventions, and the names of the metrics'
@@ -206,12 +237,6 @@ impl Tracing {
 fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
     let message = &span.message;
     let (writer, number) = (message.writer, message.sequence_number);
-    let int = |key: &str, value: u64| {
-        key_value(
-            key,
-            Value::IntValue(i64::try_from(value).unwrap_or(i64::MAX)),
-        )
-    };
     let client = match span.stage {
         SpanStage::Settle(reader) => reader,
         SpanStage::Send | SpanStage::Receive => writer,
@@ -314,9 +339,10 @@ mod tests {
     #[tokio::test]
     async fn the_queue_holds_so_many_and_says_how_many_it_refused() {
         let queue = SpanQueue::default();
+        let spans = |count| vec![QueuedSpan::Message(span(SpanStage::Send)); count];
         assert_eq!(queue.put(Vec::new()), 0);
-        assert_eq!(queue.put(vec![span(SpanStage::Send); WAITING - 1]), 0);
-        assert_eq!(queue.put(vec![span(SpanStage::Send); 3]), 2);
+        assert_eq!(queue.put(spans(WAITING - 1)), 0);
+        assert_eq!(queue.put(spans(3)), 2);
         queue.filled().await;
         let mut taken = 0;
         while let more @ 1.. = queue.take().len() {

@@ -101,6 +101,7 @@ fn common_rmw(snapshot: &Snapshot, domain_id: DomainId) -> Option<&'static str> 
     match first {
         VendorId::EPROSIMA => Some("rmw_fastrtps_cpp"),
         VendorId::CYCLONE => Some("rmw_cyclonedds_cpp"),
+        VendorId::ZENOH => Some("rmw_zenoh_cpp"),
         _ => None,
     }
 }

@@ -67,6 +67,12 @@ impl Classes<'_> {
             Side::Server => (EndpointType::Server, [ends.reader, ends.writer]),
             Side::Client => (EndpointType::Client, [ends.writer, ends.reader]),
         };
+        // rmw_zenoh has one endpoint for both directions.
+        let count = match ends.reader.guid.prefix.is_zenoh() {
+            true => 1,
+            false => both.len(),
+        };
+        let endpoints = || both.into_iter().take(count);
         let members = vec![
             ("node_name", Value::text(name)),
             ("node_namespace", Value::text(namespace)),
@@ -77,14 +83,14 @@ impl Classes<'_> {
             ("service_type_hash", type_hash(ends.reader.type_hash)),
             (
                 "qos_profiles",
-                Value::array(both.map(|endpoint| qos_profile(&endpoint.qos))),
+                Value::array(endpoints().map(|endpoint| qos_profile(&endpoint.qos))),
             ),
             (
                 "endpoint_gids",
-                Value::array(both.map(|endpoint| self.gid(endpoint))),
+                Value::array(endpoints().map(|endpoint| self.gid(endpoint))),
             ),
             ("endpoint_type", self.kind(kind)),
-            ("endpoint_count", Value::count(both.len())),
+            ("endpoint_count", Value::count(count)),
         ];
         Value::Object("rclpy.endpoint_info.ServiceEndpointInfo", members)
     }
@@ -129,8 +135,7 @@ impl Classes<'_> {
     }
 
     fn gid(self, endpoint: &EndpointFacts) -> Value {
-        let bytes = endpoint.guid.prefix.0.iter().chain(&endpoint.guid.entity.0);
-        let mut bytes: Vec<u8> = bytes.copied().collect();
+        let mut bytes = endpoint.gid.to_vec();
         if self.dialect == Dialect::Humble {
             bytes.resize(LONG_GID, 0);
         }

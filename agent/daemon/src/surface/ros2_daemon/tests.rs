@@ -221,6 +221,28 @@ fn lyrical_receives_both_endpoints_of_services_and_all_parts_of_actions() {
 }
 
 #[test]
+fn a_server_or_client_of_zenoh_has_one_endpoint() {
+    let mut robot = robot();
+    for topic in &mut robot.topics {
+        for endpoint in topic.publishers.iter_mut().chain(&mut topic.subscriptions) {
+            endpoint.guid.prefix.0[..2].copy_from_slice(&VendorId::ZENOH.0);
+        }
+    }
+    for method in ["get_servers_info_by_service", "get_clients_info_by_service"] {
+        let info = answer(&ask(&robot, Dialect::Rolling, method, &["/add"]));
+        assert!(
+            info.contains("<name>endpoint_count</name>\n<value><int>1</int></value>"),
+            "{method}"
+        );
+        assert_eq!(
+            info.matches("<rclpy.qos.QoSProfile>").count(),
+            1,
+            "{method}"
+        );
+    }
+}
+
+#[test]
 fn names_counts_and_nodes_are_those_of_rclpy() {
     let text = |text: &str| Value::text(text);
     let string = "std_msgs/msg/String";

@@ -5,13 +5,16 @@ use std::collections::HashMap;
 
 use ros2probe_wire::{DomainId, Guid, RtpsDuration};
 
+use super::inside;
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
+use crate::recording::counted;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
 use ros2probe_model::history::Past;
 use ros2probe_model::snapshot::{EndpointFacts, Snapshot, TopicFacts, WatchState};
+use ros2probe_model::zenoh::Unseen;
 
 /// Largest number of findings per stream.
 const MOST: usize = 512;
@@ -39,7 +42,12 @@ pub(super) fn findings(circumstances: &Circumstances<'_>) -> Vec<Finding> {
     list
 }
 
-fn finding(kind: &'static str, severity: Severity, about: &str, text: String) -> Finding {
+pub(super) fn finding(
+    kind: &'static str,
+    severity: Severity,
+    about: &str,
+    text: String,
+) -> Finding {
     Finding {
         id: format!("{kind}|{about}"),
         kind: kind.into(),
@@ -82,8 +90,30 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
         let rejected = finding("topics_rejected", Severity::Warning, "", text);
         list.push(rejected.with_remedy("raise limits.topics, or watch fewer topics"));
     }
+    list.extend(unseen_zenoh(snapshot));
     list.extend(unseen(agent));
     list
+}
+
+/// Returns which connections of Zenoh cannot be read, one finding per reason.
+fn unseen_zenoh(snapshot: &Snapshot) -> Vec<Finding> {
+    let unseen = snapshot.zenoh.iter().flat_map(|zenoh| zenoh.unseen());
+    let findings = unseen.map(|(reason, connections)| {
+        let connections = counted(connections, "connection");
+        let which = format!("{connections} of Zenoh {}", reason.in_words());
+        let unseen = |severity, text| finding("zenoh_unseen", severity, reason.label(), text);
+        match reason {
+            Unseen::SharedMemory => {
+                let text = format!(
+                    "The agent cannot read the payloads of {which}; rates and sizes are right"
+                );
+                unseen(Severity::Note, text)
+            }
+            _ => unseen(Severity::Warning, format!("The agent cannot read {which}"))
+                .with_remedy("capture.inside: topics    # counts them inside the processes"),
+        }
+    });
+    findings.collect()
 }
 
 /// Returns what the agent cannot observe: one note per reason, and one for all that its source
@@ -127,6 +157,7 @@ const fn object(ability: Ability) -> &'static str {
         Ability::Forwarded => "traffic without a local socket",
         Ability::SharedMemory => "messages through shared memory",
         Ability::SharedMemoryExact => "each single message through shared memory",
+        Ability::Inside => "messages that only calls inside processes show",
     }
 }
 
@@ -249,6 +280,36 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
                 ..finding(kind, Severity::Warning, node, text)
             }
             .with_remedy("start all of its processes with the same ROS_DOMAIN_ID")
+        }
+        Diagnosis::SlowCallback { .. }
+        | Diagnosis::ExecutorWait { .. }
+        | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ObservationSuspended { .. } => inside::in_words(all.ids, diagnosis),
+        Diagnosis::RestampingNode { topic, node, input } => {
+            let text = format!(
+                "{node} gives {} new stamps instead of those of {input}: chains end there",
+                topic.name
+            );
+            let about = format!("{}|{}|{node}", topic.domain_id, topic.dds_name);
+            Finding {
+                node: all.ids.node(topic.domain_id, node),
+                ..finding(kind, Severity::Note, &about, text)
+            }
+            .with_remedy("copy the stamp of the input into the header of the output")
+        }
+        Diagnosis::SlowChain {
+            topic,
+            from,
+            max_latency,
+        } => {
+            let text = format!(
+                "The chain from {from} to {} takes longer than {} ms",
+                topic.name,
+                max_latency.as_secs_f64() * 1e3
+            );
+            let about = format!("{}|{}|{from}", topic.domain_id, topic.dds_name);
+            finding(kind, Severity::Warning, &about, text)
+                .with_remedy("run `rp chain` to see which hop takes the time")
         }
     }
 }
@@ -493,6 +554,7 @@ mod tests {
 
     use super::*;
     use ros2probe_model::diagnosis::Diagnoses;
+    use ros2probe_model::zenoh::ZenohFacts;
 
     #[test]
     fn of_more_findings_than_are_sent_the_worst_are() {
@@ -522,6 +584,49 @@ mod tests {
             ("agent_not_ready", Severity::Error)
         );
         assert!(found.is_sorted_by_key(|each| each.severity));
+    }
+
+    #[test]
+    fn each_reason_for_unread_connections_of_zenoh_is_in_words() {
+        let found = |unseen| {
+            let snapshot = Snapshot {
+                zenoh: Some(ZenohFacts {
+                    unseen,
+                    ..ZenohFacts::default()
+                }),
+                ..Snapshot::default()
+            };
+            unseen_zenoh(&snapshot)
+        };
+        let text = |list: &[Finding]| -> Vec<String> {
+            list.iter().map(|each| each.text.clone()).collect()
+        };
+        assert!(found([0; 6]).is_empty());
+        assert_eq!(
+            text(&found([1; 6])),
+            [
+                "The agent cannot read 1 connection of Zenoh encrypted with TLS",
+                "The agent cannot read 1 connection of Zenoh encrypted with QUIC",
+                "The agent cannot read 1 connection of Zenoh with another version of the wire \
+                 format than 9",
+                "The agent cannot read 1 connection of Zenoh with compressed batches",
+                "The agent cannot read 1 connection of Zenoh with the low-latency transport",
+                "The agent cannot read the payloads of 1 connection of Zenoh with shared memory; \
+                 rates and sizes are right",
+            ]
+        );
+        let two = found([2, 0, 0, 0, 0, 3]);
+        assert_eq!(
+            text(&two),
+            [
+                "The agent cannot read 2 connections of Zenoh encrypted with TLS",
+                "The agent cannot read the payloads of 3 connections of Zenoh with shared \
+                 memory; rates and sizes are right",
+            ]
+        );
+        // A count inside the processes has no payloads either.
+        let remedies = two.iter().map(|each| each.remedy.is_some());
+        assert_eq!(remedies.collect::<Vec<_>>(), [true, false]);
     }
 
     #[test]

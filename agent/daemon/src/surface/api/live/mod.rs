@@ -5,6 +5,7 @@
 //! stream, no work is done.
 
 mod findings;
+mod inside;
 mod shared_lines;
 mod structure;
 mod values;

@@ -115,7 +115,13 @@ impl Figures<'_> {
                 Diagnosis::UnfedSubscriber { .. } => mark(Flag::Unfed, true),
                 Diagnosis::DuplicateNode { .. }
                 | Diagnosis::NodeInSeveralDomains { .. }
-                | Diagnosis::HangingCall { .. } => {}
+                | Diagnosis::HangingCall { .. }
+                | Diagnosis::SlowCallback { .. }
+                | Diagnosis::ExecutorWait { .. }
+                | Diagnosis::IntraProcessOverflow { .. }
+                | Diagnosis::ObservationSuspended { .. }
+                | Diagnosis::RestampingNode { .. }
+                | Diagnosis::SlowChain { .. } => {}
             }
         }
         let measured = topic.measurement.as_deref();
@@ -139,7 +145,10 @@ impl Figures<'_> {
         let mut transports = topic.transports.iter();
         mark(
             Flag::Unseen,
-            transports.any(|each| is_unseen(each.transport)),
+            transports.any(|each| {
+                let observed = topic.observed_pairs(each.transport);
+                is_unseen(each.transport) && observed < each.pairs
+            }),
         );
         let is_sampled = measured.is_some_and(|measured| measured.sampled.is_some());
         mark(Flag::Sampled, is_sampled);

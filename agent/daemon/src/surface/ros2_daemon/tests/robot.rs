@@ -22,6 +22,7 @@ fn endpoint(
 ) -> EndpointFacts {
     EndpointFacts {
         guid: Guid::new(PREFIX, EntityId(entity)),
+        gid: Guid::new(PREFIX, EntityId(entity)).to_bytes(),
         node: node.map(Into::into),
         qos: Arc::new(Qos {
             reliability: Reliability::RELIABLE,

@@ -1,0 +1,290 @@
+//! Callbacks of rclcpp: how long they wait and run, and what they publish.
+
+use core::ptr::{read_volatile, write_volatile};
+
+use ros2probe_wire::inside::{
+    Counter, Figures, HOPS_PER_SECOND, Handle, Hop, announced, distribution, kind,
+};
+
+use crate::{
+    instructions::add,
+    maps::{ANNOUNCEMENTS, Current, Thread, calendar, count, now, observe, read, steady},
+};
+
+const SECOND: u64 = 1_000_000_000;
+/// Longest plausible period of a timer, and the distance of its last call.
+const LONGEST: u64 = 86_400 * SECOND;
+const SHORTEST: u64 = 1_000;
+/// Difference of clock readings that is taken for none.
+const IMPRECISION: u64 = 10_000_000;
+/// Offsets of the period in `rcl_timer_impl_t` that are tried. The last and the next call follow.
+const FIRST_PLACE: u32 = 32;
+const LAST_PLACE: u32 = 80;
+
+/// The executor begins to execute a handle; 0 = it selects the next one.
+#[inline(always)]
+pub fn executed(handle: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    if let Some(thread) = current.thread() {
+        // SAFETY: a map value pointer checked against null, of the running thread.
+        unsafe {
+            (*thread).executed = handle;
+            if handle != 0 {
+                (*thread).input = current.handle(0, 0);
+            }
+        }
+    }
+}
+
+/// A callback begins that handles a message of the same process.
+#[inline(always)]
+pub fn received(callback: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    if let Some(figures) = current.figures(callback, kind::CALLBACK) {
+        // SAFETY: a map value pointer checked against null.
+        unsafe {
+            add(&raw mut (*figures).within, 1);
+            (*figures).trigger = current.handle(0, kind::BUFFER);
+            write_volatile(&raw mut (*figures).last, now());
+        }
+    }
+}
+
+/// A callback begins.
+#[inline(always)]
+pub fn started(callback: u64, within: bool) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let (Some(figures), Some(thread)) =
+        (current.figures(callback, kind::CALLBACK), current.thread())
+    else {
+        return;
+    };
+    let now = now();
+    // SAFETY: map value pointers checked against null; the thread is the running one.
+    unsafe {
+        (*thread).callback = callback;
+        (*thread).started = now;
+        (*figures).thread = current.thread;
+        let input = (*thread).input;
+        if within {
+            add(&raw mut (*figures).within, 1);
+            if input.kind == kind::BUFFER {
+                (*figures).trigger = input;
+                let entered = (*thread).entered;
+                if entered != 0 && now > entered {
+                    observe(figures, distribution::DELAY, now - entered);
+                }
+            } else {
+                (*figures).trigger = current.handle(0, kind::BUFFER);
+            }
+        } else if input.kind == kind::SUBSCRIPTION {
+            (*figures).trigger = input;
+            waited_since_source(&current, figures, thread, now);
+        } else if (*thread).executed != 0 {
+            (*figures).trigger = current.handle((*thread).executed, kind::TIMER);
+            waited_since_due(&current, figures, (*thread).executed, now);
+        } else {
+            (*figures).trigger = current.handle(0, 0);
+        }
+    }
+}
+
+/// Adds the time since the message's source timestamp, less the least time until a take.
+#[inline(always)]
+unsafe fn waited_since_source(
+    current: &Current,
+    figures: *mut Figures,
+    thread: *const Thread,
+    now: u64,
+) {
+    // SAFETY: map values, by the caller.
+    unsafe {
+        let source = (*thread).source_timestamp;
+        let calendar = calendar(now);
+        if source == 0 || calendar <= source {
+            return;
+        }
+        let input = (*thread).input;
+        let Some(subscription) = current.known_figures(input.address, kind::SUBSCRIPTION) else {
+            return;
+        };
+        let minima = (&raw const (*subscription).minima).cast::<u64>();
+        let least = read_volatile(minima.add(distribution::DELAY));
+        let delay = calendar - source;
+        if least != 0 && delay >= least - 1 {
+            observe(figures, distribution::DELAY, delay - (least - 1));
+        }
+    }
+}
+
+/// Adds the time since the timer was due. At this moment, its structure has the next call.
+#[inline(always)]
+unsafe fn waited_since_due(current: &Current, figures: *mut Figures, timer: u64, now: u64) {
+    let structure = read::<u64>(timer);
+    let place = match current.timer_period_at() {
+        0 => find_period(structure, now),
+        place => place,
+    };
+    if place == 0 {
+        return;
+    }
+    let [period, last, next] = read::<[u64; 3]>(structure + u64::from(place));
+    if !is_schedule(period, last, next, now) {
+        return;
+    }
+    current.found_timer_period(place);
+    // SAFETY: a map value, by the caller.
+    unsafe {
+        // The executor moves the next call by whole periods. Otherwise the timer was reset.
+        let expected = (*figures).due;
+        let (mut due, mut skipped) = (next - period, 0);
+        let ahead = next.wrapping_sub(expected);
+        if expected != 0 && next > expected && ahead.checked_rem(period) == Some(0) {
+            due = expected;
+            skipped = ahead.checked_div(period).unwrap_or(1) - 1;
+        }
+        (*figures).due = next;
+        (*figures).period = period;
+        if skipped != 0 {
+            add(&raw mut (*figures).failed, skipped);
+        }
+        let clock = clock_of(last, now);
+        if clock > due {
+            observe(figures, distribution::DELAY, clock - due);
+        }
+    }
+}
+
+/// Finds the offset of the period; 0 if no place looks like one.
+#[inline(always)]
+fn find_period(structure: u64, now: u64) -> u32 {
+    let mut place = FIRST_PLACE;
+    while place <= LAST_PLACE {
+        let [period, last, next] = read::<[u64; 3]>(structure + u64::from(place));
+        if is_schedule(period, last, next, now) {
+            return place;
+        }
+        place += 8;
+    }
+    0
+}
+
+/// Returns whether three numbers are a period, a last call just now, and the next one.
+#[inline(always)]
+fn is_schedule(period: u64, last: u64, next: u64, now: u64) -> bool {
+    let is_period = period >= SHORTEST && period <= LONGEST && next > last && next - last <= period;
+    is_period && clock_of(last, now).wrapping_sub(last) < SECOND
+}
+
+/// Returns the time by the clock that has given `last`: the steady one, or the system's. It is at
+/// least `last`, from which user space's reading of the clocks may differ by some microseconds.
+#[inline(always)]
+fn clock_of(last: u64, now: u64) -> u64 {
+    let steady = steady(now);
+    let clock = if last < steady.wrapping_add(LONGEST) {
+        steady
+    } else {
+        calendar(now)
+    };
+    if clock < last && last - clock < IMPRECISION {
+        last
+    } else {
+        clock
+    }
+}
+
+/// A callback ends.
+#[inline(always)]
+pub fn ended(callback: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let (Some(figures), Some(thread)) = (
+        current.figures(callback, kind::CALLBACK),
+        current.known_thread(),
+    ) else {
+        return;
+    };
+    let now = now();
+    // SAFETY: as in `started`.
+    unsafe {
+        add(&raw mut (*figures).count, 1);
+        write_volatile(&raw mut (*figures).last, now);
+        // A callback that runs an executor has others within it, and its own start is lost.
+        if (*thread).callback == callback && now > (*thread).started {
+            observe(figures, distribution::INTERVAL, now - (*thread).started);
+        }
+        (*thread).callback = 0;
+        (*thread).executed = 0;
+        (*thread).input = current.handle(0, 0);
+    }
+}
+
+/// Reports a publication during a callback that handles a message.
+#[inline(always)]
+pub fn published(current: &Current, publisher: u64, within: bool, now: u64) {
+    let Some(thread) = current.known_thread() else {
+        return;
+    };
+    // SAFETY: a map value pointer checked against null, of the running thread.
+    let (callback, input) = unsafe { ((*thread).callback, (*thread).input) };
+    if callback == 0 || input.address == 0 {
+        return;
+    }
+    let Some(figures) = current.known_figures(callback, kind::CALLBACK) else {
+        return;
+    };
+    // SAFETY: as above.
+    unsafe {
+        if now.wrapping_sub((*figures).hops_since) >= SECOND {
+            (*figures).hops_since = now;
+            (*figures).hops = 0;
+        }
+        if (*figures).hops >= HOPS_PER_SECOND {
+            count(Counter::HopsSkipped);
+            return;
+        }
+        (*figures).hops += 1;
+    }
+    // SAFETY: as above.
+    unsafe { report(current, thread, publisher, within, input, now) };
+}
+
+#[inline(always)]
+unsafe fn report(
+    current: &Current,
+    thread: *const Thread,
+    publisher: u64,
+    within: bool,
+    input: Handle,
+    now: u64,
+) {
+    let Some(mut entry) = ANNOUNCEMENTS.reserve::<Hop>(0) else {
+        count(Counter::HopsLost);
+        return;
+    };
+    // SAFETY: a map value, by the caller.
+    let hop = unsafe {
+        Hop {
+            kind: announced::HOP,
+            process: current.process,
+            thread: current.thread,
+            within: u32::from(within),
+            published: now,
+            publisher,
+            input,
+            source_timestamp: (*thread).source_timestamp,
+            taken: (*thread).taken,
+            started: (*thread).started,
+            callback: (*thread).callback,
+        }
+    };
+    entry.write(hop);
+    entry.submit(0);
+}

@@ -1,0 +1,172 @@
+//! Calls of `libtracetools.so` in ROS processes, counted where they happen.
+//!
+//! `rcl`, `rclcpp` and the middlewares call a function of this library for each event, whether a
+//! tracer is installed or not. A uprobe at its entry runs in the process that calls it. The
+//! programs read arguments and, once for each handle, names; they write only their own maps. Nothing
+//! leaves the kernel for each message, except a bounded number of causal publications.
+//!
+//! They stay within what Linux 5.10 verifies, as the packet filter does.
+
+#![no_std]
+#![no_main]
+#![feature(asm_experimental_arch)]
+
+mod callbacks;
+#[path = "../instructions.rs"]
+mod instructions;
+mod maps;
+mod messages;
+mod names;
+#[path = "../registers.rs"]
+mod registers;
+#[path = "../settings.rs"]
+mod settings;
+
+use aya_ebpf::{EbpfContext as _, macros::uprobe, programs::ProbeContext};
+use ros2probe_wire::inside::announced;
+
+use crate::registers::{is_aarch64, register};
+
+/// Declares a program at a function's entry, with as many of its arguments as named.
+macro_rules! calls {
+    ($($(#[$doc:meta])* $name:ident($($argument:ident),*) { $($body:tt)* })*) => {
+        $(
+            $(#[$doc])*
+            #[uprobe]
+            pub fn $name(context: ProbeContext) -> u32 {
+                arguments!(context; $($argument),*);
+                $($body)*
+                0
+            }
+        )*
+    };
+}
+
+/// Binds arguments in order: System V ABI and AAPCS64.
+macro_rules! arguments {
+    ($context:ident;) => {
+        let _ = $context;
+    };
+    ($context:ident; $a:ident $(, $b:ident $(, $c:ident $(, $d:ident)?)?)?) => {
+        let registers = $context.as_ptr() as *const u64;
+        let $a = if is_aarch64() { register!(registers, 0) } else { register!(registers, 112) };
+        $(
+            let $b = if is_aarch64() { register!(registers, 8) } else { register!(registers, 104) };
+            $(
+                let $c = if is_aarch64() { register!(registers, 16) } else { register!(registers, 96) };
+                $(
+                    let $d =
+                        if is_aarch64() { register!(registers, 24) } else { register!(registers, 88) };
+                )?
+            )?
+        )?
+    };
+}
+
+calls! {
+    /// `(rcl_publisher_t *, message)`.
+    rcl_publish(publisher) { messages::published(publisher, false); }
+    /// `(rcl_publisher_t *, message)`, before the message enters the subscriptions' buffers.
+    rclcpp_intra_publish(publisher) { messages::published(publisher, true); }
+    /// `(rmw_subscription_t *, message, source timestamp, bool taken)`.
+    rmw_take(subscription, _message, source_timestamp, taken) {
+        messages::taken(subscription, source_timestamp, taken as u8 != 0);
+    }
+    /// `(buffer, index, size, bool overwritten)`.
+    rclcpp_ring_buffer_enqueue(buffer, index, size, overwritten) {
+        messages::enqueued(buffer, index, size as u32, overwritten as u8 != 0);
+    }
+    /// `(buffer, index, size)`.
+    rclcpp_ring_buffer_dequeue(buffer, index, size) {
+        messages::dequeued(buffer, index, size as u32);
+    }
+    /// `(buffer)`.
+    rclcpp_ring_buffer_clear(buffer) { messages::cleared(buffer); }
+
+    /// `(callback, bool intra_process)`.
+    callback_start(callback, intra_process) {
+        callbacks::started(callback, intra_process as u8 != 0);
+    }
+    /// As `callback_start`, where only received messages are counted.
+    callback_received(callback, intra_process) {
+        if intra_process as u8 != 0 {
+            callbacks::received(callback);
+        }
+    }
+    /// `(callback)`.
+    callback_end(callback) { callbacks::ended(callback); }
+    /// `(rcl_timer_t * or rcl_subscription_t *)`.
+    rclcpp_executor_execute(handle) { callbacks::executed(handle); }
+    /// `()`.
+    rclcpp_executor_get_next_ready() { callbacks::executed(0); }
+
+    /// `(rcl_node_t *, rmw_node_t *, name, namespace)`.
+    rcl_node_init(node, _rmw, name, namespace) {
+        names::announce(announced::NODE, node, 0, 0, name, namespace);
+    }
+    /// `(rcl_publisher_t *, rcl_node_t *, rmw_publisher_t *, topic, depth)`.
+    rcl_publisher_init(publisher, node, rmw, topic) {
+        names::publisher_created(publisher, node, rmw, topic);
+    }
+    /// `(rcl_subscription_t *, rcl_node_t *, rmw_subscription_t *, topic, depth)`.
+    rcl_subscription_init(subscription, node, rmw, topic) {
+        names::subscription_created(subscription, node, rmw, topic);
+    }
+    /// `(rcl_subscription_t *, rclcpp subscription)`.
+    rclcpp_subscription_init(handle, subscription) {
+        names::announce(announced::SUBSCRIPTION_OBJECT, subscription, handle, 0, 0, 0);
+    }
+    /// `(rclcpp subscription, callback)`.
+    rclcpp_subscription_callback_added(subscription, callback) {
+        names::callback_created(announced::SUBSCRIPTION_CALLBACK, callback, subscription);
+    }
+    /// `(rcl_timer_t *, period)`.
+    rcl_timer_init(timer, period) {
+        names::announce(announced::TIMER, timer, 0, period, 0, 0);
+    }
+    /// `(rcl_timer_t *, rcl_node_t *)`.
+    rclcpp_timer_link_node(timer, node) {
+        names::announce(announced::TIMER_NODE, timer, node, 0, 0, 0);
+    }
+    /// `(rcl_timer_t *, callback)`.
+    rclcpp_timer_callback_added(timer, callback) {
+        names::callback_created(announced::TIMER_CALLBACK, callback, timer);
+    }
+    /// `(rcl_service_t *, rcl_node_t *, rmw_service_t *, name)`.
+    rcl_service_init(service, node, _rmw, name) {
+        names::announce(announced::SERVICE, service, node, 0, name, 0);
+    }
+    /// `(rcl_service_t *, callback)`.
+    rclcpp_service_callback_added(service, callback) {
+        names::callback_created(announced::SERVICE_CALLBACK, callback, service);
+    }
+    /// `(rcl_node_t *, state machine)`.
+    rcl_lifecycle_state_machine_init(node, machine) {
+        names::announce(announced::STATE_MACHINE, machine, node, 0, 0, 0);
+    }
+    /// `(state machine, label of the start state, label of the goal state)`.
+    rcl_lifecycle_transition(machine, start, goal) {
+        names::announce(announced::TRANSITION, machine, 0, 0, start, goal);
+    }
+    /// `(buffer, capacity)`.
+    rclcpp_construct_ring_buffer(buffer, capacity) {
+        names::buffer_created(buffer, capacity);
+    }
+    /// `(ring buffer, intra-process buffer)`.
+    rclcpp_buffer_to_ipb(buffer, owner) {
+        names::announce(announced::BUFFER_OWNER, owner, buffer, 0, 0, 0);
+    }
+    /// `(intra-process buffer, rclcpp subscription)`.
+    rclcpp_ipb_to_subscription(owner, subscription) {
+        names::announce(announced::BUFFER_SUBSCRIPTION, owner, subscription, 0, 0, 0);
+    }
+}
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo<'_>) -> ! {
+    loop {}
+}
+
+#[unsafe(link_section = "license")]
+#[unsafe(no_mangle)]
+static LICENSE: [u8; 4] = *b"GPL\0";

@@ -1,0 +1,186 @@
+//! Messages that are published, taken, and passed within a process.
+
+use core::ptr::{read_volatile, write_volatile};
+
+use ros2probe_wire::inside::{distribution, kind};
+
+use crate::{
+    callbacks,
+    instructions::add,
+    maps::{CALLBACKS, Current, Entry, WAITING, calendar, event, now, observe},
+    names,
+    settings::setting,
+};
+
+/// A publication: to the middleware, or before that `within` the process.
+#[inline(always)]
+pub fn published(publisher: u64, within: bool) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let now = now();
+    let thread = current.known_thread();
+    if !within {
+        // The second call for a message that was also passed within the process.
+        if let Some(thread) = thread {
+            // SAFETY: a map value pointer checked against null, of the running thread.
+            let is_counted = unsafe { (*thread).publisher } == publisher;
+            if is_counted {
+                // SAFETY: as above.
+                unsafe { (*thread).publisher = 0 };
+                return;
+            }
+        }
+    }
+    let Some(figures) = current.figures(publisher, kind::PUBLISHER) else {
+        return;
+    };
+    // SAFETY: a map value pointer checked against null.
+    unsafe { event(figures, now) };
+    names::publisher(&current, figures, publisher);
+    if within {
+        // SAFETY: as above.
+        add(unsafe { &raw mut (*figures).within }, 1);
+        if let Some(thread) = current.thread() {
+            // SAFETY: as above.
+            unsafe { (*thread).publisher = publisher };
+        }
+    }
+    if setting(&CALLBACKS) != 0 {
+        callbacks::published(&current, publisher, within, now);
+    }
+}
+
+/// A take from the middleware, or an attempt.
+#[inline(always)]
+pub fn taken(subscription: u64, source_timestamp: u64, taken: bool) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let Some(figures) = current.figures(subscription, kind::SUBSCRIPTION) else {
+        return;
+    };
+    names::subscription(&current, figures, subscription);
+    if !taken {
+        // SAFETY: a map value pointer checked against null.
+        add(unsafe { &raw mut (*figures).failed }, 1);
+        return;
+    }
+    let now = now();
+    // SAFETY: as above.
+    unsafe { event(figures, now) };
+    let calendar = calendar(now);
+    if source_timestamp != 0 && calendar > source_timestamp {
+        // SAFETY: as above.
+        unsafe { observe(figures, distribution::DELAY, calendar - source_timestamp) };
+    }
+    if setting(&CALLBACKS) == 0 {
+        return;
+    }
+    if let Some(thread) = current.thread() {
+        // SAFETY: as above, of the running thread.
+        unsafe {
+            (*thread).input = current.handle(subscription, kind::SUBSCRIPTION);
+            (*thread).source_timestamp = source_timestamp;
+            (*thread).taken = now;
+        }
+    }
+}
+
+/// A message enters a ring buffer. `size`: messages in it afterwards, one too many if one of them
+/// is overwritten.
+#[inline(always)]
+pub fn enqueued(buffer: u64, index: u64, size: u32, overwritten: bool) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let Some(figures) = current.figures(buffer, kind::BUFFER) else {
+        return;
+    };
+    let now = now();
+    let depth = size.wrapping_sub(u32::from(overwritten));
+    // SAFETY: a map value pointer checked against null.
+    unsafe {
+        event(figures, now);
+        if overwritten {
+            add(&raw mut (*figures).failed, 1);
+        }
+        write_volatile(&raw mut (*figures).depth, depth);
+        if read_volatile(&raw const (*figures).max_depth) < depth {
+            write_volatile(&raw mut (*figures).max_depth, depth);
+        }
+    }
+    if let Some(thread) = current.known_thread() {
+        // SAFETY: as above. The publication that fills the buffers precedes in the same thread.
+        unsafe {
+            let publisher = (*thread).publisher;
+            if publisher != 0 {
+                (*figures).trigger = current.handle(publisher, kind::PUBLISHER);
+            }
+        }
+    }
+    let _ = WAITING.insert(&entry(&current, buffer, index), &now, 0);
+}
+
+/// A message leaves a ring buffer.
+#[inline(always)]
+pub fn dequeued(buffer: u64, index: u64, size: u32) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    let Some(figures) = current.figures(buffer, kind::BUFFER) else {
+        return;
+    };
+    let now = now();
+    let key = entry(&current, buffer, index);
+    let entered = match WAITING.get_ptr(&key) {
+        // SAFETY: a map value pointer checked against null.
+        Some(entered) => unsafe { *entered },
+        None => 0,
+    };
+    // SAFETY: as above.
+    unsafe {
+        add(&raw mut (*figures).within, 1);
+        write_volatile(&raw mut (*figures).depth, size);
+        if entered != 0 && now > entered {
+            observe(figures, distribution::DELAY, now - entered);
+        }
+    }
+    if entered != 0 {
+        let _ = WAITING.remove(&key);
+    }
+    if setting(&CALLBACKS) == 0 {
+        return;
+    }
+    if let Some(thread) = current.thread() {
+        let source_timestamp = if entered == 0 { 0 } else { calendar(entered) };
+        // SAFETY: as above, of the running thread.
+        unsafe {
+            (*thread).input = current.handle(buffer, kind::BUFFER);
+            (*thread).source_timestamp = source_timestamp;
+            (*thread).taken = now;
+            (*thread).entered = entered;
+        }
+    }
+}
+
+/// A ring buffer is emptied.
+#[inline(always)]
+pub fn cleared(buffer: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    if let Some(figures) = current.known_figures(buffer, kind::BUFFER) {
+        // SAFETY: a map value pointer checked against null.
+        unsafe { write_volatile(&raw mut (*figures).depth, 0) };
+    }
+}
+
+#[inline(always)]
+fn entry(current: &Current, buffer: u64, index: u64) -> Entry {
+    Entry {
+        buffer,
+        process: current.process,
+        index: index as u32,
+    }
+}

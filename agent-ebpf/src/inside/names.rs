@@ -1,0 +1,258 @@
+//! Names and relations of handles, each sent to user space once.
+//!
+//! A process that started before the programs has announced its handles already: their names are
+//! then read from its structures, which are checked before they are believed.
+
+use aya_ebpf::helpers::generated::bpf_probe_read_user_str;
+use ros2probe_wire::inside::{Announcement, Counter, Figures, NAME_BYTES, announced, kind};
+
+use crate::maps::{ANNOUNCEMENTS, Current, count, now, read};
+
+/// `"rmw_"`, with which every identifier of a middleware begins.
+const RMW: u32 = u32::from_le_bytes(*b"rmw_");
+/// Offset of `rmw_handle` in `rcl_publisher_impl_s` and `rcl_subscription_impl_s`: of Humble, and of
+/// Iron and later.
+const RMW_HANDLES: [u32; 2] = [240, 248];
+/// Offset of the topic's name in `rmw_publisher_t` and `rmw_subscription_t`.
+const TOPIC_NAME: u64 = 16;
+/// Attempts to read a name: its page may not be resident.
+const ATTEMPTS: u32 = 16;
+
+/// Announces a publisher at its first publication.
+#[inline(always)]
+pub fn publisher(current: &Current, figures: *mut Figures, publisher: u64) {
+    if !is_to_be_announced(figures) {
+        return;
+    }
+    let rmw = rmw_handle(current, publisher);
+    if rmw == 0 {
+        count(Counter::Unreadable);
+        return;
+    }
+    existing(current, figures, announced::PUBLISHER, publisher, rmw);
+}
+
+/// Announces a subscription at its first take.
+#[inline(always)]
+pub fn subscription(current: &Current, figures: *mut Figures, rmw: u64) {
+    if !is_to_be_announced(figures) {
+        return;
+    }
+    if !is_endpoint(rmw) {
+        // Middlewares take from topics of their own, whose names have no slash.
+        if is_internal(rmw) {
+            // SAFETY: a map value, by the caller.
+            unsafe { (*figures).announced = ATTEMPTS };
+        } else {
+            count(Counter::Unreadable);
+        }
+        return;
+    }
+    existing(current, figures, announced::SUBSCRIPTION, rmw, rmw);
+}
+
+/// A publisher is created.
+#[inline(always)]
+pub fn publisher_created(publisher: u64, node: u64, rmw: u64, topic: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    current.renew(publisher, kind::PUBLISHER);
+    created(
+        &current,
+        announced::PUBLISHER,
+        publisher,
+        node,
+        0,
+        topic,
+        rmw,
+    );
+}
+
+/// A subscription is created.
+#[inline(always)]
+pub fn subscription_created(subscription: u64, node: u64, rmw: u64, topic: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    current.renew(rmw, kind::SUBSCRIPTION);
+    created(
+        &current,
+        announced::SUBSCRIPTION,
+        rmw,
+        node,
+        subscription,
+        topic,
+        rmw,
+    );
+}
+
+/// A callback is created.
+#[inline(always)]
+pub fn callback_created(what: u32, callback: u64, parent: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    current.renew(callback, kind::CALLBACK);
+    send(&current, what, callback, parent, 0, 0, 0);
+}
+
+/// A ring buffer is created.
+#[inline(always)]
+pub fn buffer_created(buffer: u64, capacity: u64) {
+    let Some(current) = Current::of_call() else {
+        return;
+    };
+    current.renew(buffer, kind::BUFFER);
+    send(&current, announced::BUFFER, buffer, 0, capacity, 0, 0);
+}
+
+/// Announces another object or relation.
+#[inline(always)]
+pub fn announce(what: u32, address: u64, parent: u64, value: u64, text: u64, second: u64) {
+    if let Some(current) = Current::of_call() {
+        send(&current, what, address, parent, value, text, second);
+    }
+}
+
+/// Sends the names of a new endpoint, and notes that they are known.
+#[inline(always)]
+fn created(
+    current: &Current,
+    what: u32,
+    address: u64,
+    node: u64,
+    value: u64,
+    topic: u64,
+    rmw: u64,
+) {
+    let identifier = read::<u64>(rmw);
+    let is_sent = send(current, what, address, node, value, topic, identifier);
+    let of = if what == announced::PUBLISHER {
+        kind::PUBLISHER
+    } else {
+        kind::SUBSCRIPTION
+    };
+    if is_sent && let Some(figures) = current.figures(address, of) {
+        // SAFETY: a map value pointer checked against null.
+        unsafe { (*figures).announced = ATTEMPTS };
+    }
+}
+
+/// Sends the names of an endpoint that existed before.
+#[inline(always)]
+fn existing(current: &Current, figures: *mut Figures, what: u32, address: u64, rmw: u64) {
+    let (identifier, topic) = (read::<u64>(rmw), read::<u64>(rmw + TOPIC_NAME));
+    if send(current, what, address, 0, 0, topic, identifier) {
+        // SAFETY: a map value, by the caller.
+        unsafe { (*figures).announced = ATTEMPTS };
+    }
+}
+
+/// Returns whether a handle's name is to be read, and counts the attempt.
+#[inline(always)]
+fn is_to_be_announced(figures: *mut Figures) -> bool {
+    // SAFETY: a map value, by the callers.
+    unsafe {
+        let attempts = (*figures).announced;
+        if attempts >= ATTEMPTS {
+            return false;
+        }
+        (*figures).announced = attempts + 1;
+    }
+    true
+}
+
+/// Returns the middleware's handle of a publisher; 0 if it has none.
+#[inline(always)]
+fn rmw_handle(current: &Current, publisher: u64) -> u64 {
+    let structure = read::<u64>(publisher);
+    let known = current.rmw_handle_at();
+    if known != 0 {
+        let rmw = read::<u64>(structure + u64::from(known));
+        return if is_endpoint(rmw) { rmw } else { 0 };
+    }
+    let mut index = 0;
+    while index < RMW_HANDLES.len() {
+        let offset = RMW_HANDLES[index];
+        let rmw = read::<u64>(structure + u64::from(offset));
+        if is_endpoint(rmw) {
+            current.found_rmw_handle(offset);
+            return rmw;
+        }
+        index += 1;
+    }
+    0
+}
+
+/// Returns whether an address holds an endpoint of a middleware: an identifier that begins with
+/// `rmw_`, and a name that begins with a slash.
+#[inline(always)]
+fn is_endpoint(rmw: u64) -> bool {
+    read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) == b'/'
+}
+
+/// Returns whether an address holds an endpoint whose name does not begin with a slash.
+#[inline(always)]
+fn is_internal(rmw: u64) -> bool {
+    read::<u32>(read(rmw)) == RMW && read::<u8>(read(rmw + TOPIC_NAME)) != 0
+}
+
+/// Sends an announcement; returns whether the ring has room, and a first name could be read if
+/// there is one.
+#[inline(always)]
+fn send(
+    current: &Current,
+    what: u32,
+    address: u64,
+    parent: u64,
+    value: u64,
+    text: u64,
+    second: u64,
+) -> bool {
+    let Some(mut entry) = ANNOUNCEMENTS.reserve::<Announcement>(0) else {
+        count(Counter::AnnouncementsLost);
+        return false;
+    };
+    let announcement = entry.as_mut_ptr();
+    // SAFETY: memory of the size of an announcement that this run has reserved; every field that
+    // user space reads is written.
+    let length = unsafe {
+        (*announcement).kind = what;
+        (*announcement).process = current.process;
+        (*announcement).thread = current.thread;
+        (*announcement).unused = 0;
+        (*announcement).time = now();
+        (*announcement).address = address;
+        (*announcement).parent = parent;
+        (*announcement).value = value;
+        (*announcement).text[0] = 0;
+        (*announcement).second[0] = 0;
+        let length = string((&raw mut (*announcement).text).cast(), text);
+        string((&raw mut (*announcement).second).cast(), second);
+        length
+    };
+    if text != 0 && length <= 0 {
+        count(Counter::Unreadable);
+        entry.discard(0);
+        return false;
+    }
+    entry.submit(0);
+    true
+}
+
+/// Copies a string of the running process; returns its length with the final zero, or an error.
+#[inline(always)]
+unsafe fn string(to: *mut u8, address: u64) -> i64 {
+    if address == 0 {
+        return 0;
+    }
+    // SAFETY: `to` has room for a name, by the caller; the kernel checks the address.
+    let length =
+        unsafe { bpf_probe_read_user_str(to.cast(), NAME_BYTES as u32, address as *const _) };
+    if length <= 0 {
+        // SAFETY: as above.
+        unsafe { *to = 0 };
+    }
+    length
+}

@@ -1,0 +1,24 @@
+//! Single instructions that the optimizer leaves as they are.
+
+use core::arch::asm;
+
+/// Adds to a field of a map value, so that no other run comes between.
+#[inline(always)]
+pub fn add(to: *mut u64, by: u64) {
+    // SAFETY: `to` is a field of a map value. Without a returned value this is an instruction that
+    // every BPF verifier accepts.
+    unsafe {
+        asm!("lock *(u64 *)({to} + 0) += {by}", to = in(reg) to, by = in(reg) by, options(nostack));
+    }
+}
+
+/// Returns the same number with its bounds hidden from the optimizer, so that a mask that follows
+/// is kept and every verifier sees it.
+#[inline(always)]
+pub fn opaque(value: u32) -> u64 {
+    let mut value = u64::from(value);
+    // The assembly must not be empty: the verifier refuses line information without an instruction.
+    // SAFETY: changes nothing.
+    unsafe { asm!("{0} = {0}", inout(reg) value, options(pure, nomem, nostack, preserves_flags)) }
+    value
+}

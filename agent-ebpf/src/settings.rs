@@ -1,0 +1,36 @@
+//! Constants that the loader sets before it loads the programs, and the processes they select.
+
+use aya_ebpf::helpers::generated::bpf_get_current_ancestor_cgroup_id;
+
+/// Ancestor control groups that are compared.
+const LEVELS: i32 = 16;
+
+/// Restricts programs that run in processes to those in or below this control group; 0 = all. Set
+/// by the loader.
+#[unsafe(no_mangle)]
+pub static WITHIN: u64 = 0;
+
+/// Reads a constant that the loader may have changed.
+#[inline(always)]
+pub fn setting<T: Copy>(constant: &'static T) -> T {
+    // SAFETY: a constant of the loaded object, never written while the program runs.
+    unsafe { core::ptr::read_volatile(constant) }
+}
+
+/// Returns whether the running process is in the observed control group.
+#[inline(always)]
+pub fn is_within() -> bool {
+    let within = setting(&WITHIN);
+    if within == 0 {
+        return true;
+    }
+    let mut level = 0;
+    while level < LEVELS {
+        // SAFETY: no preconditions.
+        if unsafe { bpf_get_current_ancestor_cgroup_id(level) } == within {
+            return true;
+        }
+        level += 1;
+    }
+    false
+}

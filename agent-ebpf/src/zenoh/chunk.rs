@@ -1,0 +1,169 @@
+//! Chunks for user space: a part of a direction's bytes, of which the beginning may be copied.
+
+use aya_ebpf::{bindings::__sk_buff, helpers::generated::bpf_skb_load_bytes};
+use core::mem::size_of;
+use ros2probe_wire::{
+    filter::Counter,
+    host::{PIECE_BYTES, Piece, chunk as part},
+    record::flag,
+};
+
+use crate::{
+    maps::{PIECES, PieceBuffer, WAKE_PIECE_BYTES, count, piece},
+    packet::IPV4_MAPPED,
+    pieces::bounded,
+    settings::setting,
+    verdict::{AVAILABLE_DATA, FORCE_WAKEUP, NO_WAKEUP},
+};
+
+use super::state::{WINDOW, segment};
+
+/// Most chunks of one packet's bytes: 128 KB.
+const PARTS: u32 = 8;
+/// Wakes user space. Not a bit of [`part`].
+pub const WAKE: u32 = 1 << 16;
+
+/// Loads the first bytes of a batch, from `offset` of the payload on, into the window; returns how
+/// many.
+#[unsafe(export_name = "zenoh_load_window")]
+#[inline(never)]
+pub extern "C" fn load_window(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+    let (Some(mut this), Some(buffer)) = (segment(slot), piece(slot)) else {
+        return 0;
+    };
+    this.end = 0;
+    let left = this.len.wrapping_sub(offset);
+    let wanted = if left > WINDOW { WINDOW } else { left };
+    if wanted == 0 || !load(skb, buffer, this.body.wrapping_add(offset), wanted) {
+        return 0;
+    }
+    this.window = offset;
+    this.end = wanted;
+    wanted
+}
+
+#[inline(always)]
+fn load(skb: *mut __sk_buff, buffer: &mut PieceBuffer, from: u32, len: u32) -> bool {
+    // SAFETY: the buffer has room for the longest piece.
+    let loaded = unsafe {
+        bpf_skb_load_bytes(
+            skb.cast(),
+            from,
+            buffer.bytes.as_mut_ptr().cast(),
+            bounded(len) as u32,
+        )
+    };
+    loaded == 0
+}
+
+/// Passes on the bytes from `offset` of the payload on, all of them; `flags` are those of the first
+/// chunk.
+#[unsafe(export_name = "zenoh_whole")]
+#[inline(never)]
+pub extern "C" fn whole(skb: *mut __sk_buff, slot: u32, offset: u32, len: u32, flags: u32) -> u32 {
+    let (mut done, mut number, mut flags) = (0, 0, flags);
+    while number < PARTS {
+        if done >= len {
+            return 1;
+        }
+        let left = len - done;
+        let now = if left > PIECE_BYTES {
+            PIECE_BYTES
+        } else {
+            left
+        };
+        head(
+            skb,
+            slot,
+            offset.wrapping_add(done),
+            u64::from(now) << 32 | u64::from(now),
+            flags,
+        );
+        flags &= WAKE;
+        done += PIECE_BYTES;
+        number += 1;
+    }
+    if done < len
+        && let Some(mut this) = segment(slot)
+    {
+        this.state.pending |= u32::from(part::LOST);
+    }
+    1
+}
+
+/// Passes on the bytes from `offset` of the payload on. `lengths` is the number of bytes, and in its
+/// upper half how many of them are copied.
+#[unsafe(export_name = "zenoh_head")]
+#[inline(never)]
+pub extern "C" fn head(
+    skb: *mut __sk_buff,
+    slot: u32,
+    offset: u32,
+    lengths: u64,
+    flags: u32,
+) -> u32 {
+    let (Some(mut this), Some(buffer)) = (segment(slot), piece(slot)) else {
+        return 0;
+    };
+    let (len, copied) = (lengths as u32, (lengths >> 32) as u32);
+    if PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) / 2 * 3 {
+        // The rest is for datagrams.
+        return lost(slot);
+    }
+    if copied != 0 && (offset != this.window || copied > this.end) {
+        this.end = 0;
+        if !load(skb, buffer, this.body.wrapping_add(offset), copied) {
+            return lost(slot);
+        }
+    }
+    let piece = &mut buffer.piece;
+    piece.time = this.now;
+    piece.socket = this.key.socket;
+    piece.source = this.source;
+    piece.destination = this.destination;
+    piece.source_port = this.source_port as u16;
+    piece.destination_port = this.destination_port as u16;
+    piece.interface = this.interface;
+    piece.datagram = this.sequence_number.wrapping_add(offset);
+    piece.datagram_len = len;
+    piece.offset = 0;
+    piece.len = copied;
+    let ipv6 = if this.source[2] == IPV4_MAPPED && this.source[0] | this.source[1] == 0 {
+        0
+    } else {
+        flag::IPV6
+    };
+    let outgoing = if this.key.outgoing == 0 {
+        0
+    } else {
+        flag::OUTGOING
+    };
+    piece.flags = flag::HOST | flag::STREAM | ipv6 | outgoing;
+    piece.chunk = (flags | this.state.pending) as u16;
+    let wake = if flags & WAKE != 0 || PIECES.query(AVAILABLE_DATA) > setting(&WAKE_PIECE_BYTES) {
+        FORCE_WAKEUP
+    } else {
+        NO_WAKEUP
+    };
+    let size = size_of::<Piece>() + if copied == 0 { 0 } else { bounded(copied) };
+    // SAFETY: the buffer is that long.
+    let bytes = unsafe { core::slice::from_raw_parts((&raw const *buffer).cast::<u8>(), size) };
+    let written = PIECES.output::<[u8]>(bytes, wake).is_ok();
+    buffer.piece.chunk = 0;
+    if !written {
+        return lost(slot);
+    }
+    count(slot, Counter::ZenohChunks, 1);
+    this.state.pending = 0;
+    this.state.reported = this.now;
+    1
+}
+
+#[inline(always)]
+fn lost(slot: u32) -> u32 {
+    count(slot, Counter::ZenohChunksLost, 1);
+    if let Some(mut this) = segment(slot) {
+        this.state.pending |= u32::from(part::LOST);
+    }
+    0
+}

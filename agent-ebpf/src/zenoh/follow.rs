@@ -1,0 +1,305 @@
+//! Follows one direction of a connection from batch to batch, and passes on what is needed.
+//!
+//! A segment that repeats earlier bytes is left out. Missing bytes do not matter within a batch
+//! of which only the head is needed: the next boundary is still known. Otherwise everything is
+//! passed on until a boundary is found again, and also the missing bytes when TCP repeats them. User
+//! space puts segments into their order and goes on by itself.
+
+use aya_ebpf::bindings::__sk_buff;
+use core::mem::swap;
+use ros2probe_wire::{filter::Counter, host::chunk as part};
+
+use crate::maps::{copy, count};
+
+use super::{
+    chunk::{self, WAKE},
+    message::{self, WHOLE},
+    search,
+    state::{CONNECTIONS, Current, Window, body, mode, segment as current},
+};
+
+/// Most batches of one packet that are read; of more, everything is passed on.
+const BATCHES: u32 = 64;
+/// Bytes passed on after a boundary was lost, until the connection is left alone.
+const GAP_BYTES: u32 = 16 << 20;
+/// At least one chunk of a direction in this time shows that its sender lives.
+const ALIVE_NANOSECONDS: u64 = 1_000_000_000;
+/// Bytes of a batch that is passed on for that reason only.
+const ALIVE_BYTES: u32 = 256;
+/// Bytes of the length before a batch.
+const PREFIX: u32 = 2;
+/// Marks a known first byte of a length.
+const SPLIT: u32 = 0x100;
+
+/// Handles a segment of a known direction.
+#[inline(always)]
+pub fn segment(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut this) = current(slot) else {
+        return 0;
+    };
+    let Some(state) = CONNECTIONS.get_ptr_mut(&this.key) else {
+        return 0;
+    };
+    // SAFETY: a map value pointer checked against null. Segments of one direction follow each other;
+    // runs that race on two CPUs lose a boundary at worst.
+    copy(unsafe { &*state }, &mut this.state);
+    if this.len != 0 {
+        take(skb, slot);
+    }
+    if this.state.mode == mode::GAP && this.state.gap_bytes > GAP_BYTES {
+        let _ = CONNECTIONS.remove(&this.key);
+        return 0;
+    }
+    if let Some(state) = CONNECTIONS.get_ptr_mut(&this.key) {
+        // SAFETY: as above.
+        copy(&this.state, unsafe { &mut *state });
+    }
+    0
+}
+
+#[unsafe(export_name = "zenoh_take")]
+#[inline(never)]
+extern "C" fn take(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut this) = current(slot) else {
+        return 0;
+    };
+    let behind = this.state.next.wrapping_sub(this.sequence_number);
+    if this.state.mode == mode::UNREADABLE {
+        return 0;
+    }
+    if this.state.mode == mode::FOLLOWED && behind as i32 > 0 {
+        if behind >= this.len {
+            let into = this.sequence_number.wrapping_sub(this.state.hole);
+            if into < this.state.hole_len {
+                chunk::whole(skb, slot, 0, this.len, 0);
+            }
+            return 0;
+        }
+        this.sequence_number = this.state.next;
+        this.body += behind;
+        this.len -= behind;
+    } else if this.state.mode == mode::FOLLOWED && behind != 0 {
+        let ahead = this.state.boundary.wrapping_sub(this.sequence_number);
+        if this.state.body == body::WHOLE || this.state.prefix != 0 || (ahead as i32) < 0 {
+            this.state.hole = this.state.next;
+            this.state.hole_len = 0_u32.wrapping_sub(behind);
+            lose(slot, this);
+        }
+    } else if this.state.mode == mode::GAP && (behind as i32) < 0 {
+        this.state.hole_len = this.sequence_number.wrapping_sub(this.state.hole);
+    }
+    let end = this.sequence_number.wrapping_add(this.len);
+    if this.state.mode == mode::GAP {
+        chunk::whole(skb, slot, 0, this.len, 0);
+        this.state.gap_bytes = this.state.gap_bytes.wrapping_add(this.len);
+        if end.wrapping_sub(this.state.next) as i32 > 0 {
+            this.state.next = end;
+        }
+        if search::judge(skb, slot, 1) != 0 {
+            this.state.mode = mode::FOLLOWED;
+            this.state.boundary = this.state.guess.boundary;
+            this.state.covered = end;
+            this.state.next = end;
+            this.state.body = body::WHOLE;
+            this.state.chain = 0;
+            this.state.prefix = 0;
+        }
+        return 0;
+    }
+    let left = this.state.boundary.wrapping_sub(this.sequence_number);
+    if this.state.prefix == 0 && left != 0 {
+        finish(skb, slot, left);
+    }
+    this.state.next = end;
+    let mut batches = 0;
+    while batches < BATCHES {
+        if batch(skb, slot) == 0 {
+            return 0;
+        }
+        batches += 1;
+    }
+    let offset = this.state.boundary.wrapping_sub(this.sequence_number);
+    if offset < this.len {
+        lose(slot, this);
+        let rest = this.len - offset;
+        chunk::whole(skb, slot, offset, rest, u32::from(part::BOUNDARY));
+    }
+    0
+}
+
+/// Passes on the rest of a batch that an earlier segment began; `left` bytes of it are missing.
+#[inline(always)]
+fn finish(skb: *mut __sk_buff, slot: u32, left: u32) {
+    let Some(mut this) = current(slot) else {
+        return;
+    };
+    let now = if left > this.len { this.len } else { left };
+    if this.state.body == body::WHOLE {
+        chunk::whole(skb, slot, 0, now, 0);
+    } else if this.state.body == body::HEAD && left <= this.len {
+        let covered = this.state.covered;
+        let rest = this.state.boundary.wrapping_sub(covered);
+        let offset = covered.wrapping_sub(this.sequence_number);
+        chunk::head(skb, slot, offset, u64::from(rest), 0);
+    } else {
+        return;
+    }
+    this.state.covered = this.sequence_number.wrapping_add(now);
+}
+
+#[inline(always)]
+fn lose(slot: u32, mut this: Current) {
+    count(slot, Counter::ZenohGaps, 1);
+    this.state.mode = mode::GAP;
+    this.state.gap_bytes = 0;
+    this.state.guess.is_open = 0;
+}
+
+/// Handles the next batch that begins in the segment; returns 0 if none does, or if it is not one.
+#[unsafe(export_name = "zenoh_batch")]
+#[inline(never)]
+extern "C" fn batch(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let offset = this.state.boundary.wrapping_sub(this.sequence_number);
+    if this.state.prefix != 0 {
+        return split(skb, slot);
+    }
+    if offset >= this.len {
+        return 0;
+    }
+    let read = chunk::load_window(skb, slot, offset);
+    let Some(low) = window.byte(0, read) else {
+        return unreadable(skb, slot, offset);
+    };
+    let Some(high) = window.byte(1, read) else {
+        let one = 1 << 32 | 1;
+        chunk::head(skb, slot, offset, one, u32::from(part::BOUNDARY));
+        this.state.prefix = SPLIT | low;
+        return 0;
+    };
+    let total = (low | high << 8) + PREFIX;
+    this.total = total;
+    if this.end > total {
+        this.end = total;
+    }
+    this.is_judged = 0;
+    if total == PREFIX {
+        // Sent in place of the rest of a message that was dropped.
+        this.wanted = 0;
+    } else {
+        if message::read(slot) == 0 {
+            return unreadable(skb, slot, offset);
+        }
+        count(slot, Counter::ZenohBatches, 1);
+    }
+    let left = this.len - offset;
+    let now = if total > left { left } else { total };
+    this.state.boundary = this.state.boundary.wrapping_add(total);
+    if this.wanted == 0 && this.now.wrapping_sub(this.state.reported) > ALIVE_NANOSECONDS {
+        this.wanted = ALIVE_BYTES;
+    }
+    let boundary = u32::from(part::BOUNDARY);
+    if this.wanted == WHOLE {
+        let wake = if this.wakes != 0 { WAKE } else { 0 };
+        this.state.body = body::WHOLE;
+        chunk::whole(skb, slot, offset, now, boundary | wake);
+    } else if this.wanted == 0 {
+        count(slot, Counter::ZenohSkipped, 1);
+        this.state.body = body::SKIPPED;
+        this.state.pending |= u32::from(part::SKIPPED);
+    } else {
+        let copied = if this.wanted > now { now } else { this.wanted };
+        this.state.body = body::HEAD;
+        let lengths = u64::from(copied) << 32 | u64::from(now);
+        chunk::head(skb, slot, offset, lengths, boundary);
+    }
+    this.state.covered = this.sequence_number.wrapping_add(offset + now);
+    1
+}
+
+/// Handles a batch of which the last segment had the first byte of the length.
+#[inline(always)]
+fn split(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (current(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let read = chunk::load_window(skb, slot, 0);
+    let Some(high) = window.byte(0, read) else {
+        return unreadable(skb, slot, 0);
+    };
+    let length = this.state.prefix & 0xff | high << 8;
+    this.state.prefix = 0;
+    if length != 0 {
+        count(slot, Counter::ZenohBatches, 1);
+    }
+    let now = if length + 1 > this.len {
+        this.len
+    } else {
+        length + 1
+    };
+    this.state.boundary = this.state.boundary.wrapping_add(length + PREFIX);
+    this.state.body = body::WHOLE;
+    chunk::whole(skb, slot, 0, now, 0);
+    this.state.covered = this.sequence_number.wrapping_add(now);
+    1
+}
+
+/// Passes on the rest of a segment in which no batch begins where one should.
+#[inline(always)]
+fn unreadable(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+    if let Some(this) = current(slot) {
+        lose(slot, this);
+        let rest = this.len.wrapping_sub(offset);
+        chunk::whole(skb, slot, offset, rest, 0);
+    }
+    0
+}
+
+/// Handles the end of a direction, and with `is_reset` of the other one, too.
+#[unsafe(export_name = "zenoh_end")]
+#[inline(never)]
+pub extern "C" fn end(skb: *mut __sk_buff, slot: u32, is_reset: u32) -> u32 {
+    let Some(mut this) = current(slot) else {
+        return 0;
+    };
+    let offset = this.len;
+    close(skb, slot, offset);
+    if is_reset == 0 {
+        return 0;
+    }
+    let this = &mut *this;
+    this.key.outgoing = u32::from(this.key.outgoing == 0);
+    this.key.ports = this.key.ports << 16 | this.key.ports >> 16;
+    swap(&mut this.source_port, &mut this.destination_port);
+    let mut word = 0;
+    while word < 4 {
+        let (one, other) = (this.source[word], this.destination[word]);
+        this.source[word] = other;
+        this.destination[word] = one;
+        word += 1;
+    }
+    if let Some(state) = CONNECTIONS.get_ptr_mut(&this.key) {
+        // SAFETY: a map value pointer checked against null.
+        this.sequence_number = unsafe { (*state).next };
+        close(skb, slot, 0);
+    }
+    0
+}
+
+#[unsafe(export_name = "zenoh_close")]
+#[inline(never)]
+extern "C" fn close(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+    let Some(mut this) = current(slot) else {
+        return 0;
+    };
+    let Some(state) = CONNECTIONS.get_ptr_mut(&this.key) else {
+        return 0;
+    };
+    // SAFETY: a map value pointer checked against null.
+    this.state.pending = unsafe { (*state).pending };
+    chunk::head(skb, slot, offset, 0, u32::from(part::END) | WAKE);
+    let _ = CONNECTIONS.remove(&this.key);
+    1
+}

@@ -1,0 +1,216 @@
+//! Reads the header of a batch: which bytes of it are needed, and whether it may be one at all.
+
+use super::{
+    push,
+    state::{WINDOW, Window, chain, segment},
+};
+
+/// Transport messages (`zenoh-protocol`, `transport/`).
+pub mod id {
+    pub const INIT: u32 = 1;
+    pub const KEEP_ALIVE: u32 = 4;
+    pub const FRAME: u32 = 5;
+    pub const FRAGMENT: u32 = 6;
+    pub const JOIN: u32 = 7;
+}
+
+/// Everything of a batch is needed.
+pub const WHOLE: u32 = u32::MAX;
+/// Bytes of a FRAGMENT that continues a message.
+const CONTINUATION: u32 = 16;
+/// Priority of data without another one, and of declarations.
+const DATA: u32 = 5;
+const CONTROL: u32 = 0;
+/// The least id of a network message.
+const LEAST_NETWORK: u32 = 0x19;
+/// Bytes of a length before a batch.
+const PREFIX: u32 = 2;
+/// Most bytes of a number.
+const NUMBER: u32 = 9;
+/// Most extensions of a message.
+const EXTENSIONS: u32 = 8;
+
+/// Reads the batch in the window: sets `wanted`, `lane` and `number`. Returns 1 if it may be a
+/// batch.
+#[unsafe(export_name = "zenoh_read")]
+#[inline(never)]
+pub extern "C" fn read(slot: u32) -> u32 {
+    u32::from(batch(slot).is_some())
+}
+
+#[inline(always)]
+fn batch(slot: u32) -> Option<()> {
+    let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
+        return None;
+    };
+    this.wanted = WHOLE;
+    this.lane = 0;
+    this.payload = 0;
+    this.attachment = 0;
+    this.priority = DATA;
+    this.is_first = 0;
+    this.is_shared = 0;
+    this.wakes = 0;
+    let Some(header) = window.byte(PREFIX, this.end) else {
+        // The segment ends before it.
+        return Some(());
+    };
+    let kind = header & 0x1f;
+    if kind > id::JOIN {
+        return None;
+    }
+    this.wakes = u32::from(kind != id::KEEP_ALIVE && kind < id::FRAME);
+    if kind != id::FRAME && kind != id::FRAGMENT {
+        return Some(());
+    }
+    this.at = PREFIX + 1;
+    if number(slot) == 0 {
+        return is_cut(slot, kind);
+    }
+    this.number = this.value;
+    if header & 0x80 != 0 && extensions(slot) == 0 {
+        return is_cut(slot, kind);
+    }
+    this.message = this.at;
+    this.lane = 1 << 16 | this.priority << 8 | header & 0x20;
+    let is_control = this.priority == CONTROL;
+    this.wakes = u32::from(is_control);
+    if this.is_judged != 0 {
+        return Some(());
+    }
+    let in_frame = kind == id::FRAME;
+    let is_first = in_frame || this.is_first != 0 || this.state.chain & chain::OPEN == 0;
+    if is_first && !in_frame {
+        this.state.chain = 0;
+    }
+    if is_first && !is_control {
+        let _ = push::read(slot, in_frame);
+    }
+    if in_frame {
+        return Some(());
+    }
+    if !is_first && this.state.chain & chain::WHOLE == 0 && !is_control {
+        this.wanted = match this.state.chain & chain::SKIPPED {
+            0 => CONTINUATION,
+            _ => 0,
+        };
+    }
+    this.state.chain = match header & 0x40 {
+        0 => 0,
+        _ => this.state.chain | chain::OPEN,
+    };
+    Some(())
+}
+
+/// Handles a header that cannot be read: it is cut by the end of the segment, or it is no header.
+#[inline(always)]
+fn is_cut(slot: u32, kind: u32) -> Option<()> {
+    let mut this = segment(slot)?;
+    if this.end == WINDOW || this.end == this.total {
+        return None;
+    }
+    if kind == id::FRAGMENT && this.state.chain & chain::OPEN == 0 {
+        // Whose sample it is, is not known: all of it is passed on.
+        this.state.chain = chain::OPEN | chain::WHOLE;
+    }
+    Some(())
+}
+
+/// Returns whether the batch in the window may be one of a connection of which nothing is known:
+/// stricter than [`read`], which it follows.
+#[inline(always)]
+pub fn is_plausible(slot: u32) -> bool {
+    let (Some(this), Some(window)) = (segment(slot), Window::of(slot)) else {
+        return false;
+    };
+    let Some(header) = window.byte(PREFIX, this.end) else {
+        return false;
+    };
+    if header & 0x1f == id::KEEP_ALIVE {
+        return header == id::KEEP_ALIVE && this.total == PREFIX + 1;
+    }
+    if this.lane == 0 {
+        return false;
+    }
+    if header & 0x1f == id::FRAGMENT {
+        return true;
+    }
+    let Some(next) = window.byte(this.message, this.end) else {
+        return false;
+    };
+    header & 0x40 == 0 && next & 0x1f >= LEAST_NETWORK
+}
+
+/// Reads a number of variable length at the reader's position into `value`, whose upper bits are
+/// cut off; returns 0 if it is not in the window.
+#[unsafe(export_name = "zenoh_number")]
+#[inline(never)]
+pub extern "C" fn number(slot: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let (mut value, mut shift, mut count) = (0_u32, 0_u32, 0);
+    while count < NUMBER {
+        let Some(next) = window.byte(this.at, this.end) else {
+            return 0;
+        };
+        this.at += 1;
+        count += 1;
+        if shift < 32 {
+            value |= (next & 0x7f) << shift;
+        }
+        shift += 7;
+        // The ninth byte has no mark.
+        if next & 0x80 == 0 || count == NUMBER {
+            this.value = value;
+            return 1;
+        }
+    }
+    0
+}
+
+/// Reads the extensions at the reader's position; returns 0 if they end behind the window or are
+/// malformed.
+#[unsafe(export_name = "zenoh_extensions")]
+#[inline(never)]
+pub extern "C" fn extensions(slot: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let mut count = 0;
+    while count < EXTENSIONS {
+        let Some(header) = window.byte(this.at, this.end) else {
+            return 0;
+        };
+        this.at += 1;
+        count += 1;
+        let encoding = header & 0x60;
+        if encoding == 0x60 {
+            return 0;
+        }
+        this.value = 0;
+        if encoding != 0 && number(slot) == 0 {
+            return 0;
+        }
+        match header & 0x7f {
+            0x31 => this.priority = this.value & 7,
+            0x02 => this.is_first = 1,
+            0x12 => this.is_shared = 1,
+            0x43 => {
+                this.attachment = this.at;
+                this.attachment_len = this.value;
+            }
+            _ => {}
+        }
+        if encoding == 0x40 {
+            if this.value > WINDOW {
+                return 0;
+            }
+            this.at += this.value;
+        }
+        if header & 0x80 == 0 {
+            return 1;
+        }
+    }
+    0
+}

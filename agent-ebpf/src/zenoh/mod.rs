@@ -1,0 +1,298 @@
+//! TCP connections of Zenoh: which bytes of them user space needs.
+//!
+//! At the sockets ([`socket`]) each direction of a connection is followed from batch to batch. Of a
+//! sample only the head is passed on, of declarations all. On interfaces ([`frame`]) whole frames
+//! are kept. Either way a connection is found by its first batch, or by batches that fit together
+//! ([`search`]). Of QUIC only the first packets are noticed ([`quic`]). Nothing of other connections
+//! is passed on, and few bytes of them are read.
+
+mod chunk;
+mod follow;
+mod message;
+mod push;
+mod search;
+mod state;
+
+use aya_ebpf::{
+    bindings::__sk_buff,
+    helpers::{bpf_ktime_get_ns, generated::bpf_get_socket_cookie},
+};
+use ros2probe_wire::{host::chunk as part, quic as initial};
+
+use crate::{
+    host::meet,
+    maps::{claim_incoming, claim_outgoing, release, scratch},
+    packet::{IPV4_MAPPED, hook, load},
+    settings::setting,
+};
+use state::{CONNECTIONS, Key, Segment, ZENOH_PORTS};
+
+/// Index of the loopback interface, in every network namespace (`LOOPBACK_IFINDEX` of Linux).
+const LOOPBACK: u32 = 1;
+const TCP: u32 = 6;
+/// Bytes of a UDP header.
+const UDP_HEADER: u32 = 8;
+const FIN: u32 = 1;
+const SYN: u32 = 2;
+const RST: u32 = 4;
+
+/// Header fields that are needed before a slot is claimed.
+struct Header {
+    source: [u32; 4],
+    destination: [u32; 4],
+    source_port: u32,
+    destination_port: u32,
+    sequence_number: u32,
+    flags: u32,
+    /// Offset of the payload in the socket buffer.
+    body: u32,
+    /// Length of the payload.
+    len: u32,
+}
+
+/// Handles one packet at a socket; `at` is one of [`hook`].
+// Inlined, as others here: at most eight functions may call one another.
+#[inline(always)]
+pub fn socket(skb: *mut __sk_buff, at: u32) -> Option<()> {
+    // SAFETY: the verifier rewrites reads of this field.
+    let interface = unsafe { (*skb).ifindex };
+    if at != hook::EGRESS && interface == LOOPBACK {
+        // TCP brings to the receiver what its sender sent, and that is seen there.
+        return None;
+    }
+    let header = header(skb, 0)?;
+    if header.flags & SYN != 0 || header.len == 0 && header.flags & (FIN | RST) == 0 {
+        return None;
+    }
+    let outgoing = u32::from(at == hook::EGRESS);
+    let key = Key {
+        // SAFETY: `skb` is the program's context.
+        socket: unsafe { bpf_get_socket_cookie(skb.cast()) },
+        ports: header.source_port << 16 | header.destination_port,
+        outgoing,
+    };
+    let is_noted = state::is_noted(key.socket);
+    let is_known = is_noted && CONNECTIONS.get_ptr_mut(&key).is_some();
+    if is_known {
+        state::note(key.socket);
+    } else if !search::may_be(skb, header.body, header.len, &key, is_noted) {
+        return None;
+    }
+    let slot = if outgoing == 0 {
+        claim_incoming()?
+    } else {
+        claim_outgoing()?
+    };
+    if let Some(mut segment) = state::segment(slot) {
+        fill(skb, &mut segment, &header, &key);
+        if is_known {
+            follow::segment(skb, slot);
+        } else if search::at_socket(skb, slot) != 0 {
+            // Once for a direction, so this costs nothing per segment.
+            meet(skb, key.socket, 1);
+            follow::segment(skb, slot);
+        }
+        if header.flags & (FIN | RST) != 0 {
+            follow::end(skb, slot, header.flags & RST);
+        }
+    }
+    release(slot);
+    Some(())
+}
+
+/// Handles one frame on an interface; returns 1 to keep it. `slot` is claimed.
+#[unsafe(export_name = "zenoh_frame")]
+#[inline(never)]
+pub extern "C" fn frame(skb: *mut __sk_buff, slot: u32, start: u32) -> u32 {
+    u32::from(on_interface(skb, slot, start).is_some())
+}
+
+#[inline(always)]
+fn on_interface(skb: *mut __sk_buff, slot: u32, start: u32) -> Option<()> {
+    let header = header(skb, start)?;
+    if header.len == 0 && header.flags & (SYN | FIN | RST) == 0 {
+        return None;
+    }
+    if is_port(header.source_port) || is_port(header.destination_port) {
+        return Some(());
+    }
+    // SAFETY: the verifier rewrites reads of this field.
+    let interface = unsafe { (*skb).ifindex };
+    let (one, other) = (&header.source, &header.destination);
+    let low = u64::from(one[3]) + u64::from(other[3]) + u64::from(one[1]) + u64::from(other[1]);
+    let high = u64::from(one[2]) + u64::from(other[2]) + u64::from(one[0]) + u64::from(other[0]);
+    let key = Key {
+        // The same for both directions. If it is another connection's, too, that one is kept.
+        socket: low.wrapping_mul(0x9e37_79b9_7f4a_7c15) ^ high << 20 ^ u64::from(interface),
+        ports: header.source_port << 16 | header.destination_port,
+        outgoing: 2,
+    };
+    let is_noted = state::is_noted(key.socket);
+    if is_noted && CONNECTIONS.get_ptr_mut(&key).is_some() {
+        state::note(key.socket);
+        return Some(());
+    }
+    if !search::may_be(skb, header.body, header.len, &key, is_noted) {
+        return None;
+    }
+    let mut segment = state::segment(slot)?;
+    fill(skb, &mut segment, &header, &key);
+    if search::on_interface(skb, slot) == 0 {
+        return None;
+    }
+    Some(())
+}
+
+/// Handles a UDP datagram that is not RTPS. On a port of Zenoh, a QUIC connection may begin with it:
+/// at a socket its head is passed on. Returns 1 to keep the frame, on an interface.
+#[unsafe(export_name = "zenoh_quic")]
+#[inline(never)]
+pub extern "C" fn quic(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut scratch) = scratch(slot) else {
+        return 0;
+    };
+    let packet = &scratch.get().packet;
+    let body = packet.body;
+    let Some(ports): Option<u32> = load(skb, body) else {
+        return 0;
+    };
+    let ports = u32::from_be(ports);
+    if !is_zenoh_port(ports) || packet.fragmented != 0 || packet.len < UDP_HEADER {
+        return 0;
+    }
+    let len = packet.len - UDP_HEADER;
+    let Some(head): Option<[u8; initial::HEAD]> = load(skb, body + UDP_HEADER) else {
+        return 0;
+    };
+    if !initial::is_initial(head, len) {
+        return 0;
+    }
+    if packet.host == 0 {
+        return 1;
+    }
+    if let Some(mut segment) = state::segment(slot) {
+        segment.key = Key {
+            // SAFETY: `skb` is the program's context.
+            socket: unsafe { bpf_get_socket_cookie(skb.cast()) },
+            ports,
+            outgoing: packet.outgoing,
+        };
+        segment.source = packet.source;
+        segment.destination = packet.destination;
+        segment.source_port = ports >> 16;
+        segment.destination_port = ports & 0xffff;
+        segment.interface = packet.interface;
+        segment.sequence_number = 0;
+        segment.body = body + UDP_HEADER;
+        segment.len = len;
+        segment.end = 0;
+        segment.state.pending = 0;
+        // SAFETY: no preconditions.
+        segment.now = unsafe { bpf_ktime_get_ns() };
+        let lengths = (initial::HEAD as u64) << 32 | u64::from(len);
+        chunk::head(skb, slot, 0, lengths, u32::from(part::QUIC) | chunk::WAKE);
+    }
+    0
+}
+
+/// Returns whether the configuration names one of two ports as one of Zenoh.
+#[inline(always)]
+pub fn is_zenoh_port(ports: u32) -> bool {
+    is_port(ports >> 16) || is_port(ports & 0xffff)
+}
+
+/// Returns whether the configuration names the port as one of Zenoh.
+#[inline(always)]
+fn is_port(port: u32) -> bool {
+    let ports = setting(&ZENOH_PORTS);
+    let port = port as u16;
+    ports[0] == port
+        || ports[1] == port
+        || ports[2] == port
+        || ports[3] == port
+        || ports[4] == port
+        || ports[5] == port
+        || ports[6] == port
+        || ports[7] == port
+}
+
+#[inline(always)]
+fn fill(skb: *mut __sk_buff, segment: &mut Segment, header: &Header, key: &Key) {
+    segment.key = *key;
+    segment.source = header.source;
+    segment.destination = header.destination;
+    segment.source_port = header.source_port;
+    segment.destination_port = header.destination_port;
+    segment.sequence_number = header.sequence_number;
+    segment.body = header.body;
+    segment.len = header.len;
+    // The window holds another packet's bytes.
+    segment.end = 0;
+    // SAFETY: the verifier rewrites reads of this field.
+    segment.interface = unsafe { (*skb).ifindex };
+    // SAFETY: no preconditions.
+    segment.now = unsafe { bpf_ktime_get_ns() };
+}
+
+/// Reads the headers; `None` if the packet is not a TCP segment in one piece. IPv6 extension headers
+/// are not read: no TCP stack sends them unasked.
+#[inline(always)]
+fn header(skb: *mut __sk_buff, start: u32) -> Option<Header> {
+    let first: [u32; 5] = load(skb, start)?;
+    let (body, total, source, destination) = match u32::from_be(first[0]) >> 28 {
+        4 => {
+            let lengths = u32::from_be(first[0]);
+            if u32::from_be(first[2]) >> 16 & 0xff != TCP || u32::from_be(first[1]) & 0x3fff != 0 {
+                return None;
+            }
+            let header = (lengths >> 24 & 0xf) * 4;
+            if header < 20 {
+                return None;
+            }
+            (
+                start + header,
+                lengths & 0xffff,
+                [0, 0, IPV4_MAPPED, first[3]],
+                [0, 0, IPV4_MAPPED, first[4]],
+            )
+        }
+        6 => {
+            if u32::from_be(first[1]) >> 8 & 0xff != TCP {
+                return None;
+            }
+            let rest: [u32; 5] = load(skb, start + 20)?;
+            let payload = u32::from_be(first[1]) >> 16;
+            (
+                start + 40,
+                if payload == 0 { 0 } else { payload + 40 },
+                [first[2], first[3], first[4], rest[0]],
+                [rest[1], rest[2], rest[3], rest[4]],
+            )
+        }
+        _ => return None,
+    };
+    let tcp: [u32; 4] = load(skb, body)?;
+    // A packet of more than 64 KB has no length in its header.
+    // SAFETY: the verifier rewrites reads of this field.
+    let end = start
+        + if total == 0 {
+            unsafe { (*skb).len }
+        } else {
+            total
+        };
+    let flags = u32::from_be(tcp[3]);
+    let body = body + (flags >> 28) * 4;
+    if flags >> 28 < 5 || end < body {
+        return None;
+    }
+    Some(Header {
+        source,
+        destination,
+        source_port: u32::from_be(tcp[0]) >> 16,
+        destination_port: u32::from_be(tcp[0]) & 0xffff,
+        sequence_number: u32::from_be(tcp[1]),
+        flags: flags >> 16 & 0x3f,
+        body,
+        len: end - body,
+    })
+}

@@ -1,0 +1,313 @@
+//! Finds connections of Zenoh: by their first batch, or by batches that fit together.
+//!
+//! A connection that is older than the agent is found where a packet begins with what may be a
+//! batch. From there on batches are read, in this packet and those that follow, until two of them
+//! continue the sequence numbers of their lane. All of this stays in the kernel.
+
+use aya_ebpf::bindings::__sk_buff;
+use ros2probe_wire::{filter::Counter, host::chunk as part};
+
+use crate::{
+    maps::{copy, count},
+    packet::load,
+};
+
+use super::{
+    chunk::{self, WAKE},
+    is_zenoh_port,
+    message::{self, id},
+    state::{CANDIDATES, CONNECTIONS, Current, Direction, Key, Window, body, mode, note, segment},
+};
+
+/// Batches that continue the numbers of their lane and make a boundary certain.
+const CERTAIN: u32 = 2;
+/// Most batches of one packet that are read for it.
+const BATCHES: u32 = 32;
+/// Version of the wire format.
+const VERSION: u32 = 9;
+/// Largest version that is another version of Zenoh rather than something else.
+const PLAUSIBLE_VERSION: u32 = 0x3f;
+/// A KEEP_ALIVE alone in its batch, which is alone in its packet.
+const KEEP_ALIVE: [u8; 3] = [1, 0, 4];
+/// A record of TLS with a handshake, whose version begins with 3.
+const TLS: u32 = 0x0316;
+/// Bytes of TLS that are passed on, once.
+const TLS_BYTES: u32 = 16;
+
+/// What a packet begins with.
+mod first {
+    pub const OTHER: u32 = 0;
+    pub const INIT: u32 = 1;
+    pub const OTHER_VERSION: u32 = 2;
+    pub const KEEP_ALIVE: u32 = 3;
+    pub const TLS: u32 = 4;
+    pub const BATCH: u32 = 5;
+}
+
+/// Returns whether the payload may belong to a connection of Zenoh that is not known yet.
+#[inline(always)]
+pub fn may_be(skb: *mut __sk_buff, body: u32, len: u32, key: &Key, is_noted: bool) -> bool {
+    len != 0
+        && (begins_with(skb, body, len, key.ports) != first::OTHER
+            || is_noted && CANDIDATES.get_ptr_mut(key).is_some())
+}
+
+/// Returns what a payload begins with, one of [`first`].
+#[inline(always)]
+fn begins_with(skb: *mut __sk_buff, at: u32, len: u32, ports: u32) -> u32 {
+    if len < 8 {
+        let is_alive = len == 3 && load::<[u8; 3]>(skb, at) == Some(KEEP_ALIVE);
+        return if is_alive {
+            first::KEEP_ALIVE
+        } else {
+            first::OTHER
+        };
+    }
+    let Some([one, two]): Option<[u32; 2]> = load(skb, at) else {
+        return first::OTHER;
+    };
+    let (one, two) = (u32::from_le(one), u32::from_le(two));
+    let (length, header, next) = (one & 0xffff, one >> 16 & 0xff, one >> 24);
+    if length == TLS && header <= 4 {
+        // The handshake's first message: of the client or the server.
+        let kind = two >> 8 & 0xff;
+        return if (kind == 1 || kind == 2) && is_zenoh_port(ports) {
+            first::TLS
+        } else {
+            first::OTHER
+        };
+    }
+    if length == 0 {
+        return first::OTHER;
+    }
+    match header & 0x1f {
+        id::INIT if length + 2 <= len && next == VERSION && two & 0x0c == 0 && two & 3 != 3 => {
+            first::INIT
+        }
+        id::INIT if length + 2 <= len && next <= PLAUSIBLE_VERSION && is_zenoh_port(ports) => {
+            first::OTHER_VERSION
+        }
+        id::FRAME if header & 0x40 == 0 => first::BATCH,
+        id::FRAGMENT => first::BATCH,
+        _ => first::OTHER,
+    }
+}
+
+/// Looks for a boundary in a direction that is not known; returns 1 if it is known now, and the
+/// segment is to be followed.
+#[unsafe(export_name = "zenoh_at_socket")]
+#[inline(never)]
+pub extern "C" fn at_socket(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    let begins = begins_with(skb, this.body, this.len, this.key.ports);
+    match begins {
+        first::INIT => {
+            begin(slot, u32::from(part::SYN));
+            know(slot, this, mode::FOLLOWED)
+        }
+        first::KEEP_ALIVE => {
+            begin(slot, u32::from(part::LOST));
+            know(slot, this, mode::FOLLOWED)
+        }
+        first::OTHER_VERSION | first::TLS => {
+            begin(slot, u32::from(part::SYN));
+            let all = if begins == first::TLS {
+                TLS_BYTES
+            } else {
+                this.len
+            };
+            let copied = if all > this.len { this.len } else { all };
+            let copied = if copied > super::state::WINDOW {
+                super::state::WINDOW
+            } else {
+                copied
+            };
+            let lengths = u64::from(copied) << 32 | u64::from(this.len);
+            chunk::head(skb, slot, 0, lengths, WAKE);
+            know(slot, this, mode::UNREADABLE);
+            0
+        }
+        _ => {
+            if guess(skb, slot) == 0 {
+                return 0;
+            }
+            this.state.boundary = this.state.guess.boundary;
+            this.state.covered = this.state.boundary;
+            know(slot, this, mode::FOLLOWED)
+        }
+    }
+}
+
+/// Looks as [`at_socket`] does, on an interface; returns 1 if the connection is of Zenoh.
+#[unsafe(export_name = "zenoh_on_interface")]
+#[inline(never)]
+pub extern "C" fn on_interface(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    let begins = begins_with(skb, this.body, this.len, this.key.ports);
+    if begins != first::INIT && begins != first::KEEP_ALIVE && guess(skb, slot) == 0 {
+        return 0;
+    }
+    begin(slot, 0);
+    know(slot, this, mode::UNREADABLE);
+    this.key.ports = this.key.ports << 16 | this.key.ports >> 16;
+    know(slot, this, mode::UNREADABLE);
+    1
+}
+
+/// Starts a direction with the current segment.
+#[unsafe(export_name = "zenoh_begin")]
+#[inline(never)]
+extern "C" fn begin(slot: u32, pending: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    this.state.reported = 0;
+    this.state.next = this.sequence_number;
+    this.state.boundary = this.sequence_number;
+    this.state.covered = this.sequence_number;
+    this.state.body = body::SKIPPED;
+    this.state.chain = 0;
+    this.state.prefix = 0;
+    this.state.pending = pending;
+    this.state.gap_bytes = 0;
+    this.state.unused = 0;
+    close(slot)
+}
+
+/// Forgets what is guessed of the direction.
+#[unsafe(export_name = "zenoh_forget")]
+#[inline(never)]
+extern "C" fn close(slot: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    let number = this.sequence_number;
+    let guess = &mut this.state.guess;
+    guess.boundary = number;
+    guess.next = number;
+    guess.proofs = 0;
+    guess.is_open = 0;
+    guess.lanes[0] = 0;
+    guess.lanes[1] = 0;
+    guess.expected[0] = 0;
+    guess.expected[1] = 0;
+    0
+}
+
+#[inline(always)]
+fn know(slot: u32, mut this: Current, mode: u32) -> u32 {
+    this.state.mode = mode;
+    count(slot, Counter::ZenohConnections, 1);
+    note(this.key.socket);
+    u32::from(CONNECTIONS.insert(&this.key, &this.state, 0).is_ok())
+}
+
+/// Continues what is guessed of the direction, or begins a guess; returns 1 once it is certain.
+#[inline(always)]
+fn guess(skb: *mut __sk_buff, slot: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    let known = CANDIDATES.get_ptr_mut(&this.key);
+    begin(slot, u32::from(part::LOST));
+    if let Some(known) = known {
+        // SAFETY: a map value pointer checked against null.
+        let known: &Direction = unsafe { &*known };
+        copy(&known.guess, &mut this.state.guess);
+    }
+    let is_certain = judge(skb, slot, 0);
+    if is_certain != 0 || this.state.guess.is_open == 0 {
+        if known.is_some() {
+            let _ = CANDIDATES.remove(&this.key);
+        }
+        return is_certain;
+    }
+    if known.is_none() {
+        count(slot, Counter::ZenohCandidates, 1);
+    }
+    note(this.key.socket);
+    let _ = CANDIDATES.insert(&this.key, &this.state, 0);
+    0
+}
+
+/// Reads the batches of the segment as far as they fit those before. Returns 1 once it is certain
+/// that they are batches: at once, or with `to_end` if all up to the end of the segment are.
+#[unsafe(export_name = "zenoh_judge")]
+#[inline(never)]
+pub extern "C" fn judge(skb: *mut __sk_buff, slot: u32, to_end: u32) -> u32 {
+    let Some(mut this) = segment(slot) else {
+        return 0;
+    };
+    if this.state.guess.is_open == 0 || this.state.guess.next != this.sequence_number {
+        close(slot);
+        this.state.guess.is_open = 1;
+    }
+    let mut batches = 0;
+    while batches < BATCHES {
+        let offset = this.state.guess.boundary.wrapping_sub(this.sequence_number);
+        if offset >= this.len {
+            this.state.guess.next = this.sequence_number.wrapping_add(this.len);
+            return u32::from(this.state.guess.proofs >= CERTAIN);
+        }
+        if fits(skb, slot, offset) == 0 {
+            break;
+        }
+        if to_end == 0 && this.state.guess.proofs >= CERTAIN {
+            return 1;
+        }
+        this.state.guess.boundary = this.state.guess.boundary.wrapping_add(this.total);
+        batches += 1;
+    }
+    this.state.guess.is_open = 0;
+    0
+}
+
+/// Returns 1 if a batch at this offset fits those before.
+#[unsafe(export_name = "zenoh_fits")]
+#[inline(never)]
+extern "C" fn fits(skb: *mut __sk_buff, slot: u32, offset: u32) -> u32 {
+    let (Some(mut this), Some(window)) = (segment(slot), Window::of(slot)) else {
+        return 0;
+    };
+    let read = chunk::load_window(skb, slot, offset);
+    let (Some(low), Some(high)) = (window.byte(0, read), window.byte(1, read)) else {
+        return 0;
+    };
+    this.total = (low | high << 8) + 2;
+    if this.end > this.total {
+        this.end = this.total;
+    }
+    this.is_judged = 1;
+    if this.total == 2 || message::read(slot) == 0 || !message::is_plausible(slot) {
+        return 0;
+    }
+    let (lane, number) = (this.lane, this.number);
+    let guess = &mut this.state.guess;
+    if lane == 0 {
+        guess.proofs += 1;
+        return 1;
+    }
+    let index = if guess.lanes[0] == 0 || guess.lanes[0] == lane {
+        0
+    } else {
+        1
+    };
+    if guess.lanes[index] == 0 {
+        guess.lanes[index] = lane;
+    } else if guess.lanes[index] != lane {
+        return 1;
+    } else {
+        // One number is left out behind the FRAGMENTs of a message.
+        let ahead = number.wrapping_sub(guess.expected[index]);
+        if ahead > 1 {
+            return 0;
+        }
+        guess.proofs += 1;
+    }
+    guess.expected[index] = number.wrapping_add(1);
+    1
+}

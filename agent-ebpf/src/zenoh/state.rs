@@ -1,0 +1,274 @@
+//! Maps of the connections of Zenoh, and the working memory of a run.
+
+use core::ops::{Deref, DerefMut};
+
+use aya_ebpf::{
+    helpers::generated::bpf_jiffies64,
+    macros::map,
+    maps::{Array, LruHashMap, PerCpuArray},
+};
+use ros2probe_wire::filter::{CANDIDATE_CAPACITY, CONNECTION_CAPACITY, PORT_CAPACITY};
+
+use crate::{
+    instructions::opaque,
+    maps::{SLOTS, Shared, piece},
+};
+
+/// Bytes of a batch that are read at most: they hold all headers of a sample, and a power of two.
+pub const WINDOW: u32 = 512;
+
+/// TCP ports of Zenoh; 0 = unused. Set by the loader.
+#[unsafe(no_mangle)]
+pub static ZENOH_PORTS: [u16; PORT_CAPACITY] = [7447, 0, 0, 0, 0, 0, 0, 0];
+
+/// Directions of connections of Zenoh.
+#[map]
+pub static CONNECTIONS: LruHashMap<Key, Direction> =
+    LruHashMap::with_max_entries(CONNECTION_CAPACITY, 0);
+/// Directions of other connections that may be of Zenoh.
+#[map]
+pub static CANDIDATES: LruHashMap<Key, Direction> =
+    LruHashMap::with_max_entries(CANDIDATE_CAPACITY, 0);
+/// When a socket was last in one of the tables, by hash of its cookie: most are in none, and this is
+/// faster to look up.
+#[map]
+static NOTED: Array<Shared<u32>> = Array::with_max_entries(NOTED_ENTRIES, 0);
+/// A power of two.
+const NOTED_ENTRIES: u32 = 16_384;
+/// Jiffies, of which a second has 100 to 1000: longer than the pause between two KEEP_ALIVEs.
+const NOTED_JIFFIES: u32 = 600_000;
+/// The current segment, by slot.
+#[map]
+static SEGMENT: PerCpuArray<Segment> = PerCpuArray::with_max_entries(SLOTS, 0);
+
+/// How a direction is read.
+pub mod mode {
+    /// The boundaries of batches are known.
+    pub const FOLLOWED: u32 = 0;
+    /// A boundary was lost: all bytes are passed on until it is found again.
+    pub const GAP: u32 = 1;
+    /// Nothing of it can be read.
+    pub const UNREADABLE: u32 = 2;
+}
+
+/// What is passed on of a batch.
+pub mod body {
+    /// The beginning only.
+    pub const HEAD: u32 = 0;
+    /// Everything.
+    pub const WHOLE: u32 = 1;
+    /// No byte.
+    pub const SKIPPED: u32 = 2;
+}
+
+/// Bits of [`Direction::chain`].
+pub mod chain {
+    /// The last FRAGMENT has a successor.
+    pub const OPEN: u32 = 1;
+    /// All fragments of the message are passed on whole.
+    pub const WHOLE: u32 = 2;
+    /// None of them is passed on.
+    pub const SKIPPED: u32 = 4;
+}
+
+/// Identifies a direction of a connection at a socket.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct Key {
+    /// Cookie of the socket; on an interface a hash of the addresses.
+    pub socket: u64,
+    /// Source port and destination port.
+    pub ports: u32,
+    /// Whether the socket sends it; 2 on an interface.
+    pub outgoing: u32,
+}
+
+/// Numbers of up to two lanes of a direction that may be of Zenoh.
+// Aligned, so that it is copied in few steps: the stack is small.
+#[repr(C, align(8))]
+#[derive(Clone, Copy)]
+pub struct Guess {
+    /// Sequence number of the next batch.
+    pub boundary: u32,
+    /// Sequence number of the next byte.
+    pub next: u32,
+    /// Batches that continued the numbers of their lane.
+    pub proofs: u32,
+    /// Whether the other fields hold anything.
+    pub is_open: u32,
+    pub lanes: [u32; 2],
+    pub expected: [u32; 2],
+}
+
+/// State of one direction.
+#[repr(C)]
+#[derive(Clone, Copy)]
+pub struct Direction {
+    /// When a chunk was last written.
+    pub reported: u64,
+    /// One of [`mode`].
+    pub mode: u32,
+    /// Sequence number of the next byte.
+    pub next: u32,
+    /// Sequence number of the next batch.
+    pub boundary: u32,
+    /// Sequence number behind the last byte that a chunk covers.
+    pub covered: u32,
+    /// What is passed on of the current batch, one of [`body`].
+    pub body: u32,
+    /// Bits of [`chain`].
+    pub chain: u32,
+    /// The first byte of a length, with bit 8 set, if the last segment ended behind it.
+    pub prefix: u32,
+    /// Flags of the next chunk.
+    pub pending: u32,
+    /// Bytes passed on since a boundary was lost.
+    pub gap_bytes: u32,
+    /// Sequence number of the first of the bytes that were missing then.
+    pub hole: u32,
+    /// Number of the bytes that were missing then, which TCP may repeat.
+    pub hole_len: u32,
+    pub unused: u32,
+    pub guess: Guess,
+}
+
+/// The current TCP segment, and what is read of its current batch.
+#[repr(C)]
+pub struct Segment {
+    pub key: Key,
+    pub state: Direction,
+    pub source: [u32; 4],
+    pub destination: [u32; 4],
+    pub now: u64,
+    pub source_port: u32,
+    pub destination_port: u32,
+    pub interface: u32,
+    /// Sequence number of the first byte.
+    pub sequence_number: u32,
+    /// Offset of the payload in the socket buffer.
+    pub body: u32,
+    /// Length of the payload.
+    pub len: u32,
+    /// Position of the reader in the window.
+    pub at: u32,
+    /// Bytes in the window.
+    pub end: u32,
+    /// Offset in the payload of the window's first byte.
+    pub window: u32,
+    /// The number that was read last.
+    pub value: u32,
+    /// Position behind the header of a FRAME or FRAGMENT.
+    pub message: u32,
+    /// What extensions say.
+    pub priority: u32,
+    pub is_first: u32,
+    pub is_shared: u32,
+    /// Whether the message is a sample, read or not.
+    pub is_sample: u32,
+    /// Offset of the attachment in the window; 0 = none.
+    pub attachment: u32,
+    pub attachment_len: u32,
+    /// Offset of the sample's payload in the window; 0 = it is not a sample, or not understood.
+    pub payload: u32,
+    /// Length of that payload.
+    pub payload_len: u32,
+    /// Length of the current batch with its prefix.
+    pub total: u32,
+    /// Whether the batch is only judged, so that its sample does not matter.
+    pub is_judged: u32,
+    /// Whether user space should read the batch soon.
+    pub wakes: u32,
+    /// Bytes of the batch to be passed on, or `u32::MAX`: all.
+    pub wanted: u32,
+    /// Key of the batch's lane; 0 = the batch is not one of a lane.
+    pub lane: u32,
+    /// Sequence number in the lane.
+    pub number: u32,
+}
+
+/// The working memory of a run. References to it last for one access: functions that are called in
+/// between look it up themselves.
+#[derive(Clone, Copy)]
+pub struct Current(*mut Segment);
+
+impl Deref for Current {
+    type Target = Segment;
+
+    #[inline(always)]
+    fn deref(&self) -> &Segment {
+        // SAFETY: a map value pointer checked against null; the run that has claimed the slot uses it
+        // alone.
+        unsafe { &*self.0 }
+    }
+}
+
+impl DerefMut for Current {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut Segment {
+        // SAFETY: as above.
+        unsafe { &mut *self.0 }
+    }
+}
+
+/// Returns whether a socket may be in one of the tables.
+#[inline(always)]
+pub fn is_noted(socket: u64) -> bool {
+    let Some(at) = NOTED.get(noted_index(socket)) else {
+        return false;
+    };
+    // SAFETY: no preconditions.
+    let now = unsafe { bpf_jiffies64() } as u32 | 1;
+    at.get() != 0 && now.wrapping_sub(at.get()) < NOTED_JIFFIES
+}
+
+/// Notes that a socket is in one of the tables.
+#[inline(always)]
+pub fn note(socket: u64) {
+    if let Some(at) = NOTED.get(noted_index(socket)) {
+        // SAFETY: no preconditions.
+        at.set(unsafe { bpf_jiffies64() } as u32 | 1);
+    }
+}
+
+#[inline(always)]
+fn noted_index(socket: u64) -> u32 {
+    (socket ^ socket >> 14 ^ socket >> 28) as u32 & (NOTED_ENTRIES - 1)
+}
+
+/// Returns the working memory of a slot.
+#[inline(always)]
+pub fn segment(slot: u32) -> Option<Current> {
+    SEGMENT.get_ptr_mut(slot).map(Current)
+}
+
+/// The first bytes of the current batch, in a piece's buffer.
+#[derive(Clone, Copy)]
+pub struct Window(*const u8);
+
+impl Window {
+    /// Returns the window of a slot.
+    #[inline(always)]
+    pub fn of(slot: u32) -> Option<Self> {
+        piece(slot).map(|buffer| Self(buffer.bytes.as_ptr()))
+    }
+
+    /// Returns the byte at `at`; `None` at `end` and behind it.
+    #[inline(always)]
+    pub fn byte(self, at: u32, end: u32) -> Option<u32> {
+        if at >= end || at >= WINDOW {
+            return None;
+        }
+        let at = opaque(at) as usize & (WINDOW as usize - 1);
+        // SAFETY: the buffer is longer than the window.
+        Some(u32::from(unsafe { *self.0.add(at) }))
+    }
+
+    /// Returns four words from `at` on.
+    #[inline(always)]
+    pub fn words(self, at: u32) -> [u32; 4] {
+        let at = opaque(at) as usize & (WINDOW as usize - 1);
+        // SAFETY: the buffer is longer than the window and these words; this machine reads words at
+        // any address.
+        unsafe { *self.0.add(at).cast() }
+    }
+}

@@ -1,0 +1,351 @@
+//! `/inside`: what processes show from inside, and what other answers contain of it.
+
+use std::borrow::Cow;
+
+use serde::{Deserialize, Serialize};
+
+/// Facts from inside processes.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Inside<'a> {
+    /// Unix time of the state that this answer describes.
+    pub timestamp_seconds: f64,
+    /// Mode of the source: `off`, `topics` or `full`.
+    pub mode: Cow<'a, str>,
+    /// Why the source shows nothing although it is switched on; null if it works, or is `off`.
+    pub reason: Option<Cow<'a, str>>,
+    /// Observed libraries.
+    pub libraries: Vec<Library<'a>>,
+    /// Counters of the source, by name.
+    pub counters: Vec<Counter<'a>>,
+    /// Observed processes.
+    pub processes: Vec<Process<'a>>,
+    /// Publishers.
+    pub publishers: Vec<Publisher<'a>>,
+    /// Subscriptions that take from the middleware.
+    pub subscriptions: Vec<Subscription<'a>>,
+    /// Buffers of subscriptions within a process, in Iron and later.
+    pub buffers: Vec<Buffer<'a>>,
+    /// Callbacks, in the mode `full`.
+    pub callbacks: Vec<Callback<'a>>,
+    /// Last known lifecycle state of each managed node.
+    pub lifecycle_states: Vec<LifecycleState<'a>>,
+}
+
+/// An observed library.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Library<'a> {
+    /// Its path, as its processes see it.
+    pub path: Cow<'a, str>,
+    /// Number of processes that use it.
+    pub processes: u64,
+    /// Why its calls are not observed; null if they are.
+    pub refused: Option<Cow<'a, str>>,
+}
+
+/// A counter of the source.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Counter<'a> {
+    /// Its name.
+    pub name: Cow<'a, str>,
+    /// Its value since the agent's start.
+    pub count: u64,
+}
+
+/// An observed process.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Process<'a> {
+    /// Process id, as this host's root sees it.
+    pub process_id: u32,
+    /// Name of the process.
+    pub process: Option<Cow<'a, str>>,
+    /// Domain id.
+    pub domain_id: u32,
+    /// Its nodes, as far as they are known.
+    pub nodes: Vec<Cow<'a, str>>,
+    /// CPU time per second over the last window; 1 is one CPU.
+    pub cpu_ratio: Option<f64>,
+    /// Observed calls per second over the last window.
+    pub calls_per_second: Option<f64>,
+    /// Observed calls.
+    pub calls: u64,
+    /// Calls that were not counted because of too many publishers, subscriptions and callbacks.
+    pub refused_calls: u64,
+    /// Its calls exceed the budget, and the agent no longer counts them.
+    pub suspended: bool,
+    /// Its library reports every step of messages within the process (Iron and later).
+    pub shows_intra_process: bool,
+}
+
+/// Process and node of a publisher, subscription, buffer or callback.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Owner<'a> {
+    /// Process id.
+    pub process_id: u32,
+    /// Address in the process; identifies the entity as long as the process runs.
+    #[cfg_attr(feature = "openapi", schema(example = "0x5581c0de0010"))]
+    pub handle: Cow<'a, str>,
+    /// Domain id.
+    pub domain_id: u32,
+    /// Node; null when unknown.
+    pub node: Option<Cow<'a, str>>,
+}
+
+/// Durations of the last 5 to 10 s. Percentiles are estimated from a histogram.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Durations {
+    /// Number of values.
+    pub count: u64,
+    /// Median.
+    pub p50_seconds: f64,
+    /// 99th percentile.
+    pub p99_seconds: f64,
+    /// Largest value; that of its bucket if an earlier one was larger.
+    pub maximum_seconds: f64,
+}
+
+/// A publisher.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+#[expect(
+    missing_docs,
+    reason = "the document describes the owner where it is declared"
+)]
+pub struct Publisher<'a> {
+    #[serde(flatten)]
+    pub owner: Owner<'a>,
+    /// ROS name of the topic.
+    pub topic: Cow<'a, str>,
+    /// Identifier of the middleware.
+    #[cfg_attr(feature = "openapi", schema(example = "rmw_fastrtps_cpp"))]
+    pub middleware: Option<Cow<'a, str>>,
+    /// Messages published.
+    pub published_messages: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process_messages: u64,
+    /// Publications per second over the last window.
+    pub rate_hertz: Option<f64>,
+    /// Unix time of the last publication.
+    pub last_message_timestamp_seconds: f64,
+    /// Time between publications; null without any.
+    pub interval: Option<Durations>,
+}
+
+/// A subscription.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+#[expect(
+    missing_docs,
+    reason = "the document describes the owner where it is declared"
+)]
+pub struct Subscription<'a> {
+    #[serde(flatten)]
+    pub owner: Owner<'a>,
+    /// ROS name of the topic.
+    pub topic: Cow<'a, str>,
+    /// Identifier of the middleware.
+    pub middleware: Option<Cow<'a, str>>,
+    /// Messages taken from the middleware.
+    pub taken_messages: u64,
+    /// Attempts that returned no message.
+    pub failed_takes: u64,
+    /// Messages taken per second over the last window.
+    pub rate_hertz: Option<f64>,
+    /// Unix time of the last message.
+    pub last_message_timestamp_seconds: f64,
+    /// Time from the source timestamp to the take; null without any.
+    pub latency: Option<Durations>,
+}
+
+/// The buffer of a subscription within a process.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+#[expect(
+    missing_docs,
+    reason = "the document describes the owner where it is declared"
+)]
+pub struct Buffer<'a> {
+    #[serde(flatten)]
+    pub owner: Owner<'a>,
+    /// ROS name of the topic; null until a publication shows it.
+    pub topic: Option<Cow<'a, str>>,
+    /// Messages put into the buffer.
+    pub enqueued_messages: u64,
+    /// Messages overwritten before they were taken.
+    pub overwritten_messages: u64,
+    /// Messages taken.
+    pub dequeued_messages: u64,
+    /// Share of the messages of the last window that were overwritten.
+    pub overwritten_ratio: Option<f64>,
+    /// Messages in the buffer after the last entry.
+    pub depth: u32,
+    /// The largest of these.
+    pub maximum_depth: u32,
+    /// Capacity, if the process created the buffer while it was observed.
+    pub capacity: Option<u32>,
+    /// Messages put into the buffer per second over the last window.
+    pub rate_hertz: Option<f64>,
+    /// Unix time of the last entry.
+    pub last_message_timestamp_seconds: f64,
+    /// Time that messages spent in the buffer; null without any.
+    pub waiting: Option<Durations>,
+}
+
+/// What triggers a callback.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct Trigger<'a> {
+    /// `subscription`, `intra_process`, `timer` or `service`.
+    pub kind: Cow<'a, str>,
+    /// Topic or service; null when unknown, and for timers.
+    pub name: Option<Cow<'a, str>>,
+    /// Period of the timer, if known.
+    pub period_seconds: Option<f64>,
+}
+
+/// A callback.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+#[expect(
+    missing_docs,
+    reason = "the document describes the owner where it is declared"
+)]
+pub struct Callback<'a> {
+    #[serde(flatten)]
+    pub owner: Owner<'a>,
+    /// What triggers it.
+    pub trigger: Trigger<'a>,
+    /// Id of the thread of its last call.
+    pub thread_id: u32,
+    /// Completed calls.
+    pub calls: u64,
+    /// Periods in which a timer was not called.
+    pub skipped_periods: u64,
+    /// Calls per second over the last window.
+    pub rate_hertz: Option<f64>,
+    /// Share of the last window that its calls took.
+    pub busy_ratio: Option<f64>,
+    /// Unix time at which the last call ended.
+    pub last_call_timestamp_seconds: f64,
+    /// Duration of its calls; null without any.
+    pub duration: Option<Durations>,
+    /// Time from being ready to the start; null without any.
+    pub wait: Option<Durations>,
+}
+
+/// The last known lifecycle state of a managed node.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct LifecycleState<'a> {
+    /// Process id.
+    pub process_id: u32,
+    /// Domain id.
+    pub domain_id: u32,
+    /// Node; null when unknown.
+    pub node: Option<Cow<'a, str>>,
+    /// Label of the state.
+    #[cfg_attr(feature = "openapi", schema(example = "active"))]
+    pub state: Cow<'a, str>,
+    /// Label of the state before.
+    pub previous_state: Cow<'a, str>,
+    /// Unix time of the transition.
+    pub timestamp_seconds: f64,
+}
+
+/// What observed processes show of a topic. Counts cover all processes since the agent's start.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct TopicInside<'a> {
+    /// Messages published. In Humble, messages within a process count by their receptions.
+    pub published_messages: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process_messages: u64,
+    /// Messages taken from the middleware, by all subscriptions.
+    pub taken_messages: u64,
+    /// Attempts to take that returned no message.
+    pub failed_takes: u64,
+    /// Messages put into buffers within a process.
+    pub enqueued_messages: u64,
+    /// Messages among them overwritten before they were taken.
+    pub overwritten_messages: u64,
+    /// Messages taken from these buffers.
+    pub dequeued_messages: u64,
+    /// Calls of callbacks for messages of the same process.
+    pub intra_process_receptions: u64,
+    /// Messages per second over the last window.
+    pub rate_hertz: f64,
+    /// Unix time of the last message.
+    pub last_message_timestamp_seconds: Option<f64>,
+    /// Publishers in observed processes.
+    pub observed_publishers: usize,
+    /// Subscriptions in observed processes.
+    pub observed_subscriptions: usize,
+    /// Publishers; only in the answer about one topic.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub publishers: Vec<Publisher<'a>>,
+    /// Subscriptions; only in the answer about one topic.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub subscriptions: Vec<Subscription<'a>>,
+    /// Buffers; only in the answer about one topic.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub buffers: Vec<Buffer<'a>>,
+    /// Callbacks; only in the answer about one topic.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub callbacks: Vec<Callback<'a>>,
+}
+
+/// What observed processes show of a node.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+pub struct NodeInside<'a> {
+    /// Share of the last window that calls of its callbacks took; above 1 with several threads.
+    pub busy_ratio: Option<f64>,
+    /// Last known lifecycle state; null for an ordinary node, and before the first transition.
+    pub lifecycle_state: Option<Cow<'a, str>>,
+    /// Publishers.
+    pub publishers: Vec<Publisher<'a>>,
+    /// Subscriptions.
+    pub subscriptions: Vec<Subscription<'a>>,
+    /// Buffers.
+    pub buffers: Vec<Buffer<'a>>,
+    /// Callbacks.
+    pub callbacks: Vec<Callback<'a>>,
+}
+
+impl Trigger<'_> {
+    /// Describes the trigger in a few words: `/scan`, `timer 50 ms`, `service /reset`.
+    #[must_use]
+    pub fn words(&self) -> String {
+        match (
+            self.kind.as_ref(),
+            self.name.as_deref(),
+            self.period_seconds,
+        ) {
+            ("timer", _, Some(period)) => format!("timer {} ms", period * 1e3),
+            ("timer", _, None) => "timer".to_owned(),
+            ("service", Some(name), _) => format!("service {name}"),
+            ("service", None, _) => "service".to_owned(),
+            (_, Some(name), _) => name.to_owned(),
+            (kind, None, _) => kind.to_owned(),
+        }
+    }
+}

@@ -1,0 +1,313 @@
+//! All messages of a bag, in both storages of rosbag2.
+//!
+//! A bag that is damaged or was never completed is read as far as possible: [`Read::faults`] names
+//! what is missing. Nothing is written.
+
+use std::error::Error as _;
+use std::ffi::OsStr;
+use std::fmt;
+use std::fs;
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+
+use super::info::{SQLITE_MAGIC, read_text};
+use super::mcap;
+use super::metadata::{self, Metadata, MetadataError};
+use super::open_file;
+use super::read::{self, ReadError};
+use super::sqlite3;
+
+/// One message.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+pub struct Message<'a> {
+    /// Name of its topic.
+    pub topic: &'a str,
+    /// ROS type of its topic.
+    pub type_name: &'a str,
+    /// Definition of the type as `.msg` text; empty if the bag has none in this form.
+    pub definition: &'a str,
+    /// Time of reception, in nanoseconds since the epoch.
+    pub log_time: u64,
+    /// Time of sending; `None` if the storage has none.
+    pub publish_time: Option<u64>,
+    /// Begin of the payload with its encapsulation header: at least 64 bytes, if it has as many.
+    pub begin: &'a [u8],
+}
+
+/// Result of reading a bag.
+#[derive(Debug, Default)]
+pub struct Read {
+    /// Messages that were read.
+    pub messages: u64,
+    /// Parts that were not read.
+    pub faults: Vec<Fault>,
+}
+
+/// A part of a bag that was not read.
+#[derive(Debug)]
+pub enum Fault {
+    /// The recorder did not complete the file, or its end is missing.
+    Unfinished(PathBuf),
+    /// Parts of the file are damaged.
+    Damaged {
+        /// Path of the file.
+        path: PathBuf,
+        /// Number of chunks or pages.
+        parts: u64,
+    },
+    /// A file cannot be read, or not to its end.
+    Unreadable {
+        /// Path of the file.
+        path: PathBuf,
+        /// Cause of the failure.
+        error: MessagesError,
+    },
+    /// The latest messages are in a write-ahead log, which is not read.
+    WriteAheadLog(PathBuf),
+}
+
+/// Why a bag cannot be read at all.
+#[derive(Debug, thiserror::Error)]
+pub enum MessagesError {
+    /// The path is neither a directory nor a file that can be read.
+    #[error("cannot read {}", path.display())]
+    Io {
+        /// The path.
+        path: PathBuf,
+        /// Cause of the failure.
+        source: io::Error,
+    },
+    /// metadata.yaml is invalid.
+    #[error("cannot read metadata.yaml of {}", path.display())]
+    Metadata {
+        /// Path of the bag.
+        path: PathBuf,
+        /// Cause of the failure.
+        source: MetadataError,
+    },
+    /// A directory without files of a bag.
+    #[error("{} holds no file of a bag", .0.display())]
+    Empty(PathBuf),
+    /// The file is of neither storage.
+    #[error("{} is neither an MCAP file nor a sqlite3 bag", .0.display())]
+    Unknown(PathBuf),
+    /// Each message is compressed on its own.
+    #[error("{}: rp does not read bags whose messages are compressed one by one", .0.display())]
+    CompressedMessages(PathBuf),
+}
+
+/// Returns whether the path is a directory, or a file in a storage of rosbag2.
+#[must_use]
+pub fn is_bag(path: &Path) -> bool {
+    path.is_dir() || begin_of(path).is_ok_and(|begin| storage(path, &begin).is_some())
+}
+
+/// Reads the messages of a bag, file by file, each in the order of the file. `each` also receives
+/// the number of messages in the bag, if metadata.yaml has it.
+///
+/// # Errors
+/// Fails if nothing can be read.
+pub fn read(
+    path: &Path,
+    each: &mut dyn FnMut(&Message<'_>, Option<u64>),
+) -> Result<Read, MessagesError> {
+    let (files, total) = match path.is_dir() {
+        true => files_of(path)?,
+        false => (vec![path.to_owned()], None),
+    };
+    let mut result = Read::default();
+    let mut failed = None;
+    let mut is_any_read = false;
+    for file in files {
+        let before = result.messages;
+        let read = read_file(&file, &mut |message| {
+            result.messages += 1;
+            each(message, total);
+        });
+        is_any_read |= read.is_ok() || result.messages > before;
+        match read {
+            Ok(faults) => result.faults.extend(faults),
+            Err(error) => failed = Some((file, error)),
+        }
+        // An error of the whole bag, unless other messages were read.
+        if is_any_read && let Some((path, error)) = failed.take() {
+            result.faults.push(Fault::Unreadable { path, error });
+        }
+    }
+    match failed {
+        Some((_, error)) => Err(error),
+        None => Ok(result),
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Unfinished(path) => write!(
+                f,
+                "{} was not completed: messages up to its last complete record were read",
+                path.display()
+            ),
+            Self::Damaged { path, parts } => {
+                let (number, noun) = (parts, if *parts == 1 { "part" } else { "parts" });
+                write!(f, "{}: {number} damaged {noun} skipped", path.display())
+            }
+            Self::Unreadable { path, error } => {
+                write!(f, "{} was not read", path.display())?;
+                match error.source() {
+                    Some(source) => write!(f, ": {source}"),
+                    None => write!(f, ": {error}"),
+                }
+            }
+            Self::WriteAheadLog(path) => write!(
+                f,
+                "{} was not read: it holds the latest messages, until sqlite3 opens the bag",
+                path.display()
+            ),
+        }
+    }
+}
+
+#[derive(Clone, Copy)]
+enum Storage {
+    Mcap,
+    Sqlite3,
+}
+
+fn storage(path: &Path, begin: &[u8]) -> Option<Storage> {
+    if begin.starts_with(SQLITE_MAGIC) {
+        return Some(Storage::Sqlite3);
+    }
+    // A compressed file is recognised by its name.
+    let inner = path.file_stem().map(Path::new);
+    let is_inner = inner.is_some_and(|inner| has_suffix(inner, "mcap"));
+    let is_compressed = read::compression(path) != super::Compression::None && is_inner;
+    (begin.starts_with(&mcap::MAGIC) || is_compressed).then_some(Storage::Mcap)
+}
+
+fn has_suffix(path: &Path, suffix: &str) -> bool {
+    path.extension() == Some(OsStr::new(suffix))
+}
+
+fn begin_of(path: &Path) -> io::Result<Vec<u8>> {
+    let mut begin = Vec::new();
+    open_file(path)?.take(16).read_to_end(&mut begin)?;
+    Ok(begin)
+}
+
+/// Returns the files of a bag in their order, and its number of messages.
+fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesError> {
+    let wrong = |source| MessagesError::Io {
+        path: directory.to_owned(),
+        source,
+    };
+    match read_text(&directory.join(metadata::FILE_NAME)) {
+        Ok(text) => {
+            let metadata = Metadata::read(&text).map_err(|source| MessagesError::Metadata {
+                path: directory.to_owned(),
+                source,
+            })?;
+            if metadata.compression_mode.eq_ignore_ascii_case("message") {
+                return Err(MessagesError::CompressedMessages(directory.to_owned()));
+            }
+            // Old versions prefix the directory; files of a bag lie in it.
+            let names = metadata.relative_file_paths.iter();
+            let names = names.filter_map(|path| Path::new(path).file_name());
+            let files: Vec<_> = names.map(|name| directory.join(name)).collect();
+            if files.is_empty() {
+                return Err(MessagesError::Empty(directory.to_owned()));
+            }
+            return Ok((files, Some(metadata.message_count)));
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(source) => {
+            return Err(MessagesError::Io {
+                path: directory.join(metadata::FILE_NAME),
+                source,
+            });
+        }
+    }
+    // The recorder was killed before it wrote metadata.yaml.
+    let mut files = Vec::new();
+    for entry in fs::read_dir(directory).map_err(wrong)? {
+        let path = entry.map_err(wrong)?.path();
+        if begin_of(&path).is_ok_and(|begin| storage(&path, &begin).is_some()) {
+            files.push(path);
+        }
+    }
+    // By number: `bag_10` follows `bag_9`.
+    files.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
+    match files.is_empty() {
+        true => Err(MessagesError::Empty(directory.to_owned())),
+        false => Ok((files, None)),
+    }
+}
+
+fn read_file(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> Result<Vec<Fault>, MessagesError> {
+    let begin = begin_of(path).map_err(|source| MessagesError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    match storage(path, &begin) {
+        Some(Storage::Mcap) => read_mcap(path, each).map_err(|error| match error {
+            ReadError::Io { path, source } => MessagesError::Io { path, source },
+            ReadError::NotMcap(path) => MessagesError::Unknown(path),
+        }),
+        Some(Storage::Sqlite3) => read_sqlite3(path, each),
+        None => Err(MessagesError::Unknown(path.to_owned())),
+    }
+}
+
+fn read_mcap(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> Result<Vec<Fault>, ReadError> {
+    let scan = read::scan_with_cut(path, &mut |message, contents| {
+        let Some(channel) = contents.channels.get(&message.channel_id) else {
+            return;
+        };
+        let schema = contents.schemas.get(&channel.schema_id);
+        let definition = schema.filter(|schema| schema.encoding == "ros2msg");
+        let text = definition.and_then(|schema| std::str::from_utf8(&schema.data).ok());
+        each(&Message {
+            topic: &channel.topic,
+            type_name: schema.map_or("", |schema| &schema.name),
+            definition: text.unwrap_or_default(),
+            log_time: message.log_time,
+            publish_time: Some(message.publish_time),
+            begin: message.data,
+        });
+    })?;
+    let mut faults = Vec::new();
+    if scan.unreadable_chunks > 0 {
+        faults.push(Fault::Damaged {
+            path: path.to_owned(),
+            parts: scan.unreadable_chunks,
+        });
+    }
+    if !scan.is_ended {
+        faults.push(Fault::Unfinished(path.to_owned()));
+    }
+    Ok(faults)
+}
+
+fn read_sqlite3(
+    path: &Path,
+    each: &mut dyn FnMut(&Message<'_>),
+) -> Result<Vec<Fault>, MessagesError> {
+    let damaged = sqlite3::read(path, each).map_err(|source| MessagesError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    let mut faults = Vec::new();
+    if damaged > 0 {
+        faults.push(Fault::Damaged {
+            path: path.to_owned(),
+            parts: damaged,
+        });
+    }
+    let mut log = path.as_os_str().to_owned();
+    log.push("-wal");
+    let log = PathBuf::from(log);
+    if fs::metadata(&log).is_ok_and(|log| log.len() > 0) {
+        faults.push(Fault::WriteAheadLog(log));
+    }
+    Ok(faults)
+}

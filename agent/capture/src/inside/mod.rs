@@ -1,0 +1,280 @@
+//! What happens inside ROS processes, whatever their middleware: messages, also those that never
+//! leave a process, and callbacks.
+//!
+//! Opt-in, because it puts breakpoints into code of other processes, which cost them some
+//! microseconds each. The kernel programs aggregate; a thread with the privileges reads their
+//! tables once a second, resolves names, and leaves a report for the model. It changes nothing in
+//! the processes and never waits for them.
+
+pub mod names;
+pub mod process;
+pub mod programs;
+pub mod table;
+
+use std::collections::HashSet;
+use std::io;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::inside::Counter;
+
+use self::programs::{Attached, Programs, Tables};
+use self::table::{ProcessTable, Round};
+use crate::error_chain::in_words;
+use crate::filter::FilterError;
+use crate::settings::InsideChoice;
+use crate::shm::directories::Scope;
+use crate::system::{Clocks, wait};
+use crate::threads::{Spawn, Task};
+use crate::uprobe::attachments::{Attachments, LibraryFacts, Refusal, installed};
+use crate::uprobe::processes::{Processes, is_version_of};
+use crate::uprobe::{self, UprobeError};
+
+/// Interval of reports.
+const EVERY: Duration = Duration::from_secs(1);
+/// How long to collect announcements before they are read.
+const GATHER: Duration = Duration::from_millis(250);
+/// Most reports that wait for the model.
+const MAX_WAITING: usize = 4;
+/// Calls per second of all processes above which the programs are detached.
+pub const MAX_HITS: u64 = 200_000;
+/// Time for which they then stay detached.
+const PAUSE: Duration = Duration::from_secs(60);
+/// Name of the library; a version may follow.
+const LIBRARY: &str = "libtracetools.so";
+
+/// The kernel programs, and the thread that attaches and reads them.
+pub struct Inside {
+    shared: Arc<Shared>,
+    /// State passed to the thread when it starts.
+    waiting: Option<Work>,
+}
+
+/// State of the source.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Facts {
+    /// Whether callbacks are observed, and not only messages.
+    pub has_callbacks: bool,
+    /// Libraries in use.
+    pub libraries: Vec<LibraryFacts>,
+    /// Why nothing is attached at present; `None` = the libraries in use are.
+    pub detached: Option<String>,
+    /// Counters of the programs.
+    pub counters: Vec<(&'static str, u64)>,
+}
+
+#[derive(Default)]
+struct Shared {
+    rounds: Mutex<Vec<Round>>,
+    facts: Mutex<Facts>,
+    stop: AtomicBool,
+}
+
+struct Work {
+    attachments: Attachments<Attached>,
+    tables: Tables,
+    scope: Scope,
+    has_callbacks: bool,
+}
+
+impl Inside {
+    /// Loads the programs, and attaches them to installed libraries. `cgroup`: only for processes of
+    /// this control group.
+    ///
+    /// # Errors
+    /// Fails if a capability is missing, or if the kernel has no uprobes.
+    pub fn open(choice: InsideChoice, cgroup: Option<&Path>) -> Result<Self, UprobeError> {
+        let missing = uprobe::missing();
+        if !missing.is_empty() {
+            return Err(UprobeError::Missing(missing.join(" and ")));
+        }
+        let within = cgroup.map(uprobe::inode).transpose()?;
+        let has_callbacks = choice == InsideChoice::Full;
+        let loaded = programs::load(has_callbacks, within);
+        let (programs, mut tables) = loaded.map_err(|error| match error {
+            FilterError::Program(_) if within.is_some() => UprobeError::InsideScope(error),
+            error => error.into(),
+        })?;
+        set_clocks(&mut tables, &Clocks::read());
+        let mut attachments = attachments(programs);
+        // A node announces its publishers once: installed libraries are attached in advance.
+        attachments.install(&installed(is_library), Instant::now());
+        let scope = cgroup.map_or(Scope::AllProcesses, |path| {
+            Scope::Cgroup(path.to_path_buf())
+        });
+        let facts = Facts {
+            has_callbacks,
+            ..Facts::default()
+        };
+        Ok(Self {
+            shared: Arc::new(Shared {
+                facts: Mutex::new(facts),
+                ..Shared::default()
+            }),
+            waiting: Some(Work {
+                attachments,
+                tables,
+                scope,
+                has_callbacks,
+            }),
+        })
+    }
+
+    /// Starts the thread, once, with only the privileges that it needs.
+    ///
+    /// # Errors
+    /// Fails if the thread cannot be started.
+    pub fn start(&mut self, spawn: Spawn) -> io::Result<()> {
+        let Some(work) = self.waiting.take() else {
+            return Ok(());
+        };
+        let thread = std::thread::Builder::new().name("inside".to_owned());
+        let shared = Arc::clone(&self.shared);
+        let work = Box::new(move || follow(&shared, work));
+        spawn(Task::Inside, thread, work).map(drop)
+    }
+
+    /// Takes the rounds since the last call, oldest first.
+    #[must_use]
+    pub fn take(&self) -> Vec<Round> {
+        let rounds = self.shared.rounds.lock();
+        std::mem::take(&mut *rounds.unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// Returns the state of the source.
+    #[must_use]
+    pub fn facts(&self) -> Facts {
+        let facts = self.shared.facts.lock();
+        facts.unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Drop for Inside {
+    /// Lets the thread end within a second. A shutdown does not wait for it: the kernel removes the
+    /// probes with the process.
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+    }
+}
+
+impl Shared {
+    /// Returns whether the model has not taken earlier reports. Figures are cumulative, so a round
+    /// that is left out loses nothing.
+    fn is_late(&self) -> bool {
+        let rounds = self.rounds.lock();
+        rounds.unwrap_or_else(PoisonError::into_inner).len() >= MAX_WAITING
+    }
+
+    fn put(&self, round: Round) {
+        let rounds = self.rounds.lock();
+        rounds.unwrap_or_else(PoisonError::into_inner).push(round);
+    }
+
+    fn report(&self, facts: Facts) {
+        let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
+        *known = facts;
+    }
+}
+
+/// The thread's main function.
+fn follow(shared: &Shared, mut work: Work) {
+    let mut processes = Processes::new(work.scope.clone(), is_library);
+    let mut table = ProcessTable::new(work.has_callbacks);
+    let mut detached_at = None::<Instant>;
+    let mut last = Instant::now();
+    while !shared.stop.load(Ordering::Acquire) {
+        let now = Instant::now();
+        if detached_at.is_some_and(|at| now - at >= PAUSE) {
+            detached_at = None;
+            work.attachments.install(&installed(is_library), now);
+            tracing::info!("attached again inside processes");
+        }
+        processes.find(false);
+        if detached_at.is_none() {
+            work.attachments.follow(&processes, now);
+        }
+        let clocks = Clocks::read();
+        set_clocks(&mut work.tables, &clocks);
+        if !shared.is_late() {
+            let elapsed = last.elapsed();
+            last += elapsed;
+            let showing = showing_intra_process(&processes, &work.attachments);
+            let round = table.round(&mut work.tables, &clocks, elapsed, |process| {
+                showing.contains(&process)
+            });
+            let hits = round.hits;
+            shared.put(round);
+            if detached_at.is_none() && hits > MAX_HITS {
+                tracing::warn!(
+                    calls_per_second = hits,
+                    "detached inside processes for a minute: together they exceed the budget"
+                );
+                work.attachments.clear();
+                detached_at = Some(now);
+            }
+        }
+        shared.report(Facts {
+            has_callbacks: work.has_callbacks,
+            libraries: work.attachments.facts(),
+            detached: detached_at.map(|_| {
+                format!("all processes together made more than {MAX_HITS} calls per second")
+            }),
+            counters: counters(&work.tables),
+        });
+        // Announcements are read in between: their ring could overflow before the next round.
+        loop {
+            let rest = EVERY.saturating_sub(now.elapsed());
+            if rest.is_zero() || !matches!(wait(&[work.tables.descriptor()], rest), Ok(Some(_))) {
+                break;
+            }
+            table.drain(&mut work.tables, &Clocks::read());
+            std::thread::sleep(EVERY.saturating_sub(now.elapsed()).min(GATHER));
+        }
+    }
+}
+
+/// Returns attachments of the functions of `libtracetools.so`.
+fn attachments(mut programs: Programs) -> Attachments<Attached> {
+    Attachments::new(
+        "calls are observed",
+        Box::new(move |file| {
+            let attached = programs.attach(file);
+            attached.map_err(|error| Refusal::Probe(error.into()))
+        }),
+    )
+}
+
+/// Returns the processes whose library reports every step of messages within them.
+fn showing_intra_process(
+    processes: &Processes,
+    attachments: &Attachments<Attached>,
+) -> HashSet<u32> {
+    let attached = |id| attachments.probe(id)?.as_ref().ok();
+    let shows = |id| attached(id).is_some_and(|attached| attached.shows_intra_process);
+    let using = processes.using();
+    let showing = using.filter(|(_, used)| used.libraries.iter().any(|library| shows(&library.id)));
+    showing.map(|(process, _)| process).collect()
+}
+
+fn set_clocks(tables: &mut Tables, clocks: &Clocks) {
+    if let Err(error) = tables.set_clocks(clocks) {
+        let reason = in_words(&error);
+        tracing::debug!(
+            reason,
+            "latencies inside processes use an older clock reading"
+        );
+    }
+}
+
+fn counters(tables: &Tables) -> Vec<(&'static str, u64)> {
+    let values = tables.counters().unwrap_or_default();
+    let labels = Counter::ALL.iter().map(|counter| counter.label());
+    labels.zip(values).collect()
+}
+
+/// Returns whether a file of this name is the library.
+fn is_library(name: &str) -> bool {
+    is_version_of(LIBRARY, name)
+}

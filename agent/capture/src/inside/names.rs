@@ -1,0 +1,352 @@
+//! Names and relations of the handles in one process.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_model::inside::report::Trigger;
+use ros2probe_model::names::{NodeName, TopicName};
+use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
+
+/// Most names and relations of one process.
+pub const MAX_NAMES: usize = 16_384;
+/// Longest chain of relations.
+const DEPTH: usize = 8;
+
+/// Names that a process has announced.
+#[derive(Debug, Default)]
+pub struct Names {
+    known: HashMap<(Of, u64), Named>,
+    /// Names beyond the cap.
+    pub refused: u64,
+}
+
+/// Kinds of objects: addresses of different kinds may be equal, because one contains the other.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, Debug)]
+enum Of {
+    Node,
+    Publisher,
+    Subscription,
+    /// `rcl_subscription_t`.
+    SubscriptionHandle,
+    /// Subscription of rclcpp.
+    SubscriptionObject,
+    Callback,
+    Timer,
+    TimerNode,
+    Service,
+    StateMachine,
+    Buffer,
+    /// Intra-process buffer that owns a ring buffer, by the ring buffer.
+    Owner,
+    /// Subscription of rclcpp, by the intra-process buffer.
+    Owned,
+}
+
+/// What is known about an object.
+#[derive(Clone, Debug)]
+enum Named {
+    Node(NodeName),
+    /// A publisher, subscription or service.
+    Endpoint {
+        node: u64,
+        name: Arc<str>,
+        middleware: Option<Arc<str>>,
+    },
+    /// Another object.
+    Is(Of, u64),
+    Period(Duration),
+    Capacity(u32),
+}
+
+/// Topic, node and middleware of an endpoint.
+#[derive(Clone, Debug)]
+pub struct Endpoint {
+    /// ROS name of its topic, or its service's name.
+    pub name: Arc<str>,
+    /// Its node, if announced.
+    pub node: Option<NodeName>,
+    /// Identifier of its middleware.
+    pub middleware: Option<Arc<str>>,
+}
+
+impl Names {
+    /// Adds what an announcement says. Returns the name of a new node.
+    pub fn announce(&mut self, said: &Announcement) -> Option<NodeName> {
+        let (address, parent) = (said.address, said.parent);
+        let endpoint = || {
+            let middleware = text(&said.second);
+            Named::Endpoint {
+                node: parent,
+                name: text(&said.text).into(),
+                middleware: (!middleware.is_empty()).then(|| middleware.into()),
+            }
+        };
+        let (of, named) = match said.kind {
+            announced::NODE => {
+                let name = NodeName::from(joined(&text(&said.second), &text(&said.text)));
+                self.insert(Of::Node, address, Named::Node(name.clone()));
+                return Some(name);
+            }
+            announced::PUBLISHER => (Of::Publisher, endpoint()),
+            announced::SUBSCRIPTION => {
+                if said.value != 0 {
+                    let is = Named::Is(Of::Subscription, address);
+                    self.insert(Of::SubscriptionHandle, said.value, is);
+                }
+                (Of::Subscription, endpoint())
+            }
+            announced::SUBSCRIPTION_OBJECT => (
+                Of::SubscriptionObject,
+                Named::Is(Of::SubscriptionHandle, parent),
+            ),
+            announced::SUBSCRIPTION_CALLBACK => {
+                (Of::Callback, Named::Is(Of::SubscriptionObject, parent))
+            }
+            announced::TIMER => (Of::Timer, Named::Period(Duration::from_nanos(said.value))),
+            announced::TIMER_NODE => (Of::TimerNode, Named::Is(Of::Node, parent)),
+            announced::TIMER_CALLBACK => (Of::Callback, Named::Is(Of::Timer, parent)),
+            announced::SERVICE => (Of::Service, endpoint()),
+            announced::SERVICE_CALLBACK => (Of::Callback, Named::Is(Of::Service, parent)),
+            announced::STATE_MACHINE => (Of::StateMachine, Named::Is(Of::Node, parent)),
+            announced::BUFFER => {
+                let capacity = u32::try_from(said.value).unwrap_or(u32::MAX);
+                (Of::Buffer, Named::Capacity(capacity))
+            }
+            announced::BUFFER_OWNER => {
+                self.insert(Of::Owner, parent, Named::Is(Of::Owned, address));
+                return None;
+            }
+            announced::BUFFER_SUBSCRIPTION => {
+                (Of::Owned, Named::Is(Of::SubscriptionObject, parent))
+            }
+            _ => return None,
+        };
+        self.insert(of, address, named);
+        None
+    }
+
+    fn insert(&mut self, of: Of, address: u64, named: Named) {
+        if self.known.len() >= MAX_NAMES && !self.known.contains_key(&(of, address)) {
+            self.refused += 1;
+            return;
+        }
+        self.known.insert((of, address), named);
+    }
+
+    /// Follows relations to an object that is no relation.
+    fn resolve(&self, of: Of, address: u64) -> Option<(Of, u64, &Named)> {
+        let mut at = (of, address);
+        for _ in 0..DEPTH {
+            match self.known.get(&at)? {
+                Named::Is(of, address) => at = (*of, *address),
+                named => return Some((at.0, at.1, named)),
+            }
+        }
+        None
+    }
+
+    fn node(&self, address: u64) -> Option<NodeName> {
+        match self.known.get(&(Of::Node, address))? {
+            Named::Node(name) => Some(name.clone()),
+            _ => None,
+        }
+    }
+
+    fn endpoint(&self, of: Of, address: u64) -> Option<Endpoint> {
+        match self.resolve(of, address)?.2 {
+            Named::Endpoint {
+                node,
+                name,
+                middleware,
+            } => Some(Endpoint {
+                name: Arc::clone(name),
+                node: self.node(*node),
+                middleware: middleware.clone(),
+            }),
+            _ => None,
+        }
+    }
+
+    /// Returns the topic of a publisher.
+    #[must_use]
+    pub fn publisher(&self, address: u64) -> Option<Endpoint> {
+        self.endpoint(Of::Publisher, address)
+    }
+
+    /// Returns the topic of a subscription.
+    #[must_use]
+    pub fn subscription(&self, address: u64) -> Option<Endpoint> {
+        self.endpoint(Of::Subscription, address)
+    }
+
+    /// Returns the topic and node of a ring buffer's subscription, or the topic of its publisher.
+    #[must_use]
+    pub fn buffer(&self, address: u64, publisher: Handle) -> Option<Endpoint> {
+        let subscription = self.endpoint(Of::Owner, address);
+        subscription.or_else(|| {
+            let publisher = self.publisher(publisher.address)?;
+            // The node is the publisher's, not the subscription's.
+            Some(Endpoint {
+                node: None,
+                ..publisher
+            })
+        })
+    }
+
+    /// Returns the capacity of a ring buffer.
+    #[must_use]
+    pub fn capacity(&self, address: u64) -> Option<u32> {
+        match self.known.get(&(Of::Buffer, address))? {
+            Named::Capacity(capacity) => Some(*capacity),
+            _ => None,
+        }
+    }
+
+    /// Returns the node of a state machine.
+    #[must_use]
+    pub fn machine(&self, address: u64) -> Option<NodeName> {
+        match self.resolve(Of::StateMachine, address)?.2 {
+            Named::Node(name) => Some(name.clone()),
+            _ => None,
+        }
+    }
+
+    /// Returns what triggers a callback, and its node. `topic_of` returns the endpoint of a ring
+    /// buffer.
+    #[must_use]
+    pub fn trigger(
+        &self,
+        callback: u64,
+        figures: &Figures,
+        topic_of: impl Fn(u64) -> Option<Endpoint>,
+    ) -> (Trigger, Option<NodeName>) {
+        let created = self.known.get(&(Of::Callback, callback));
+        let trigger = figures.trigger;
+        match trigger.kind {
+            kind::SUBSCRIPTION => match self.subscription(trigger.address) {
+                Some(endpoint) => (
+                    Trigger::Subscription(TopicName::from(&*endpoint.name)),
+                    endpoint.node,
+                ),
+                None => (Trigger::Service(None), None),
+            },
+            kind::BUFFER => {
+                let of_buffer = (trigger.address != 0).then(|| topic_of(trigger.address));
+                let of_callback = || self.endpoint(Of::Callback, callback);
+                let endpoint = of_buffer.flatten().or_else(of_callback);
+                let topic = endpoint.as_ref().map(|of| TopicName::from(&*of.name));
+                (
+                    Trigger::IntraProcess(topic),
+                    endpoint.and_then(|of| of.node),
+                )
+            }
+            kind::TIMER => {
+                let announced = match self.known.get(&(Of::Timer, trigger.address)) {
+                    Some(Named::Period(period)) => Some(*period),
+                    _ => None,
+                };
+                let read = (figures.period != 0).then(|| Duration::from_nanos(figures.period));
+                let node = match self.resolve(Of::TimerNode, trigger.address) {
+                    Some((_, _, Named::Node(name))) => Some(name.clone()),
+                    _ => None,
+                };
+                (Trigger::Timer(read.or(announced)), node)
+            }
+            _ => match created {
+                Some(Named::Is(Of::Service, service)) => {
+                    let service = self.endpoint(Of::Service, *service);
+                    let name = service.as_ref().map(|of| Arc::clone(&of.name));
+                    (Trigger::Service(name), service.and_then(|of| of.node))
+                }
+                _ => (Trigger::Service(None), None),
+            },
+        }
+    }
+}
+
+/// Returns a node's full name.
+fn joined(namespace: &str, name: &str) -> String {
+    let namespace = namespace.trim_end_matches('/');
+    let slash = if namespace.starts_with('/') || namespace.is_empty() {
+        ""
+    } else {
+        "/"
+    };
+    format!("{slash}{namespace}/{name}")
+}
+
+/// Returns the text before the final zero.
+#[must_use]
+pub fn text(bytes: &[u8]) -> String {
+    let end = bytes.iter().position(|byte| *byte == 0);
+    let bytes = bytes.get(..end.unwrap_or(bytes.len())).unwrap_or_default();
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_wire::inside::NAME_BYTES;
+    use zerocopy::FromZeros as _;
+
+    use super::*;
+
+    fn said(kind: u32, address: u64, parent: u64, value: u64, text: &str) -> Announcement {
+        let mut said = Announcement::new_zeroed();
+        (said.kind, said.address, said.parent, said.value) = (kind, address, parent, value);
+        said.text[..text.len()].copy_from_slice(text.as_bytes());
+        said
+    }
+
+    #[test]
+    fn a_callback_leads_to_its_subscription_s_topic_and_node() {
+        let mut names = Names::default();
+        let mut node = said(announced::NODE, 1, 0, 0, "lidar");
+        node.second[..7].copy_from_slice(b"/robot1");
+        assert_eq!(names.announce(&node).unwrap(), "/robot1/lidar");
+        for each in [
+            said(announced::SUBSCRIPTION, 20, 1, 21, "/points"),
+            said(announced::SUBSCRIPTION_OBJECT, 22, 21, 0, ""),
+            said(announced::SUBSCRIPTION_CALLBACK, 23, 22, 0, ""),
+        ] {
+            names.announce(&each);
+        }
+        let mut figures = Figures::new_zeroed();
+        figures.trigger.kind = kind::BUFFER;
+        let (trigger, node) = names.trigger(23, &figures, |_| None);
+        assert_eq!(trigger, Trigger::IntraProcess(Some("/points".into())));
+        assert_eq!(node.unwrap(), "/robot1/lidar");
+        let (unknown, _) = names.trigger(24, &figures, |_| None);
+        assert_eq!(unknown, Trigger::IntraProcess(None));
+    }
+
+    #[test]
+    fn relations_in_a_circle_end() {
+        let mut names = Names::default();
+        names.announce(&said(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
+        names.insert(
+            Of::SubscriptionHandle,
+            2,
+            Named::Is(Of::SubscriptionObject, 1),
+        );
+        assert!(names.endpoint(Of::SubscriptionObject, 1).is_none());
+    }
+
+    #[test]
+    fn names_beyond_the_cap_are_counted() {
+        let mut names = Names::default();
+        for address in 0..=MAX_NAMES as u64 {
+            names.announce(&said(announced::PUBLISHER, address, 0, 0, "/topic"));
+        }
+        assert_eq!((names.known.len(), names.refused), (MAX_NAMES, 1));
+    }
+
+    #[test]
+    fn names_of_nodes_are_joined_and_text_ends_with_zero() {
+        assert_eq!(joined("/", "talker"), "/talker");
+        assert_eq!(joined("/robot1", "talker"), "/robot1/talker");
+        assert_eq!(joined("robot1", "talker"), "/robot1/talker");
+        assert_eq!(text(b"abc\0def"), "abc");
+        assert_eq!(text(&[b'a'; NAME_BYTES]).len(), NAME_BYTES);
+    }
+}

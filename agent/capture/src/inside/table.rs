@@ -1,0 +1,432 @@
+//! The observed processes: their names, budgets, and what has changed since the last report.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_model::chain::causality::CausalPublication;
+use ros2probe_model::inside::report::{
+    BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
+    SubscriptionReport, Transition,
+};
+use ros2probe_model::names::{NodeName, TopicName};
+use ros2probe_wire::inside::{
+    self, Announcement, Figures, Handle, Process, announced, distribution, kind, state,
+};
+use ros2probe_wire::{DomainId, Timestamp};
+use zerocopy::FromBytes as _;
+
+use super::names::{Endpoint, Names, text};
+use super::process::Stat;
+use super::programs::Tables;
+use crate::system::Clocks;
+
+/// Calls per second of one process above which its calls are no longer counted.
+pub const MAX_PROCESS_HITS: u64 = 50_000;
+/// Least time over which calls per second are judged: a shorter one may hold a burst alone.
+const JUDGED_OVER: Duration = Duration::from_millis(500);
+/// Rounds after which a process outside of the control group is inspected again.
+const RECHECK: u32 = 5;
+/// Most causal publications and transitions of one report.
+const MAX_HOPS: usize = 16_384;
+const MAX_TRANSITIONS: usize = 1_024;
+
+/// The observed processes.
+#[derive(Debug)]
+pub struct ProcessTable {
+    known: HashMap<u32, Observed>,
+    has_callbacks: bool,
+    hops: Vec<inside::Hop>,
+    transitions: Vec<Transition>,
+    rounds: u32,
+    /// Time since calls per second were last judged.
+    unjudged: Duration,
+}
+
+/// Result of one round.
+#[derive(Debug)]
+pub struct Round {
+    /// What has changed.
+    pub report: Report,
+    /// Publications during callbacks, in the order of their time.
+    pub publications: Vec<CausalPublication>,
+    /// Calls per second of all processes; 0 if they were not judged.
+    pub hits: u64,
+}
+
+#[derive(Debug, Default)]
+struct Observed {
+    /// `None` if the process had ended before it was inspected.
+    stat: Option<Stat>,
+    domain: DomainId,
+    names: Names,
+    new_nodes: Vec<NodeName>,
+    /// Calls when they were last judged.
+    hits: u64,
+    is_suspended: bool,
+    /// What was last reported of each handle.
+    reported: HashMap<Handle, Mark>,
+    /// Publisher of each ring buffer.
+    buffers: HashMap<u64, Handle>,
+}
+
+/// Distinguishes two states of figures.
+type Mark = [u64; 5];
+
+impl Observed {
+    fn buffer(&self, address: u64) -> Option<Endpoint> {
+        let publisher = self.buffers.get(&address).copied();
+        self.names.buffer(address, publisher.unwrap_or_default())
+    }
+}
+
+impl ProcessTable {
+    /// Creates an empty table.
+    #[must_use]
+    pub fn new(has_callbacks: bool) -> Self {
+        Self {
+            known: HashMap::new(),
+            has_callbacks,
+            hops: Vec::new(),
+            transitions: Vec::new(),
+            rounds: 0,
+            unjudged: Duration::ZERO,
+        }
+    }
+
+    /// Returns the number of processes.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.known.len()
+    }
+
+    /// Returns whether no process is observed.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.known.is_empty()
+    }
+
+    /// Reads the announcements that wait.
+    pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks) {
+        while let Some(item) = tables.next_announcement(Item::read) {
+            match item {
+                Some(Item::Hop(hop)) if self.hops.len() < MAX_HOPS => self.hops.push(hop),
+                Some(Item::Announcement(said)) => self.announced(&said, clocks),
+                Some(Item::Hop(_)) | None => {}
+            }
+        }
+    }
+
+    fn announced(&mut self, said: &Announcement, clocks: &Clocks) {
+        let observed = self.observe(said.process);
+        if said.kind == announced::TRANSITION {
+            let transition = Transition {
+                process: said.process,
+                node: observed.names.machine(said.address),
+                start: text(&said.text).into(),
+                goal: text(&said.second).into(),
+                at: clocks.calendar(said.time),
+            };
+            if self.transitions.len() < MAX_TRANSITIONS {
+                self.transitions.push(transition);
+            }
+            return;
+        }
+        if let Some(node) = observed.names.announce(said) {
+            observed.new_nodes.push(node);
+        }
+    }
+
+    /// Returns the state of a process, new if necessary. The kernel's table bounds their number.
+    fn observe(&mut self, process: u32) -> &mut Observed {
+        self.known.entry(process).or_insert_with(|| {
+            let stat = Stat::read(process);
+            let domain = stat.as_ref().and_then(|stat| stat.domain(process));
+            Observed {
+                domain: domain.unwrap_or_default(),
+                stat,
+                ..Observed::default()
+            }
+        })
+    }
+
+    /// Reads everything once. `elapsed`: time since the last round. `shows_intra_process`: whether a
+    /// process's library reports every step of messages within it.
+    pub fn round(
+        &mut self,
+        tables: &mut Tables,
+        clocks: &Clocks,
+        elapsed: Duration,
+        shows_intra_process: impl Fn(u32) -> bool,
+    ) -> Round {
+        self.rounds = self.rounds.wrapping_add(1);
+        self.unjudged += elapsed;
+        let is_due = self.unjudged >= JUDGED_OVER;
+        let judged = is_due.then(|| std::mem::take(&mut self.unjudged));
+        self.drain(tables, clocks);
+        let (mut reports, mut hits) = (HashMap::new(), 0);
+        let processes: Vec<_> = tables.processes().collect();
+        for (id, process) in &processes {
+            if process.state == state::OUTSIDE {
+                if self.rounds.is_multiple_of(RECHECK) {
+                    let _ = tables.remove_process(*id);
+                }
+                continue;
+            }
+            if let Some(over) = judged {
+                hits += self.judge(tables, *id, process, over);
+            }
+            let report = self.process(*id, process);
+            reports.insert(*id, report);
+        }
+        // A process that has ended makes no further calls, so these figures are its last.
+        let ended: HashSet<_> = reports
+            .iter()
+            .filter(|(_, report)| report.has_ended)
+            .map(|(id, _)| *id)
+            .collect();
+        let mut figures: Vec<_> = tables.figures().collect();
+        // Publishers name their buffers, and buffers their callbacks.
+        figures.sort_unstable_by_key(|(handle, _)| handle.kind);
+        self.drain(tables, clocks);
+        for (handle, figures) in &figures {
+            if let Some(report) = reports.get_mut(&handle.process) {
+                self.handle(report, *handle, figures, clocks);
+            }
+        }
+        let hops = std::mem::take(&mut self.hops);
+        let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
+        let mut publications: Vec<_> = hops.collect();
+        publications.sort_by_key(|publication| publication.published);
+        for id in &ended {
+            let _ = tables.remove_process(*id);
+            self.known.remove(id);
+        }
+        // A process that began during this round is in the next report.
+        let present: HashSet<_> = tables.processes().map(|(id, _)| id).collect();
+        for (handle, _) in &figures {
+            if !present.contains(&handle.process) {
+                let _ = tables.remove_handle(*handle);
+            }
+        }
+        self.known.retain(|id, _| present.contains(id));
+        for (id, report) in &mut reports {
+            report.shows_intra_process = shows_intra_process(*id);
+        }
+        let report = Report {
+            at: clocks.now,
+            has_callbacks: self.has_callbacks,
+            processes: reports.into_values().collect(),
+            transitions: std::mem::take(&mut self.transitions),
+        };
+        Round {
+            report,
+            publications,
+            hits,
+        }
+    }
+
+    /// Returns the report of a process without its handles.
+    fn process(&mut self, id: u32, process: &Process) -> ProcessReport {
+        let observed = self.observe(id);
+        // Another process may have received the same id.
+        let started = observed.stat.as_ref().map(|stat| stat.started);
+        let stat = Stat::read(id).filter(|stat| Some(stat.started) == started);
+        let has_ended = stat.is_none();
+        if !has_ended {
+            observed.stat = stat;
+        }
+        let stat = observed.stat.as_ref();
+        ProcessReport {
+            id,
+            name: stat.map(|stat| Arc::clone(&stat.name)),
+            domain_id: observed.domain,
+            cpu: stat.map(|stat| stat.cpu).unwrap_or_default(),
+            hits: process.hits,
+            refused: process.refused,
+            is_suspended: observed.is_suspended,
+            has_ended,
+            nodes: std::mem::take(&mut observed.new_nodes),
+            ..ProcessReport::default()
+        }
+    }
+
+    /// Applies the budget of a process to its calls over this time. Returns its calls per second.
+    fn judge(&mut self, tables: &mut Tables, id: u32, process: &Process, over: Duration) -> u64 {
+        let observed = self.observe(id);
+        let milliseconds = u64::try_from(over.as_millis()).unwrap_or(u64::MAX).max(1);
+        let hits = process.hits.saturating_sub(observed.hits);
+        let rate = hits.saturating_mul(1000) / milliseconds;
+        observed.hits = process.hits;
+        let is_suspended = match observed.is_suspended {
+            true => rate > MAX_PROCESS_HITS / 2,
+            false => rate > MAX_PROCESS_HITS,
+        };
+        if is_suspended == observed.is_suspended {
+            return rate;
+        }
+        let state = match is_suspended {
+            true => state::SUSPENDED,
+            false => state::COUNTED,
+        };
+        let changed = tables.set_process(id, Process { state, ..*process });
+        if changed.is_ok() {
+            observed.is_suspended = is_suspended;
+            tracing::info!(
+                process = id,
+                calls_per_second = rate,
+                is_suspended,
+                "the budget of calls inside a process"
+            );
+        }
+        rate
+    }
+
+    /// Adds a handle to its process's report, if it has changed.
+    fn handle(
+        &mut self,
+        report: &mut ProcessReport,
+        handle: Handle,
+        figures: &Figures,
+        clocks: &Clocks,
+    ) {
+        let Some(observed) = self.known.get_mut(&handle.process) else {
+            return;
+        };
+        let mark = [
+            figures.count,
+            figures.failed,
+            figures.within,
+            u64::from(figures.depth),
+            figures.trigger.address,
+        ];
+        if observed.reported.get(&handle) == Some(&mark) {
+            return;
+        }
+        let names = &observed.names;
+        let last = match figures.last {
+            0 => Timestamp(0),
+            last => clocks.calendar(last),
+        };
+        let is_known = match handle.kind {
+            kind::PUBLISHER => names.publisher(handle.address).map(|endpoint| {
+                report.publishers.push(PublisherReport {
+                    handle: handle.address,
+                    node: endpoint.node,
+                    topic: TopicName::from(&*endpoint.name),
+                    middleware: endpoint.middleware,
+                    published: figures.count,
+                    within_process: figures.within,
+                    last,
+                    intervals: durations(figures, distribution::INTERVAL),
+                });
+            }),
+            kind::SUBSCRIPTION => names.subscription(handle.address).map(|endpoint| {
+                report.subscriptions.push(SubscriptionReport {
+                    handle: handle.address,
+                    node: endpoint.node,
+                    topic: TopicName::from(&*endpoint.name),
+                    middleware: endpoint.middleware,
+                    taken: figures.count,
+                    failed: figures.failed,
+                    last,
+                    intervals: durations(figures, distribution::INTERVAL),
+                    latency: durations(figures, distribution::DELAY),
+                });
+            }),
+            kind::BUFFER => {
+                observed.buffers.insert(handle.address, figures.trigger);
+                let endpoint = names.buffer(handle.address, figures.trigger);
+                let topic = endpoint.as_ref().map(|of| TopicName::from(&*of.name));
+                report.buffers.push(BufferReport {
+                    handle: handle.address,
+                    node: endpoint.and_then(|of| of.node),
+                    topic,
+                    enqueued: figures.count,
+                    overwritten: figures.failed,
+                    dequeued: figures.within,
+                    depth: figures.depth,
+                    max_depth: figures.max_depth,
+                    capacity: names.capacity(handle.address),
+                    last,
+                    waiting: durations(figures, distribution::DELAY),
+                });
+                Some(())
+            }
+            kind::CALLBACK => {
+                let buffer = |address| observed.buffer(address);
+                let (trigger, node) = names.trigger(handle.address, figures, buffer);
+                report.callbacks.push(CallbackReport {
+                    handle: handle.address,
+                    node,
+                    trigger,
+                    thread: figures.thread,
+                    // Where callbacks are not observed, only their begin is.
+                    calls: figures.count.max(figures.within),
+                    last,
+                    durations: durations(figures, distribution::INTERVAL),
+                    waits: durations(figures, distribution::DELAY),
+                    skipped: figures.failed,
+                });
+                Some(())
+            }
+            _ => None,
+        };
+        // The name of a handle may follow.
+        if is_known.is_some() {
+            observed.reported.insert(handle, mark);
+        }
+    }
+
+    /// Names the topics of a causal publication; `None` if one is unknown.
+    fn hop(&self, hop: &inside::Hop, clocks: &Clocks) -> Option<CausalPublication> {
+        let observed = self.known.get(&hop.process)?;
+        let names = &observed.names;
+        let output = names.publisher(hop.publisher)?;
+        let input = match hop.input.kind {
+            kind::SUBSCRIPTION => names.subscription(hop.input.address)?,
+            kind::BUFFER => observed.buffer(hop.input.address)?,
+            _ => return None,
+        };
+        Some(CausalPublication {
+            domain_id: observed.domain,
+            process: hop.process,
+            node: output.node.or(input.node),
+            input: TopicName::from(&*input.name),
+            input_source: Timestamp(hop.source_timestamp),
+            taken: clocks.calendar(hop.taken),
+            started: clocks.calendar(hop.started),
+            output: TopicName::from(&*output.name),
+            published: clocks.calendar(hop.published),
+        })
+    }
+}
+
+/// An item of the ring.
+enum Item {
+    Announcement(Box<Announcement>),
+    Hop(inside::Hop),
+}
+
+impl Item {
+    fn read(bytes: &[u8]) -> Option<Self> {
+        let kind = u32::from_ne_bytes(*bytes.first_chunk()?);
+        if kind == announced::HOP {
+            return inside::Hop::read_from_bytes(bytes).ok().map(Self::Hop);
+        }
+        let announcement = Announcement::read_from_bytes(bytes).ok()?;
+        Some(Self::Announcement(Box::new(announcement)))
+    }
+}
+
+fn durations(figures: &Figures, of: usize) -> Durations {
+    let [interval, delay] = &figures.buckets;
+    let counts = if of == distribution::INTERVAL {
+        interval
+    } else {
+        delay
+    };
+    let of = |values: &[u64; 2]| values.get(of).copied().unwrap_or_default();
+    let minimum = of(&figures.minima).saturating_sub(1);
+    Durations::new(counts, of(&figures.sums), minimum, of(&figures.maxima))
+}

@@ -1,0 +1,236 @@
+//! Probes in the libraries that processes use.
+//!
+//! Attached once to a file, a probe is in every process that maps it, including later ones. A
+//! library that no process uses is detached only after a while, so that a restarted robot is seen
+//! from its first message.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use super::library::LibraryError;
+use super::processes::{LibraryId, Mapped, Processes};
+use crate::error_chain::in_words;
+
+/// How long an unused library stays attached.
+pub const LINGER: Duration = Duration::from_secs(60);
+/// Pause before another attempt to attach to a library.
+pub const RETRY: Duration = Duration::from_secs(5);
+/// Most libraries with a probe: images of containers on one host.
+pub const MAX_LIBRARIES: usize = 64;
+
+/// Directories of installed libraries and of ROS distributions.
+const INSTALLED: [&str; 5] = [
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib",
+    "/usr/lib64",
+    "/usr/local/lib",
+];
+const DISTRIBUTIONS: &str = "/opt/ros";
+
+/// All known libraries, with a probe `P` in each.
+pub struct Attachments<P> {
+    attach: Attach<P>,
+    meaning: &'static str,
+    libraries: BTreeMap<LibraryId, Library<P>>,
+}
+
+/// Attaches to a library's file.
+pub type Attach<P> = Box<dyn FnMut(&File) -> Result<P, Refusal> + Send>;
+
+struct Library<P> {
+    path: PathBuf,
+    probe: Result<P, String>,
+    processes: usize,
+    used: Instant,
+    tried: Instant,
+    /// Attached before any process used it, and kept.
+    is_installed: bool,
+}
+
+/// Why a library is not attached.
+#[derive(Debug, thiserror::Error)]
+pub enum Refusal {
+    /// Its file cannot be opened.
+    #[error("it cannot be opened")]
+    Open(#[source] io::Error),
+    /// Its path is a directory or a device.
+    #[error("not a file")]
+    NoFile,
+    /// It is malformed, or lacks the function.
+    #[error(transparent)]
+    Library(#[from] LibraryError),
+    /// The kernel refuses the probe.
+    #[error(transparent)]
+    Probe(Box<dyn std::error::Error + Send + Sync>),
+}
+
+/// State of one library.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LibraryFacts {
+    /// Its path in the file system of a process that uses it.
+    pub path: PathBuf,
+    /// Number of processes that use it.
+    pub processes: usize,
+    /// Why it is not attached; `None` if it is.
+    pub refused: Option<String>,
+}
+
+impl<P> Attachments<P> {
+    /// Creates attachments of nothing. `meaning`: what it means that a library is attached.
+    #[must_use]
+    pub fn new(meaning: &'static str, attach: Attach<P>) -> Self {
+        Self {
+            attach,
+            meaning,
+            libraries: BTreeMap::new(),
+        }
+    }
+
+    /// Returns the probe of a library, or why it has none; `None` if the library is not known.
+    #[must_use]
+    pub fn probe(&self, id: &LibraryId) -> Option<&Result<P, String>> {
+        self.libraries.get(id).map(|library| &library.probe)
+    }
+
+    /// Detaches from all libraries.
+    pub fn clear(&mut self) {
+        self.libraries.clear();
+    }
+
+    /// Attaches to installed libraries that no process uses yet.
+    pub fn install(&mut self, paths: &[PathBuf], now: Instant) {
+        for path in paths {
+            let Ok(metadata) = fs::metadata(path) else {
+                continue;
+            };
+            let device = metadata.dev();
+            let id = LibraryId {
+                device: format!("{:02x}:{:02x}", libc::major(device), libc::minor(device)),
+                inode: metadata.ino(),
+            };
+            if self.libraries.contains_key(&id) || self.libraries.len() >= MAX_LIBRARIES {
+                continue;
+            }
+            // A failure is reported when a process uses the library.
+            if let Ok(probe) = open(path).and_then(|file| (self.attach)(&file)) {
+                tracing::info!(library = %path.display(), "uprobe attached in advance");
+                let library = Library {
+                    path: path.clone(),
+                    probe: Ok(probe),
+                    processes: 0,
+                    used: now,
+                    tried: now,
+                    is_installed: true,
+                };
+                self.libraries.insert(id, library);
+            }
+        }
+    }
+
+    /// Attaches to new libraries, and detaches those that have been unused for a while.
+    pub fn follow(&mut self, processes: &Processes, now: Instant) {
+        for library in self.libraries.values_mut() {
+            library.processes = 0;
+        }
+        for (process, used) in processes.using() {
+            for mapped in &used.libraries {
+                self.meet(mapped, process, now);
+            }
+        }
+        self.libraries.retain(|_, library| {
+            let is_used = library.is_installed || now - library.used < LINGER;
+            if !is_used && library.probe.is_ok() {
+                let library = library.path.display();
+                tracing::info!(%library, "uprobe detached: the library is no longer in use");
+            }
+            is_used
+        });
+    }
+
+    fn meet(&mut self, mapped: &Mapped, process: u32, now: Instant) {
+        let Mapped { id, path, range } = mapped;
+        let is_known = self
+            .libraries
+            .get(id)
+            .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY);
+        if !is_known && (self.libraries.contains_key(id) || self.libraries.len() < MAX_LIBRARIES) {
+            // Refers to the file that the process maps, even if its path now names another one.
+            let file = PathBuf::from(format!("/proc/{process}/map_files/{range}"));
+            let probe = open(&file).and_then(|file| (self.attach)(&file));
+            let probe = probe.map_err(|refusal| in_words(&refusal));
+            let (library, is_new) = (path.display(), !self.libraries.contains_key(id));
+            match &probe {
+                Ok(_) => tracing::info!(%library, "attached: {}", self.meaning),
+                Err(reason) if is_new => tracing::warn!(%library, reason, "not attached"),
+                Err(_) => {}
+            }
+            let library = Library {
+                path: path.clone(),
+                probe,
+                processes: 0,
+                used: now,
+                tried: now,
+                is_installed: false,
+            };
+            self.libraries.insert(id.clone(), library);
+        }
+        if let Some(library) = self.libraries.get_mut(id) {
+            library.processes += 1;
+            library.used = now;
+        }
+    }
+
+    /// Returns the libraries in use.
+    #[must_use]
+    pub fn facts(&self) -> Vec<LibraryFacts> {
+        let in_use = |library: &&Library<P>| library.processes > 0;
+        let libraries = self.libraries.values().filter(in_use);
+        let libraries = libraries.map(|library| LibraryFacts {
+            path: library.path.clone(),
+            processes: library.processes,
+            refused: library.probe.as_ref().err().cloned(),
+        });
+        libraries.collect()
+    }
+}
+
+/// Returns libraries in the usual directories of this host, not of containers. `is_library`: whether
+/// a file of this name is one.
+#[must_use]
+pub fn installed(is_library: fn(&str) -> bool) -> Vec<PathBuf> {
+    let mut directories: Vec<_> = INSTALLED.iter().map(PathBuf::from).collect();
+    let distributions = fs::read_dir(DISTRIBUTIONS).into_iter().flatten().flatten();
+    directories.extend(
+        distributions
+            .take(MAX_LIBRARIES)
+            .map(|entry| entry.path().join("lib")),
+    );
+    let entries = directories
+        .iter()
+        .flat_map(fs::read_dir)
+        .flatten()
+        .flatten();
+    let libraries = entries.filter(|entry| {
+        let is_file = entry.file_type().is_ok_and(|kind| kind.is_file());
+        is_file && entry.file_name().to_str().is_some_and(is_library)
+    });
+    libraries.map(|entry| entry.path()).collect()
+}
+
+fn open(path: &Path) -> Result<File, Refusal> {
+    // A file whose open blocks is not a library.
+    let file = OpenOptions::new()
+        .read(true)
+        .custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY)
+        .open(path)
+        .map_err(Refusal::Open)?;
+    if !file.metadata().map_err(Refusal::Open)?.is_file() {
+        return Err(Refusal::NoFile);
+    }
+    Ok(file)
+}

@@ -1,0 +1,318 @@
+//! Follows the TCP connections of Zenoh: segments in, batches out.
+//!
+//! A connection is one of Zenoh if it begins with an INIT. One that is older than the agent is
+//! recognized by batches in a row that fit together. Retransmissions are dropped, and segments out
+//! of order wait for the missing ones. After a gap, the next boundary of a batch is searched for. Of
+//! other connections only the addresses are kept.
+
+mod chunks;
+mod search;
+mod stream;
+
+use std::collections::hash_map::Entry;
+use std::collections::{HashMap, VecDeque};
+use std::time::Duration;
+
+use ros2probe_model::size::Size;
+use ros2probe_model::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::quic;
+use ros2probe_wire::zenoh::PORT;
+
+pub use chunks::{flow, flow_of};
+use stream::{Stream, Took};
+
+/// Most directions of connections that are followed.
+const MAX_STREAMS: usize = 4096;
+/// Most bytes of unfinished batches and of segments out of order, of all connections.
+const MAX_BYTES: usize = 16 << 20;
+/// Interval at which segments that wait are examined.
+const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
+
+/// A piece of one direction of a connection: a TCP segment, or a part of one.
+#[derive(Clone, Copy, Debug)]
+pub struct Chunk<'a> {
+    /// Time of the segment.
+    pub time: Timestamp,
+    /// The direction.
+    pub stream: StreamId,
+    /// TCP sequence number of its first byte, or of the SYN.
+    pub sequence_number: u32,
+    /// Whether the connection begins.
+    pub syn: bool,
+    /// Whether the sender sends nothing after this, or aborts the connection.
+    pub end: bool,
+    /// Whether the source knows that a batch begins here, on a connection of Zenoh.
+    pub is_boundary: bool,
+    /// The bytes before it that the source has not passed on.
+    pub before: Before,
+    /// Captured beginning of the bytes.
+    pub bytes: &'a [u8],
+    /// Number of the bytes.
+    pub length: u32,
+}
+
+/// What is known of missing bytes before a chunk.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Before {
+    /// Nothing: they may come later.
+    #[default]
+    Unknown,
+    /// They were left out because they are not needed.
+    Skipped,
+    /// They will not come.
+    Lost,
+}
+
+/// What happened to segments and batches.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Batches.
+    pub batches: u64,
+    /// Bytes that repeat earlier ones.
+    pub retransmitted_bytes: u64,
+    /// Times that bytes were missing.
+    pub gaps: u64,
+    /// Bytes before a boundary was found.
+    pub unsynchronized_bytes: u64,
+    /// Connections dropped because too many were open, or too many bytes waited.
+    pub evicted: u64,
+}
+
+/// All followed connections.
+#[derive(Debug)]
+pub struct Streams {
+    /// TCP ports of Zenoh.
+    ports: Vec<u16>,
+    streams: HashMap<StreamId, Box<Stream>>,
+    /// Streams of each flow: two if both sockets are of this host.
+    flows: HashMap<Flow, usize>,
+    /// The order in which to evict, with streams that may be gone.
+    order: VecDeque<StreamId>,
+    bytes: usize,
+    /// When they were last examined for segments that wait too long.
+    examined: Timestamp,
+    counters: Counters,
+}
+
+impl Default for Streams {
+    fn default() -> Self {
+        Self::new(vec![PORT])
+    }
+}
+
+impl Streams {
+    /// Creates a table without connections. TLS on one of `ports` is reported.
+    #[must_use]
+    pub fn new(ports: Vec<u16>) -> Self {
+        Self {
+            ports,
+            streams: HashMap::new(),
+            flows: HashMap::new(),
+            order: VecDeque::new(),
+            bytes: 0,
+            examined: Timestamp(0),
+            counters: Counters::default(),
+        }
+    }
+
+    /// Adds a piece and reports what it completes.
+    pub fn chunk(&mut self, chunk: &Chunk<'_>, mut report: impl FnMut(&StreamReport<'_>)) {
+        let id = chunk.stream;
+        let mut pass = |event: StreamEvent<'_>| {
+            report(&StreamReport {
+                time: chunk.time,
+                stream: &id,
+                event,
+            });
+        };
+        if chunk.syn {
+            let known = self.streams.get(&id);
+            if known.is_some_and(|stream| stream.began_with(chunk)) {
+                return;
+            }
+            self.forget(&id);
+        } else if chunk.length == 0 && !chunk.end {
+            return;
+        }
+        if !self.streams.contains_key(&id) {
+            if chunk.end && !chunk.syn {
+                return;
+            }
+            self.make_room();
+            self.order.push_back(id);
+            let (one, other) = (id.flow.source.port, id.flow.destination.port);
+            let is_zenoh_port = self.ports.contains(&one) || self.ports.contains(&other);
+            let stream = Box::new(Stream::new(chunk, is_zenoh_port));
+            self.streams.insert(id, stream);
+            *self.flows.entry(id.flow).or_default() += 1;
+        }
+        let Some(stream) = self.streams.get_mut(&id) else {
+            return;
+        };
+        let before = stream.held();
+        let was_zenoh = stream.is_zenoh();
+        let counters = &mut self.counters;
+        let took = stream.take(chunk, counters, &mut |event| pass(event));
+        while chunk.end && stream.waits() {
+            stream.give_up(counters, &mut |event| pass(event));
+        }
+        let (after, is_zenoh) = (stream.held(), stream.is_zenoh());
+        self.bytes = (self.bytes + after).saturating_sub(before);
+        if chunk.end || took == Took::NotZenoh {
+            if (is_zenoh || was_zenoh) && chunk.end {
+                pass(StreamEvent::End);
+            }
+            if chunk.end {
+                self.forget(&id);
+            }
+        }
+        if took == Took::Tls {
+            pass(StreamEvent::Unseen(Unseen::Tls));
+        }
+        while self.bytes > MAX_BYTES {
+            self.evict();
+        }
+    }
+
+    /// Reports a UDP datagram of `length` bytes with which a QUIC connection of Zenoh begins. Returns
+    /// whether it is one: a QUIC Initial packet on a port of Zenoh.
+    pub fn datagram(
+        &self,
+        (time, mut stream): (Timestamp, StreamId),
+        bytes: &[u8],
+        length: u32,
+        mut report: impl FnMut(&StreamReport<'_>),
+    ) -> bool {
+        let Flow {
+            source,
+            destination,
+        } = &mut stream.flow;
+        let is_to_zenoh = self.ports.contains(&destination.port);
+        if !is_to_zenoh && !self.ports.contains(&source.port) {
+            return false;
+        }
+        let head = bytes.first_chunk();
+        if !head.is_some_and(|head| quic::is_initial(*head, length)) {
+            return false;
+        }
+        // The client's port differs for each connection, whose end is not visible.
+        match is_to_zenoh {
+            true => source.port = 0,
+            false => destination.port = 0,
+        }
+        report(&StreamReport {
+            time,
+            stream: &stream,
+            event: StreamEvent::Unseen(Unseen::Quic),
+        });
+        true
+    }
+
+    /// Gives up segments that have waited too long for the missing ones. May be called as often as
+    /// the caller likes.
+    pub fn advance(&mut self, now: Timestamp, mut report: impl FnMut(&StreamReport<'_>)) {
+        if now.distance(self.examined) < EXAMINATION_INTERVAL {
+            return;
+        }
+        self.examined = now;
+        let counters = &mut self.counters;
+        for (id, stream) in &mut self.streams {
+            if !stream.has_waited(now) {
+                continue;
+            }
+            let before = stream.held();
+            stream.give_up(counters, &mut |event| {
+                report(&StreamReport {
+                    time: now,
+                    stream: id,
+                    event,
+                });
+            });
+            self.bytes = (self.bytes + stream.held()).saturating_sub(before);
+        }
+    }
+
+    /// Returns whether a direction is followed, at whatever socket.
+    #[must_use]
+    pub fn follows_flow(&self, flow: &Flow) -> bool {
+        self.flows.contains_key(flow)
+    }
+
+    /// Returns what happened to segments and batches.
+    #[must_use]
+    pub const fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Returns the number of bytes that wait.
+    #[must_use]
+    pub const fn bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Returns the size and cap of each table.
+    #[must_use]
+    pub fn sizes(&self) -> [Size; 4] {
+        // The destructuring makes a new table fail to compile until it is listed here.
+        let Self {
+            ports: _,
+            streams,
+            flows,
+            order,
+            bytes,
+            examined: _,
+            counters: _,
+        } = self;
+        [
+            Size::new("zenoh.streams", streams.len(), MAX_STREAMS),
+            Size::new("zenoh.streams.flows", flows.len(), MAX_STREAMS),
+            Size::new("zenoh.streams.order", order.len(), 2 * MAX_STREAMS),
+            Size::new("zenoh.streams.bytes", *bytes, MAX_BYTES),
+        ]
+    }
+
+    fn forget(&mut self, id: &StreamId) {
+        if let Some(stream) = self.streams.remove(id) {
+            self.bytes = self.bytes.saturating_sub(stream.held());
+            if let Entry::Occupied(mut count) = self.flows.entry(id.flow) {
+                *count.get_mut() -= 1;
+                if *count.get() == 0 {
+                    count.remove();
+                }
+            }
+        }
+        if self.order.len() >= 2 * MAX_STREAMS {
+            let streams = &self.streams;
+            self.order.retain(|id| streams.contains_key(id));
+        }
+    }
+
+    fn make_room(&mut self) {
+        while self.streams.len() >= MAX_STREAMS {
+            self.evict();
+        }
+    }
+
+    /// Drops a connection: first the oldest that is not known to be one of Zenoh, otherwise the
+    /// oldest.
+    fn evict(&mut self) {
+        let known = |id: &StreamId| self.streams.get(id).map(|stream| stream.is_zenoh());
+        let stranger = self.order.iter().position(|id| known(id) == Some(false));
+        let oldest = stranger.or_else(|| self.order.iter().position(|id| known(id).is_some()));
+        match oldest.and_then(|position| self.order.remove(position)) {
+            Some(id) => {
+                self.counters.evicted += 1;
+                self.forget(&id);
+            }
+            None => {
+                self.streams.clear();
+                self.flows.clear();
+                self.bytes = 0;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,488 @@
+use std::path::Path;
+
+use proptest::prelude::*;
+use ros2probe_model::zenoh::Flow;
+
+use super::*;
+use crate::pcap::PcapReader;
+
+/// What a replay of a capture reports.
+#[derive(Default, PartialEq, Eq, Debug)]
+struct Reported {
+    batches: Vec<(Flow, Vec<u8>)>,
+    gaps: u64,
+    begun: u64,
+    ended: u64,
+    tls: u64,
+}
+
+impl Reported {
+    fn note(&mut self, report: &StreamReport<'_>) {
+        match report.event {
+            StreamEvent::Batch { bytes, length } => {
+                assert_eq!(bytes.len(), usize::from(length));
+                self.batches.push((report.stream.flow, bytes.to_vec()));
+            }
+            StreamEvent::Gap => self.gaps += 1,
+            StreamEvent::Begin => self.begun += 1,
+            StreamEvent::End => self.ended += 1,
+            StreamEvent::Unseen(Unseen::Tls) => self.tls += 1,
+            StreamEvent::Unseen(_) => {}
+        }
+    }
+}
+
+/// A captured segment.
+#[derive(Clone, Debug)]
+struct Segment {
+    time: Timestamp,
+    flow: Flow,
+    sequence_number: u32,
+    syn: bool,
+    end: bool,
+    bytes: Vec<u8>,
+}
+
+fn segments() -> Vec<Segment> {
+    use ros2probe_model::route::Destination;
+    use ros2probe_wire::frame::{self, Payload};
+
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../testing/data/zenoh/lifecycle-1host/capture.pcap.gz");
+    let mut reader = PcapReader::open(&path).unwrap();
+    let mut segments = Vec::new();
+    while let Some(captured) = reader.next_packet().unwrap() {
+        let frame = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
+        let packet = frame.packet.unwrap();
+        let Payload::Segment(segment) = packet.payload else {
+            continue;
+        };
+        let place = |address, port| Destination { address, port };
+        segments.push(Segment {
+            time: captured.time,
+            flow: Flow {
+                source: place(packet.source, segment.source_port),
+                destination: place(packet.destination, segment.destination_port),
+            },
+            sequence_number: segment.sequence_number,
+            syn: segment.syn,
+            end: segment.fin || segment.rst,
+            bytes: segment.payload.to_vec(),
+        });
+    }
+    segments
+}
+
+fn follow(segments: &[Segment]) -> (Reported, Counters) {
+    let (mut streams, mut reported) = (Streams::default(), Reported::default());
+    for segment in segments {
+        let chunk = Chunk {
+            time: segment.time,
+            stream: StreamId {
+                flow: segment.flow,
+                ..StreamId::default()
+            },
+            sequence_number: segment.sequence_number,
+            syn: segment.syn,
+            end: segment.end,
+            is_boundary: false,
+            before: Before::Unknown,
+            bytes: &segment.bytes,
+            length: u32::try_from(segment.bytes.len()).unwrap(),
+        };
+        streams.advance(segment.time, |report| reported.note(report));
+        streams.chunk(&chunk, |report| reported.note(report));
+        for size in streams.sizes() {
+            assert!(size.entries <= size.cap, "{size:?}");
+        }
+    }
+    (reported, streams.counters())
+}
+
+#[test]
+fn a_capture_has_as_many_batches_as_an_independent_decoder_found() {
+    let (reported, counters) = follow(&segments());
+    assert_eq!(reported.batches.len(), 3517);
+    assert_eq!(counters.batches, 3517);
+    assert_eq!((reported.gaps, counters.gaps, counters.evicted), (0, 0, 0));
+    assert_eq!(counters.retransmitted_bytes, 797);
+}
+
+#[test]
+fn segments_out_of_order_or_again_change_nothing() {
+    let segments = segments();
+    let (expected, _) = follow(&segments);
+    let data = |segment: &Segment| !segment.bytes.is_empty() && !segment.end && !segment.syn;
+    let mut shuffled = Vec::new();
+    for (index, pair) in segments.chunks(2).enumerate() {
+        match pair {
+            [one, two] if data(one) && data(two) && index % 3 != 0 => {
+                shuffled.extend([two.clone(), one.clone(), two.clone()]);
+            }
+            _ => shuffled.extend(pair.iter().cloned()),
+        }
+    }
+    let (reported, counters) = follow(&shuffled);
+    assert!(counters.retransmitted_bytes > 10_000, "{counters:?}");
+    let sorted = |reported: &Reported| {
+        let mut batches = reported.batches.clone();
+        batches.sort_by_key(|(flow, _)| *flow);
+        batches
+    };
+    assert_eq!(sorted(&reported), sorted(&expected));
+}
+
+#[test]
+fn after_a_gap_the_next_boundary_is_found_soon() {
+    let mut segments = segments();
+    let (expected, _) = follow(&segments);
+    let busiest = |segment: &Segment| segment.bytes.len() > 300;
+    let lost: Vec<_> = (2000..2003)
+        .filter(|index| busiest(&segments[*index]))
+        .collect();
+    assert!(!lost.is_empty());
+    for index in lost.into_iter().rev() {
+        segments.remove(index);
+    }
+    let (reported, counters) = follow(&segments);
+    assert!(counters.gaps > 0 && reported.gaps > 0);
+    let missing = expected.batches.len() - reported.batches.len();
+    assert!((1..=4).contains(&missing), "{missing}");
+    let found = |batch| expected.batches.contains(batch);
+    assert!(reported.batches.iter().all(found));
+}
+
+#[test]
+fn a_connection_that_is_older_than_the_capture_is_found() {
+    let segments = segments();
+    let (expected, _) = follow(&segments);
+    let (reported, counters) = follow(&segments[2500..]);
+    assert!(reported.batches.len() > 1000, "{}", reported.batches.len());
+    assert!(counters.unsynchronized_bytes < 1000, "{counters:?}");
+    assert!(
+        reported
+            .batches
+            .iter()
+            .all(|batch| expected.batches.contains(batch))
+    );
+}
+
+#[test]
+fn other_connections_are_left_alone_and_tls_is_named() {
+    let place = |port| ros2probe_model::route::Destination {
+        address: [1; 16],
+        port,
+    };
+    let segment = |port, sequence_number, bytes: &[u8]| Segment {
+        time: Timestamp(1),
+        flow: Flow {
+            source: place(1),
+            destination: place(port),
+        },
+        sequence_number,
+        syn: sequence_number == 9,
+        end: false,
+        bytes: bytes.to_vec(),
+    };
+    let hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03";
+    let request = b"GET / HTTP/1.1\r\nHost: robot\r\n\r\n";
+    let (reported, _) = follow(&[
+        segment(7447, 9, &[]),
+        segment(7447, 10, hello),
+        segment(443, 9, &[]),
+        segment(443, 10, hello),
+        segment(80, 9, &[]),
+        segment(80, 10, request),
+        segment(81, 10, request),
+    ]);
+    assert_eq!(reported.tls, 1);
+    assert!(reported.batches.is_empty());
+}
+
+proptest! {
+    #[test]
+    fn any_segments_are_bounded(
+        segments in prop::collection::vec(
+            (0..4_u16, any::<u32>(), any::<(bool, bool, bool)>(), prop::collection::vec(any::<u8>(), 0..80), 0..100_000_u32),
+            0..200,
+        )
+    ) {
+        let mut streams = Streams::default();
+        for (port, number, (syn, end, is_boundary), bytes, more) in &segments {
+            let chunk = Chunk {
+                time: Timestamp(u64::from(*number)),
+                stream: StreamId {
+                    flow: Flow {
+                        source: ros2probe_model::route::Destination { address: [0; 16], port: *port },
+                        ..Flow::default()
+                    },
+                    ..StreamId::default()
+                },
+                sequence_number: *number % 1000,
+                syn: *syn && *end,
+                end: *end && !*syn,
+                is_boundary: *is_boundary,
+                before: [Before::Unknown, Before::Skipped, Before::Lost][bytes.len() % 3],
+                bytes,
+                length: u32::try_from(bytes.len()).unwrap() + more,
+            };
+            streams.chunk(&chunk, |_| {});
+            let held: usize = streams.streams.values().map(|stream| stream.held()).sum();
+            prop_assert_eq!(held, streams.bytes());
+        }
+    }
+}
+
+/// A chunk of the connection from this port.
+fn chunk(port: u16, sequence_number: u32, bytes: &[u8]) -> Chunk<'_> {
+    use ros2probe_model::route::Destination;
+    let source = Destination {
+        address: [1; 16],
+        port,
+    };
+    Chunk {
+        time: Timestamp(1),
+        stream: StreamId {
+            flow: Flow {
+                source,
+                ..Flow::default()
+            },
+            ..StreamId::default()
+        },
+        sequence_number,
+        syn: false,
+        end: false,
+        is_boundary: false,
+        before: Before::Unknown,
+        bytes,
+        length: u32::try_from(bytes.len()).unwrap(),
+    }
+}
+
+#[test]
+fn more_directions_than_there_is_room_for_push_out_the_oldest_stranger() {
+    let mut streams = Streams::default();
+    let zenoh = Chunk {
+        is_boundary: true,
+        ..chunk(1, 1, &[1, 0, 4])
+    };
+    streams.chunk(&zenoh, |_| {});
+    for port in 2..5002 {
+        streams.chunk(&chunk(port, 1, &[0; 10]), |_| {});
+    }
+    assert_eq!(streams.sizes()[0].entries, MAX_STREAMS);
+    assert_eq!(streams.counters().evicted, 5001 - MAX_STREAMS as u64);
+    assert!(streams.follows_flow(&zenoh.stream.flow));
+    assert!(!streams.follows_flow(&chunk(2, 1, &[]).stream.flow));
+}
+
+#[test]
+fn unfinished_batches_keep_within_their_bytes() {
+    let mut streams = Streams::default();
+    let begun = [&[0xff, 0xff][..], &[5; 65_000]].concat();
+    for port in 1..400 {
+        let begun = Chunk {
+            is_boundary: true,
+            ..chunk(port, 1, &begun)
+        };
+        streams.chunk(&begun, |_| {});
+        assert!(streams.bytes() <= MAX_BYTES);
+    }
+    assert!(streams.bytes() > MAX_BYTES - 70_000);
+    assert!(streams.counters().evicted > 100);
+}
+
+#[test]
+fn so_many_segments_wait_for_missing_bytes_that_then_are_given_up() {
+    let mut streams = Streams::default();
+    let first = Chunk {
+        is_boundary: true,
+        ..chunk(1, 1, &[1, 0, 4])
+    };
+    streams.chunk(&first, |_| {});
+    for number in 0..4096 {
+        streams.chunk(&chunk(1, 100 + 3 * number, &[1, 0, 4]), |_| {});
+    }
+    assert_eq!(streams.counters().gaps, 0);
+    streams.chunk(&chunk(1, 100_000, &[1, 0, 4]), |_| {});
+    assert_eq!(streams.counters().gaps, 1);
+}
+
+#[test]
+fn so_many_bytes_wait_for_missing_ones_that_then_are_given_up() {
+    let mut streams = Streams::default();
+    let first = Chunk {
+        is_boundary: true,
+        ..chunk(1, 1, &[1, 0, 4])
+    };
+    streams.chunk(&first, |_| {});
+    let segment = vec![0; 1 << 16];
+    for number in 0..64 {
+        streams.chunk(&chunk(1, 100 + (number << 16), &segment), |_| {});
+    }
+    assert_eq!((streams.counters().gaps, streams.bytes()), (0, 4 << 20));
+    streams.chunk(&chunk(1, 100 + (64 << 16), &[1, 0, 4]), |_| {});
+    assert_eq!(streams.counters().gaps, 1);
+}
+
+#[test]
+fn bytes_that_may_be_batches_are_collected_up_to_three_of_the_largest() {
+    let mut streams = Streams::default();
+    let mut next = 1;
+    let mut most = 0;
+    for lane in 0..6 {
+        // Fragments of lanes that have no other one.
+        let header = [0xff, 0xff, 0xe6, 1, 0x31, lane];
+        for part in [&header[..], &[0; 65_535 - 4]] {
+            streams.chunk(&chunk(1, next, part), |_| {});
+            next += u32::try_from(part.len()).unwrap();
+            most = most.max(streams.bytes());
+        }
+    }
+    assert_eq!(most, 3 * 65_537);
+    assert_eq!(streams.counters().batches, 0);
+}
+
+/// Zenoh sends one in place of the rest of a message that it drops.
+#[test]
+fn a_batch_without_a_message_is_no_gap_and_a_run_of_zeros_is() {
+    let first = [4, 0, 0x25, 1, 0x1d, 3, 0, 0, 4, 0, 0x25, 2, 0x1d, 3];
+    for parts in 1..first.len() {
+        let (mut streams, mut reported) = (Streams::default(), Reported::default());
+        let mut next = 1;
+        for part in first.chunks(parts) {
+            let chunk = Chunk {
+                is_boundary: next == 1,
+                ..chunk(1, next, part)
+            };
+            streams.chunk(&chunk, |report| reported.note(report));
+            next += u32::try_from(part.len()).unwrap();
+        }
+        assert_eq!((reported.batches.len(), reported.gaps), (2, 0), "{parts}");
+        streams.chunk(&chunk(1, next, &[0; 128]), |report| reported.note(report));
+        assert_eq!(reported.gaps, 0);
+        streams.chunk(&chunk(1, next + 128, &[0; 2]), |report| {
+            reported.note(report);
+        });
+        assert_eq!((reported.batches.len(), reported.gaps), (2, 1), "{parts}");
+    }
+}
+
+#[test]
+fn bytes_left_out_on_purpose_are_no_gap_and_lost_ones_are() {
+    let frame = |number| [4, 0, 0x25, number, 0x1d, 3];
+    let mut streams = Streams::default();
+    let mut reported = Reported::default();
+    let chunks = [
+        (1, Before::Unknown, frame(1)),
+        (1001, Before::Skipped, frame(2)),
+        (1007, Before::Unknown, frame(3)),
+        (2013, Before::Lost, frame(4)),
+        (2019, Before::Unknown, frame(5)),
+    ];
+    let mut gaps = Vec::new();
+    for (number, before, bytes) in chunks {
+        let chunk = Chunk {
+            is_boundary: true,
+            before,
+            ..chunk(1, number, &bytes)
+        };
+        streams.chunk(&chunk, |report| reported.note(report));
+        gaps.push(reported.gaps);
+    }
+    assert_eq!(gaps, [0, 0, 0, 1, 1]);
+    assert_eq!(reported.batches.len(), 5);
+    assert_eq!(
+        (streams.counters().gaps, streams.counters().batches),
+        (1, 5)
+    );
+}
+
+/// A UDP datagram over IPv4 between these ports, as a raw packet.
+fn datagram(source_port: u16, destination_port: u16, payload: &[u8]) -> Vec<u8> {
+    let length = |header: usize| u16::try_from(payload.len() + header).unwrap().to_be_bytes();
+    let mut bytes = vec![0x45, 0];
+    bytes.extend(length(28));
+    bytes.extend([0, 0, 0x40, 0, 64, 17, 0, 0]);
+    let (client, server) = ([10, 0, 0, 1], [10, 0, 0, 2]);
+    let is_answer = source_port == 7447;
+    bytes.extend(match is_answer {
+        true => [server, client].concat(),
+        false => [client, server].concat(),
+    });
+    bytes.extend(source_port.to_be_bytes());
+    bytes.extend(destination_port.to_be_bytes());
+    bytes.extend(length(8));
+    bytes.extend([0, 0]);
+    bytes.extend(payload);
+    bytes
+}
+
+/// Replays datagrams between these ports; returns the number of QUIC connections.
+fn quic_in(datagrams: &[(u16, u16, Vec<u8>)]) -> u64 {
+    use crate::frame_decoder::FrameDecoder;
+    use crate::pcap::Captured;
+    use crate::reassembly::Limits;
+    use ros2probe_model::observer::{Observer, Settings};
+    use ros2probe_wire::frame::Link;
+
+    let mut observer = Observer::new(Settings::default());
+    let mut decoder = FrameDecoder::new(Limits::default());
+    for (source_port, destination_port, payload) in datagrams {
+        let packet = datagram(*source_port, *destination_port, payload);
+        let captured = Captured {
+            time: Timestamp(1),
+            link: Link::RAW,
+            interface: 0,
+            bytes: &packet,
+            length: u32::try_from(packet.len()).unwrap(),
+        };
+        decoder.packet(&captured, &mut observer);
+    }
+    let facts = observer.snapshot(Timestamp(2)).zenoh;
+    let unseen = facts.iter().flat_map(|facts| facts.unseen());
+    let quic = unseen.inspect(|(reason, _)| assert_eq!(*reason, Unseen::Quic));
+    quic.map(|(_, connections)| connections).sum()
+}
+
+/// An Initial packet as RFC 9001, A.2 pads it, in this version.
+fn initial(version: [u8; 4]) -> Vec<u8> {
+    let first = if version == [0, 0, 0, 1] { 0xc3 } else { 0xd3 };
+    let mut bytes = [&[first][..], &version, &[8]].concat();
+    bytes.resize(1200, 0x5a);
+    bytes
+}
+
+#[test]
+fn quic_is_named_on_a_port_of_zenoh_in_a_capture() {
+    for version in [[0, 0, 0, 1], [0x6b, 0x33, 0x43, 0xcf]] {
+        let packet = initial(version);
+        assert_eq!(quic_in(&[(50_000, 7447, packet.clone())]), 1);
+        assert_eq!(quic_in(&[(7447, 50_000, packet.clone())]), 1);
+        let both = [50_000, 50_001]
+            .map(|port| [(port, 7447, packet.clone()), (7447, port, packet.clone())]);
+        assert_eq!(quic_in(&both.concat()), 1, "between two addresses");
+    }
+}
+
+#[test]
+fn other_datagrams_on_a_port_of_zenoh_are_no_quic() {
+    let short_header = [&[0x43][..], &[0x5a; 1251]].concat();
+    let draft = initial([0xff, 0, 0, 0x1d]);
+    let cut = initial([0, 0, 0, 1])[..1199].to_vec();
+    let rtps = [&b"RTPS\x02\x03"[..], &[0; 1300]].concat();
+    for payload in [short_header, draft, cut, rtps, vec![], vec![0xc0]] {
+        assert_eq!(quic_in(&[(50_000, 7447, payload)]), 0);
+    }
+    // Scouting, and HTTP/3.
+    for port in [7446, 443] {
+        assert_eq!(quic_in(&[(50_000, port, initial([0, 0, 0, 1]))]), 0);
+    }
+}
+
+proptest! {
+    #[test]
+    fn random_datagrams_are_no_quic(bytes in proptest::collection::vec(any::<u8>(), 0..1500)) {
+        prop_assert_eq!(quic_in(&[(50_000, 7447, bytes)]), 0);
+    }
+}

@@ -1,0 +1,308 @@
+//! Text of `rp inside`: a table for each kind of entity.
+
+use std::borrow::Cow;
+
+use ros2probe_api::inside::{Durations, Inside, Owner};
+
+use crate::top::text::{safe, seconds};
+
+/// Width between two columns.
+const GAP: usize = 2;
+
+/// Keeps what belongs to this node or topic.
+pub fn select(inside: &mut Inside<'_>, name: &str) {
+    let is_own = |owner: &Owner<'_>| owner.node.as_deref() == Some(name);
+    let is_topic = |topic: Option<&str>| topic == Some(name);
+    inside
+        .publishers
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
+        .subscriptions
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
+        .buffers
+        .retain(|each| is_own(&each.owner) || is_topic(each.topic.as_deref()));
+    inside
+        .callbacks
+        .retain(|each| is_own(&each.owner) || is_topic(each.trigger.name.as_deref()));
+    inside
+        .lifecycle_states
+        .retain(|each| each.node.as_deref() == Some(name));
+    let publishers = inside.publishers.iter().map(|each| &each.owner);
+    let subscriptions = inside.subscriptions.iter().map(|each| &each.owner);
+    let buffers = inside.buffers.iter().map(|each| &each.owner);
+    let callbacks = inside.callbacks.iter().map(|each| &each.owner);
+    let owners = publishers.chain(subscriptions).chain(buffers);
+    let own: Vec<u32> = owners
+        .chain(callbacks)
+        .map(|owner| owner.process_id)
+        .collect();
+    inside
+        .processes
+        .retain(|each| own.contains(&each.process_id) || each.nodes.iter().any(|it| it == name));
+}
+
+/// Returns whether nothing is known.
+#[must_use]
+pub fn is_empty(inside: &Inside<'_>) -> bool {
+    inside.processes.is_empty()
+        && inside.publishers.is_empty()
+        && inside.subscriptions.is_empty()
+        && inside.buffers.is_empty()
+        && inside.callbacks.is_empty()
+}
+
+/// Returns all tables, each below its heading; empty ones are left out.
+#[must_use]
+pub fn text(inside: &Inside<'_>) -> String {
+    let mut out = String::new();
+    let processes = inside.processes.iter().map(|it| {
+        let state = if it.suspended { "suspended" } else { "" };
+        let nodes: Vec<_> = it.nodes.iter().map(|node| safe(node)).collect();
+        row([
+            it.process_id.to_string(),
+            it.process.as_deref().map(safe).unwrap_or_default(),
+            it.domain_id.to_string(),
+            it.cpu_ratio.map(percent).unwrap_or_default(),
+            it.calls_per_second.map(hertz).unwrap_or_default(),
+            state.to_owned(),
+            nodes.join(" "),
+        ])
+    });
+    let head = ["PROCESS", "NAME", "DOMAIN", "CPU", "CALLS/S", "", "NODES"];
+    table(&mut out, head, processes);
+    let publishers = inside.publishers.iter().map(|it| {
+        row([
+            safe(&it.topic),
+            who(&it.owner),
+            it.published_messages.to_string(),
+            it.within_process_messages.to_string(),
+            it.rate_hertz.map(hertz).unwrap_or_default(),
+            quantiles(it.interval.as_ref()),
+            it.middleware.as_deref().map(safe).unwrap_or_default(),
+        ])
+    });
+    let head = [
+        "PUBLISHER",
+        "NODE",
+        "PUBLISHED",
+        "WITHIN",
+        "HZ",
+        "INTERVAL P50/P99",
+        "MIDDLEWARE",
+    ];
+    table(&mut out, head, publishers);
+    let subscriptions = inside.subscriptions.iter().map(|it| {
+        row([
+            safe(&it.topic),
+            who(&it.owner),
+            it.taken_messages.to_string(),
+            it.failed_takes.to_string(),
+            it.rate_hertz.map(hertz).unwrap_or_default(),
+            quantiles(it.latency.as_ref()),
+            it.middleware.as_deref().map(safe).unwrap_or_default(),
+        ])
+    });
+    let head = [
+        "SUBSCRIPTION",
+        "NODE",
+        "TAKEN",
+        "FAILED",
+        "HZ",
+        "LATENCY P50/P99",
+        "MIDDLEWARE",
+    ];
+    table(&mut out, head, subscriptions);
+    let buffers = inside.buffers.iter().map(|it| {
+        let capacity = it.capacity.map(|capacity| format!("/{capacity}"));
+        row([
+            it.topic.as_deref().map(safe).unwrap_or_default(),
+            who(&it.owner),
+            it.enqueued_messages.to_string(),
+            it.overwritten_messages.to_string(),
+            it.rate_hertz.map(hertz).unwrap_or_default(),
+            quantiles(it.waiting.as_ref()),
+            format!("{}{}", it.depth, capacity.unwrap_or_default()),
+        ])
+    });
+    let head = [
+        "BUFFER",
+        "NODE",
+        "ENQUEUED",
+        "OVERWRITTEN",
+        "HZ",
+        "WAITING P50/P99",
+        "DEPTH",
+    ];
+    table(&mut out, head, buffers);
+    let callbacks = inside.callbacks.iter().map(|it| {
+        row([
+            safe(&it.trigger.words()),
+            who(&it.owner),
+            it.calls.to_string(),
+            it.busy_ratio.map(percent).unwrap_or_default(),
+            it.rate_hertz.map(hertz).unwrap_or_default(),
+            quantiles(it.duration.as_ref()),
+            quantiles(it.wait.as_ref()),
+        ])
+    });
+    let head = [
+        "CALLBACK",
+        "NODE",
+        "CALLS",
+        "BUSY",
+        "HZ",
+        "DURATION P50/P99",
+        "WAIT P50/P99",
+    ];
+    table(&mut out, head, callbacks);
+    for state in &inside.lifecycle_states {
+        let node = state.node.as_deref().map_or(Cow::Borrowed("?"), Cow::from);
+        out.push_str(&format!("{} is {}\n", safe(&node), safe(&state.state)));
+    }
+    out
+}
+
+fn row<const N: usize>(cells: [String; N]) -> [String; N] {
+    cells.map(|cell| {
+        if cell.is_empty() {
+            "-".to_owned()
+        } else {
+            cell
+        }
+    })
+}
+
+fn table<const N: usize>(
+    out: &mut String,
+    head: [&str; N],
+    rows: impl Iterator<Item = [String; N]>,
+) {
+    let rows: Vec<_> = rows.collect();
+    if rows.is_empty() {
+        return;
+    }
+    if !out.is_empty() {
+        out.push('\n');
+    }
+    let head = head.map(str::to_owned);
+    let all = || std::iter::once(&head).chain(&rows);
+    let mut widths = [0; N];
+    for cells in all() {
+        for (width, cell) in widths.iter_mut().zip(cells) {
+            *width = cell.chars().count().max(*width);
+        }
+    }
+    for cells in all() {
+        let padded = cells.iter().zip(widths);
+        let line: String = padded
+            .map(|(cell, width)| format!("{cell:<0$}", width + GAP))
+            .collect();
+        out.push_str(line.trim_end());
+        out.push('\n');
+    }
+}
+
+fn who(owner: &Owner<'_>) -> String {
+    let process = || format!("process {}", owner.process_id);
+    owner.node.as_deref().map_or_else(process, safe)
+}
+
+fn hertz(rate: f64) -> String {
+    format!("{rate:.1}")
+}
+
+fn percent(ratio: f64) -> String {
+    format!("{:.1}%", ratio * 100.0)
+}
+
+fn quantiles(durations: Option<&Durations>) -> String {
+    durations.map_or_else(String::new, |it| {
+        format!("{} {}", seconds(it.p50_seconds), seconds(it.p99_seconds))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use ros2probe_api::inside::{Buffer, Callback, Process, Publisher, Trigger};
+
+    use super::*;
+
+    fn owner(node: Option<&'static str>) -> Owner<'static> {
+        Owner {
+            process_id: 42,
+            node: node.map(Cow::Borrowed),
+            ..Owner::default()
+        }
+    }
+
+    fn inside() -> Inside<'static> {
+        Inside {
+            processes: vec![Process {
+                process_id: 42,
+                process: Some("nav".into()),
+                ..Process::default()
+            }],
+            publishers: vec![Publisher {
+                owner: owner(Some("/lidar")),
+                topic: "/scan".into(),
+                published_messages: 120,
+                rate_hertz: Some(10.04),
+                ..Publisher::default()
+            }],
+            buffers: vec![Buffer {
+                owner: owner(None),
+                topic: Some("/points\u{1b}[2J".into()),
+                depth: 3,
+                capacity: Some(5),
+                ..Buffer::default()
+            }],
+            callbacks: vec![Callback {
+                owner: owner(Some("/nav")),
+                trigger: Trigger {
+                    kind: "timer".into(),
+                    name: None,
+                    period_seconds: Some(0.05),
+                },
+                busy_ratio: Some(0.4),
+                ..Callback::default()
+            }],
+            ..Inside::default()
+        }
+    }
+
+    #[test]
+    fn each_kind_has_a_table_and_hostile_names_are_escaped() {
+        let text = text(&inside());
+        let lines: Vec<_> = text.lines().collect();
+        let find = |start: &str| lines.iter().find(|line| line.starts_with(start));
+        let columns = |line: &str| {
+            line.split_whitespace()
+                .map(str::to_owned)
+                .collect::<Vec<_>>()
+        };
+        let scan = columns(find("/scan").unwrap());
+        assert_eq!(scan, ["/scan", "/lidar", "120", "0", "10.0", "-", "-"]);
+        assert!(find("timer 50 ms").unwrap().contains("40.0%"), "{text}");
+        assert!(find("/points").unwrap().ends_with("3/5"), "{text}");
+        assert!(
+            text.contains("process 42") && !text.contains('\u{1b}'),
+            "{text}"
+        );
+        assert!(!text.contains("SUBSCRIPTION"));
+    }
+
+    #[test]
+    fn a_name_selects_a_node_or_a_topic_with_its_processes() {
+        let mut of_node = inside();
+        select(&mut of_node, "/lidar");
+        let counts = (of_node.publishers.len(), of_node.callbacks.len());
+        assert_eq!((counts, of_node.processes.len()), ((1, 0), 1));
+        let mut of_topic = inside();
+        select(&mut of_topic, "/scan");
+        assert_eq!((of_topic.publishers.len(), of_topic.buffers.len()), (1, 0));
+        let mut of_none = inside();
+        select(&mut of_none, "/imu");
+        assert!(is_empty(&of_none));
+    }
+}

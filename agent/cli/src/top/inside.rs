@@ -1,0 +1,81 @@
+//! Problems and figures from inside processes, as text.
+
+use std::borrow::Cow;
+
+use ros2probe_api::diagnosis::Diagnosis;
+use ros2probe_api::inside::TopicInside;
+
+use super::text::{ratio, safe, seconds};
+
+/// Text of a problem that only calls inside processes show; `None` for another one.
+pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
+    let who = |node: &Option<Cow<'_, str>>, process: &u32| match node {
+        Some(node) => safe(node),
+        None => format!("process {process}"),
+    };
+    Some(match diagnosis {
+        Diagnosis::SlowCallback {
+            node,
+            process_id,
+            trigger,
+            duration_seconds,
+            period_seconds,
+            own_period,
+        } => format!(
+            "callback of {} in {} takes {}, {} is {}",
+            safe(&trigger.words()),
+            who(node, process_id),
+            seconds(*duration_seconds),
+            match own_period {
+                true => "its period",
+                false => "the period of a timer in its thread",
+            },
+            seconds(*period_seconds)
+        ),
+        Diagnosis::ExecutorWait {
+            node,
+            process_id,
+            trigger,
+            wait_seconds,
+        } => format!(
+            "callback of {} in {} waits {} for the executor",
+            safe(&trigger.words()),
+            who(node, process_id),
+            seconds(*wait_seconds)
+        ),
+        Diagnosis::IntraProcessOverflow {
+            node,
+            process_id,
+            overwritten_ratio,
+        } => format!(
+            "{} within the process overwrites {} of the messages",
+            who(node, process_id),
+            ratio(*overwritten_ratio)
+        ),
+        Diagnosis::ObservationSuspended { process_id, .. } => {
+            format!("process {process_id} exceeds the budget of capture.inside")
+        }
+        _ => return None,
+    })
+}
+
+/// One line about a topic's counts inside processes.
+pub(super) fn counts(inside: &TopicInside<'_>) -> String {
+    let mut line = format!(
+        "inside processes: {} published, {} taken",
+        inside.published_messages, inside.taken_messages
+    );
+    let rest = [
+        ("takes without a message", inside.failed_takes),
+        ("buffered within the process", inside.enqueued_messages),
+        ("overwritten there", inside.overwritten_messages),
+        (
+            "received within the process",
+            inside.intra_process_receptions,
+        ),
+    ];
+    for (what, count) in rest.into_iter().filter(|(_, count)| *count > 0) {
+        line.push_str(&format!(", {count} {what}"));
+    }
+    line
+}

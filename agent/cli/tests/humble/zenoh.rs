@@ -1,0 +1,325 @@
+//! Real nodes of rmw_zenoh under the agent's eyes: counts for each receiver equal the log of each
+//! subscription.
+//!
+//! Needs root and ROS 2 Humble: `make test-ros2`.
+
+mod bag;
+mod hosts;
+mod mixed;
+mod restart;
+mod viewer;
+
+use std::process::Command;
+use std::time::Duration;
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_api::topics::TopicDetails;
+use ros2probe_testing::harness::agent::{Agent, get};
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::wait_until;
+
+use crate::host::{Host, Middleware, RP};
+
+const PATIENCE: Duration = Duration::from_secs(60);
+const WATCH: &str = "watch:\n- {topic: '/**', per_subscriber: true}\n";
+
+/// What a subscription logged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Log {
+    pub received: u64,
+    /// Numbers between the first and the last that it did not receive.
+    missing: u64,
+}
+
+pub fn publisher(host: &Host<'_>, name: &str, topic: &str, rest: &[&str]) -> Result<Process> {
+    let arguments = [&["publish", name, topic], rest].concat();
+    let mut publisher = host.python("zenoh.py", &arguments)?;
+    publisher.wait_for("ready", PATIENCE)?;
+    Ok(publisher)
+}
+
+pub fn subscription(host: &Host<'_>, name: &str, topic: &str, rest: &[&str]) -> Result<Process> {
+    let arguments = [&["subscribe", name, topic], rest].concat();
+    let mut subscription = host.python("zenoh.py", &arguments)?;
+    subscription.wait_for("ready", PATIENCE)?;
+    Ok(subscription)
+}
+
+pub fn publish(publisher: &mut Process, messages: u64, total: u64) -> Result<()> {
+    publisher.write_line(&messages.to_string())?;
+    publisher.wait_for(&format!("published {total}"), PATIENCE)
+}
+
+pub fn log(subscription: &mut Process) -> Result<Log> {
+    subscription.write_line("count")?;
+    let line = subscription.line_with_end("", PATIENCE)?;
+    let words: Vec<&str> = line.split_whitespace().collect();
+    let [_, received, _, first, _, last] = words[..] else {
+        anyhow::bail!("{line}");
+    };
+    let [received, first, last]: [u64; 3] = [received.parse()?, first.parse()?, last.parse()?];
+    let span = if received == 0 { 0 } else { last - first + 1 };
+    Ok(Log {
+        received,
+        missing: span - received,
+    })
+}
+
+/// Returns what the log says once it has stayed the same for a second.
+fn settled_log(subscription: &mut Process) -> Result<Log> {
+    let mut before = log(subscription)?;
+    loop {
+        std::thread::sleep(Duration::from_secs(1));
+        let now = log(subscription)?;
+        if now == before {
+            return Ok(now);
+        }
+        before = now;
+    }
+}
+
+/// Returns what arrived at the node, and what was lost on the way, by the agent.
+fn delivered(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Log> {
+    let text = get(agent.host, &format!("http://127.0.0.1:17401/topics{topic}"))?;
+    let details: TopicDetails<'_> = serde_json::from_str(&text).with_context(|| text.clone())?;
+    let arrived = details.deliveries.iter().filter(|delivery| {
+        delivery.direction == "received" && delivery.nodes.iter().any(|other| *other == node)
+    });
+    let mut log = Log {
+        received: 0,
+        missing: 0,
+    };
+    for delivery in arrived {
+        log.received += delivery.delivered.messages;
+        log.missing += delivery.delivered.lost_messages;
+    }
+    Ok(log)
+}
+
+fn agrees(agent: &Agent<'_>, topic: &str, node: &str, log: Log) -> Result<()> {
+    let mut last = None;
+    let settled = wait_until("the agent agrees with the subscription's log", || {
+        let now = delivered(agent, topic, node)?;
+        last = Some(now);
+        Ok(now == log)
+    });
+    let figures = |page: &str| -> String {
+        let is_shown = |line: &&str| {
+            (line.contains("zenoh") || line.contains("filter_events")) && !line.starts_with("#")
+        };
+        let lines: Vec<_> = page.lines().filter(is_shown).collect();
+        lines.join("\n")
+    };
+    let page = agent.scrape()?.0;
+    settled.with_context(|| {
+        let figures = figures(&page);
+        format!("{topic} at {node}: logged {log:?}, delivered {last:?}\n{figures}")
+    })
+}
+
+fn discover(host: &Host<'_>) -> Result<()> {
+    let enter = host.enter();
+    let (program, arguments) = enter.split_first().context("no prefix")?;
+    let status = Command::new(program)
+        .args(arguments)
+        .args([RP, "discover", "--router"])
+        .status()?;
+    ensure!(status.success(), "rp discover --router");
+    Ok(())
+}
+
+fn messages(agent: &Agent<'_>, topic: &str) -> Result<f64> {
+    Ok(agent
+        .scrape()?
+        .sum("ros2_topic_messages_total", &[("topic", topic)]))
+}
+
+/// Checks that the agent names the process in which the node of a session runs.
+fn runs_in(agent: &Agent<'_>, node: &str, process: &Process) -> Result<()> {
+    let process_id = process.pid().to_string();
+    let cgroup = agent.host.cgroup();
+    let cgroup = format!("/{}", cgroup.file_name().context("no name")?.display());
+    let expected = [
+        ("process", "python3"),
+        ("pid", &process_id),
+        ("cgroup", &cgroup),
+    ];
+    let mut last = String::new();
+    let is_named = wait_until("the process is known", || {
+        let page = agent.scrape()?;
+        let is_shown = |line: &&str| {
+            line.starts_with("ros2_participant_info{") || line.starts_with("ros2_node_info{")
+        };
+        last = page
+            .0
+            .lines()
+            .filter(is_shown)
+            .collect::<Vec<_>>()
+            .join("\n");
+        let mut named = page.samples("ros2_participant_info", &expected);
+        Ok(named.next().is_some())
+    });
+    is_named.with_context(|| format!("{node}: {expected:?}\n{last}"))
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network, Middleware::Zenoh)?;
+    let agent = host.agent(WATCH)?;
+    let _router = host.router("")?;
+    let mut sensor = publisher(
+        &host,
+        "sensor",
+        "/imu",
+        &["1000", "300", "2000", "RELIABLE"],
+    )?;
+    let mut one = subscription(&host, "one", "/imu", &["2000", "RELIABLE"])?;
+    let mut two = subscription(&host, "two", "/imu", &["2000", "RELIABLE"])?;
+    let mut lidar = publisher(
+        &host,
+        "lidar",
+        "/points",
+        &["20", "2720000", "10", "RELIABLE"],
+    )?;
+    let mut map = subscription(&host, "map", "/points", &["10", "RELIABLE"])?;
+    for each in [&mut sensor, &mut lidar] {
+        each.wait_for("matched", PATIENCE)?;
+    }
+    for (process, node) in [(&sensor, "/sensor"), (&two, "/two"), (&map, "/map")] {
+        runs_in(&agent, node, process)?;
+    }
+    // Both subscriptions of the topic are matched.
+    std::thread::sleep(Duration::from_secs(2));
+    publish(&mut sensor, 5000, 5000)?;
+    publish(&mut lidar, 60, 60)?;
+    for (process, topic, node) in [
+        (&mut one, "/imu", "/one"),
+        (&mut two, "/imu", "/two"),
+        (&mut map, "/points", "/map"),
+    ] {
+        let log = settled_log(process)?;
+        println!("{node} logged {log:?}");
+        agrees(&agent, topic, node, log)?;
+    }
+    ensure!(messages(&agent, "/imu")? == 5000.0);
+    ensure!(messages(&agent, "/points")? == 60.0);
+    let page = agent.scrape()?;
+    ensure!(
+        page.sum("ros2probe_zenoh_gaps_total", &[]) == 0.0,
+        "{}",
+        page.0
+    );
+    ensure!(page.sum("ros2probe_zenoh_routers", &[]) == 1.0);
+    Ok(())
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network, Middleware::Zenoh)?;
+    let _router = host.router("")?;
+    let mut sensor = publisher(&host, "sensor", "/imu", &["200", "300", "2000", "RELIABLE"])?;
+    let mut one = subscription(&host, "one", "/imu", &["2000", "RELIABLE"])?;
+    sensor.wait_for("matched", PATIENCE)?;
+    publish(&mut sensor, 200, 200)?;
+    let agent = host.agent(WATCH)?;
+    publish(&mut sensor, 1000, 1200)?;
+    let page = agent.scrape_until("an unknown writer", |page| {
+        page.sum("ros2_unknown_writer_messages_total", &[]) >= 900.0
+    })?;
+    println!("{}", page.sum("ros2_unknown_writer_messages_total", &[]));
+    discover(&host)?;
+    agent.scrape_until("names", |page| {
+        page.samples("ros2_node_info", &[("ros_node", "/sensor")])
+            .count()
+            == 1
+    })?;
+    let before = messages(&agent, "/imu")?;
+    publish(&mut sensor, 1000, 2200)?;
+    wait_until("the messages count", || {
+        Ok(messages(&agent, "/imu")? == before + 1000.0)
+    })
+    .with_context(|| format!("{before}"))?;
+    let log = settled_log(&mut one)?;
+    ensure!(log.missing == 0, "{log:?}");
+    runs_in(&agent, "/sensor", &sensor)?;
+    Ok(())
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn messages_that_zenoh_drops_for_a_stopped_subscription_are_its_losses() -> Result<()> {
+    let logs = beside_a_stopped_subscription("20", "2720000", [10, 60, 20])?;
+    ensure!(logs[0].missing > 0, "nothing was dropped: {logs:?}");
+    Ok(())
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn small_messages_that_wait_for_a_stopped_subscription_arrive_in_large_packets() -> Result<()> {
+    let logs = beside_a_stopped_subscription("1000", "300", [1000, 5000, 1000])?;
+    ensure!(logs[1].received == 7000, "{logs:?}");
+    Ok(())
+}
+
+/// Publishes some messages, further ones while one of two subscriptions is stopped, and some more.
+/// Checks that the agent agrees with both, and returns what the stopped one logged, and the other.
+fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> Result<[Log; 2]> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network, Middleware::Zenoh)?;
+    let agent = host.agent(WATCH)?;
+    let _router = host.router("")?;
+    let qos = ["10000", "BEST_EFFORT"];
+    let mut slow = subscription(&host, "slow", "/data", &qos)?;
+    let mut fast = subscription(&host, "fast", "/data", &qos)?;
+    let arguments = [&[rate, bytes][..], &qos].concat();
+    let mut sensor = publisher(&host, "sensor", "/data", &arguments)?;
+    sensor.wait_for("matched", PATIENCE)?;
+    std::thread::sleep(Duration::from_secs(2));
+    let [before, stopped, after] = counts;
+    publish(&mut sensor, before, before)?;
+    slow.signal("STOP")?;
+    publish(&mut sensor, stopped, before + stopped)?;
+    slow.signal("CONT")?;
+    std::thread::sleep(Duration::from_secs(3));
+    publish(&mut sensor, after, before + stopped + after)?;
+    let logs = [settled_log(&mut slow)?, settled_log(&mut fast)?];
+    println!("stopped and not stopped: {logs:?}");
+    agrees(&agent, "/data", "/fast", logs[1])?;
+    agrees(&agent, "/data", "/slow", logs[0])?;
+    let gaps = agent.scrape()?.sum("ros2probe_zenoh_gaps_total", &[]);
+    ensure!(gaps == 0.0, "{gaps} gaps");
+    Ok(logs)
+}
+
+#[test]
+#[ignore = "needs ROS 2 Humble: make test-ros2"]
+fn a_router_that_is_restarted_takes_no_node_with_it() -> Result<()> {
+    let network = Namespace::alone()?;
+    let host = Host::new(&network, Middleware::Zenoh)?;
+    let agent = host.agent(WATCH)?;
+    let mut router = host.router("")?;
+    let mut sensor = publisher(&host, "sensor", "/imu", &["100", "300", "100", "RELIABLE"])?;
+    let mut one = subscription(&host, "one", "/imu", &["100", "RELIABLE"])?;
+    sensor.wait_for("matched", PATIENCE)?;
+    publish(&mut sensor, 100, 100)?;
+    router.terminate()?;
+    publish(&mut sensor, 200, 300)?;
+    let nodes = |agent: &Agent<'_>| -> Result<f64> { Ok(agent.scrape()?.sum("ros2_nodes", &[])) };
+    ensure!(nodes(&agent)? == 2.0);
+    let _router = host.router("")?;
+    publish(&mut sensor, 300, 600)?;
+    ensure!(nodes(&agent)? == 2.0);
+    let log = settled_log(&mut one)?;
+    agrees(&agent, "/imu", "/one", log)?;
+    ensure!(messages(&agent, "/imu")? == 600.0);
+    one.signal("KILL")?;
+    agent.scrape_until("the node is gone", |page| {
+        page.sum("ros2_nodes", &[]) == 1.0
+    })?;
+    Ok(())
+}

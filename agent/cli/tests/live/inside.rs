@@ -1,0 +1,113 @@
+//! Chains by causality: two processes that pass messages on within their callbacks, observed from
+//! inside by a running agent.
+
+use std::path::Path;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use anyhow::{Context as _, Result, ensure};
+use ros2probe_api::chains::ChainList;
+use ros2probe_testing::harness::agent::Agent;
+use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::harness::traced_program::TracedProgram;
+use ros2probe_testing::harness::{run, wait_until};
+
+const RP: &str = env!("CARGO_BIN_EXE_rp");
+const PATIENCE: Duration = Duration::from_secs(20);
+/// Name of a node, its topics, and the time that its callback takes, in microseconds.
+const NODES: [(&str, [&str; 2], u64); 2] = [
+    ("filter", ["/points", "/filtered"], 12_000),
+    ("controller", ["/filtered", "/cmd"], 3_000),
+];
+const MESSAGES: usize = 20;
+/// Largest difference between the agent's and a process's time of a callback, in seconds.
+const CLOSE: f64 = 0.000_2;
+
+#[test]
+fn a_chain_by_causality_takes_as_long_as_its_processes_say() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let program = TracedProgram::build(248, &[])?;
+    let agent = agent(&host, directory.path())?;
+    let mut processes = Vec::new();
+    for (node, [input, output], _) in NODES {
+        let arguments = [input, output, node];
+        processes.push(Process::start(
+            &host.inside(),
+            program.program(),
+            arguments,
+        )?);
+    }
+    // Only a library where ROS 2 is installed is observed before a process uses it.
+    agent.scrape_until("the library is observed", |page| {
+        page.sum("ros2probe_inside_library_info", &[("state", "attached")]) >= 1.0
+    })?;
+    for process in &mut processes {
+        process.write_line("init")?;
+        process.wait_for("init", PATIENCE)?;
+    }
+    agent.scrape_until("both processes are observed", |page| {
+        page.sum("ros2probe_inside_processes", &[]) >= NODES.len() as f64
+    })?;
+    let mut measured = vec![Vec::new(); NODES.len()];
+    for _ in 0..MESSAGES {
+        let mut source = SystemTime::now().duration_since(UNIX_EPOCH)?.as_nanos() as u64;
+        for (place, (process, (_, _, takes))) in processes.iter_mut().zip(NODES).enumerate() {
+            process.write_line(&format!("relay {source} {takes}"))?;
+            let answer = process.line_with_end("relay", PATIENCE)?;
+            let mut words = answer.split(' ');
+            source = words.next().context("source timestamp")?.parse()?;
+            let nanoseconds: f64 = words.next().context("duration")?.parse()?;
+            measured[place].push(nanoseconds / 1e9);
+        }
+    }
+    let socket = directory.path().join("api.sock");
+    let mut list = ChainList::default();
+    wait_until("the chain has all messages", || {
+        let line = format!("{RP} chain --json --socket {}", socket.display());
+        // Without a chain the command fails.
+        let text = run(&line).unwrap_or_default();
+        list = serde_json::from_str(&text).unwrap_or_default();
+        Ok(list
+            .chains
+            .iter()
+            .any(|chain| chain.messages == MESSAGES as u64))
+    })
+    .with_context(|| format!("{list:?}"))?;
+    let [chain] = &list.chains[..] else {
+        anyhow::bail!("{:?}", list.chains);
+    };
+    let ends = (&*chain.method, &*chain.from, &*chain.to);
+    ensure!(ends == ("causality", "/points", "/cmd"), "{ends:?}");
+    for (hop, ((node, topics, _), mut measured)) in
+        chain.hops.iter().zip(NODES.iter().zip(measured))
+    {
+        let name = format!("/robot1/{node}");
+        ensure!(hop.node.as_deref() == Some(&*name), "{hop:?}");
+        ensure!([&*hop.input, &*hop.output] == *topics, "{hop:?}");
+        measured.sort_by(f64::total_cmp);
+        // A process may lose its CPU between its clock and the call, which moves a message's rank.
+        let median = (MESSAGES - 1) / 2;
+        let close = measured[median - 3] - CLOSE..=measured[median + 3] + CLOSE;
+        let callback = hop.callback.context("callback")?.p50_seconds;
+        ensure!(
+            close.contains(&callback),
+            "{node}: {callback} s, not {measured:?}"
+        );
+        ensure!(hop.transit.is_some() && hop.wait.is_some(), "{hop:?}");
+    }
+    ensure!(chain.bottleneck == Some(0), "{chain:?}");
+    Ok(())
+}
+
+fn agent<'n>(host: &'n Namespace, directory: &Path) -> Result<Agent<'n>> {
+    let configuration = directory.join("ros2probe.yaml");
+    let capture = format!(
+        "capture: {{source: host, cgroup: {}, inside: full}}\n",
+        host.cgroup().display()
+    );
+    let socket = directory.join("api.sock");
+    let text = format!("{capture}api: {{socket: {}}}\n", socket.display());
+    std::fs::write(&configuration, text)?;
+    Agent::start(host, RP, &configuration)
+}

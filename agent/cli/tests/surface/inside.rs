@@ -1,0 +1,195 @@
+//! From reports about calls inside processes to the metrics page, and `rp inside` without them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::rp;
+use ros2probe_daemon::agent_facts::{AgentFacts, InsideSourceFacts, SourceKind};
+use ros2probe_daemon::config::{Limits, Watch, Watchlist};
+use ros2probe_daemon::settings_cell::Settings;
+use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::input::Input;
+use ros2probe_model::inside::report::{
+    BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition,
+    Trigger,
+};
+use ros2probe_model::observer::{self, Observer};
+use ros2probe_testing::local_agent;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Timestamp};
+
+const START: u64 = 1_795_143_000 * SECOND;
+
+/// Returns an observer that has taken a report in each of ten seconds: `/scan` at 20 Hz, published
+/// by a managed node whose timer takes 4 ms.
+fn observed() -> Observer {
+    let mut observer = Observer::new(observer::Settings::default());
+    observer.input(Input::Time(Timestamp(START)));
+    let watches = Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap();
+    observer.input(Input::Watchlist(Arc::new(watches)));
+    for second in 1..=10 {
+        let now = START + second * SECOND;
+        let mut durations = Durations::default();
+        for _ in 0..20 * second {
+            durations.observe(Duration::from_millis(4));
+        }
+        let process = ProcessReport {
+            id: 70,
+            name: Some("lidar".into()),
+            domain_id: DomainId(3),
+            nodes: vec!["/lidar".into()],
+            shows_intra_process: true,
+            publishers: vec![PublisherReport {
+                handle: 1,
+                node: None,
+                topic: "/scan".into(),
+                middleware: Some("rmw_zenoh_cpp".into()),
+                published: 20 * second,
+                within_process: 0,
+                last: Timestamp(now - SECOND / 2),
+                intervals: Durations::default(),
+            }],
+            buffers: vec![BufferReport {
+                handle: 2,
+                node: None,
+                topic: Some("/scan".into()),
+                enqueued: 20 * second,
+                overwritten: second,
+                dequeued: 19 * second,
+                depth: 2,
+                max_depth: 3,
+                capacity: None,
+                last: Timestamp(now - SECOND / 2),
+                waiting: durations.clone(),
+            }],
+            callbacks: vec![CallbackReport {
+                handle: 3,
+                node: None,
+                trigger: Trigger::Timer(Some(Duration::from_millis(50))),
+                thread: 71,
+                calls: 20 * second,
+                last: Timestamp(now - SECOND / 2),
+                durations,
+                waits: Durations::default(),
+                skipped: 2,
+            }],
+            ..ProcessReport::default()
+        };
+        let transition = Transition {
+            process: 70,
+            node: None,
+            start: "activating".into(),
+            goal: "active".into(),
+            at: Timestamp(now - SECOND / 2),
+        };
+        observer.input(Input::Inside(Report {
+            at: Timestamp(now - SECOND / 2),
+            has_callbacks: true,
+            processes: vec![process],
+            transitions: vec![transition],
+        }));
+        observer.input(Input::Time(Timestamp(now)));
+    }
+    observer
+}
+
+fn page(observer: &Observer, source: Option<InsideSourceFacts>) -> String {
+    let settings = Settings {
+        watches: vec![Arc::new(Watch::named("/**").unwrap())],
+        histograms: true,
+        per_writer: false,
+        limits: Limits::default(),
+    };
+    let sources = MetricSources::new(SourceKind::Host, settings);
+    let agent = AgentFacts {
+        inside: source,
+        ..AgentFacts::new(SourceKind::Host, std::time::Instant::now())
+    };
+    let snapshot = observer.snapshot(Timestamp(START + 10 * SECOND));
+    sources.latest.publish(snapshot, agent);
+    Exposition::new(sources).render(Format::Classic).unwrap()
+}
+
+#[test]
+fn reports_become_series() {
+    let source = InsideSourceFacts {
+        mode: "full",
+        counters: vec![("hits", 777)],
+        ..InsideSourceFacts::default()
+    };
+    let page = page(&observed(), Some(source));
+    let topic = "domain_id=\"3\",topic=\"/scan\"";
+    let callback = "domain_id=\"3\",ros_node=\"/lidar\",trigger=\"timer\",name=\"50ms\"";
+    let node = "domain_id=\"3\",ros_node=\"/lidar\"";
+    for expected in [
+        format!("ros2_topic_messages_total{{{topic}}} 200"),
+        format!("ros2_topic_source_info{{{topic},source=\"inside\"}} 1"),
+        format!("ros2_topic_inside_published_messages_total{{{topic}}} 200"),
+        format!("ros2_intra_process_enqueued_messages_total{{{topic}}} 200"),
+        format!("ros2_intra_process_overwritten_messages_total{{{topic}}} 10"),
+        format!("ros2_intra_process_buffered_messages{{{topic}}} 2"),
+        format!("ros2_callback_duration_seconds_count{{{callback}}} 200"),
+        format!("ros2_callback_duration_seconds_bucket{{le=\"0.005\",{callback}}} 200"),
+        format!("ros2_callback_duration_seconds_bucket{{le=\"0.002\",{callback}}} 0"),
+        format!("ros2_callback_duration_max_seconds{{{callback}}} 0.004"),
+        format!("ros2_timer_skipped_periods_total{{{callback}}} 2"),
+        format!("ros2_node_lifecycle_state{{{node},state=\"active\"}} 1"),
+        "ros2probe_inside_info{mode=\"full\",reason=\"\"} 1".to_owned(),
+        "ros2probe_inside_events_total{event=\"hits\"} 777".to_owned(),
+        "ros2probe_inside_processes{state=\"counted\"} 1".to_owned(),
+        "ros2probe_callbacks_not_shown 0".to_owned(),
+    ] {
+        assert!(
+            page.lines().any(|line| line == expected),
+            "{expected}\n{page}"
+        );
+    }
+    let value = |series: &str| {
+        let mut lines = page.lines();
+        let line = lines.find_map(|line| line.strip_prefix(&format!("{series} ")));
+        line.unwrap_or_else(|| panic!("no {series}"))
+            .parse::<f64>()
+            .unwrap()
+    };
+    let rate = value(&format!("ros2_topic_rate_hertz{{{topic}}}"));
+    assert!((rate - 20.0).abs() < 0.1, "{rate}");
+    let busy = value(&format!("ros2_node_callback_busy_ratio{{{node}}}"));
+    assert!((busy - 0.08).abs() < 0.001, "{busy}");
+    // Calls show no sizes.
+    assert!(!page.contains(&format!("ros2_topic_bytes_total{{{topic}}}")));
+    assert!(!page.contains(&format!("ros2_topic_bandwidth_bytes_per_second{{{topic}}}")));
+}
+
+#[test]
+fn without_reports_there_are_no_series() {
+    let observer = Observer::new(observer::Settings::default());
+    let page = page(&observer, None);
+    for name in [
+        "ros2_topic_source_info{",
+        "ros2_callback_",
+        "ros2probe_inside_",
+    ] {
+        let has_any = page
+            .lines()
+            .any(|line| line.starts_with(name) && !line.starts_with('#'));
+        assert!(!has_any, "{name}");
+    }
+}
+
+#[test]
+fn without_the_source_the_command_says_how_to_switch_it_on() {
+    let capture = local_agent::capture();
+    let run = |arguments: &[&str]| {
+        let mut command = rp();
+        command.arg("inside").args(arguments).arg("--replay");
+        command.arg(&capture).output().unwrap()
+    };
+    let output = run(&[]);
+    assert_eq!(output.status.code(), Some(1));
+    let error = String::from_utf8(output.stderr).unwrap();
+    assert!(error.contains("capture.inside is off"), "{error}");
+    let output = run(&["--json"]);
+    let answer: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(answer["mode"], "off");
+    assert_eq!(answer["callbacks"], serde_json::json!([]));
+}

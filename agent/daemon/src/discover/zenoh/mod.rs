@@ -1,0 +1,295 @@
+//! `rp discover --router`: requests the liveliness tokens of all nodes from a Zenoh router.
+//!
+//! A session as a client exists for a few milliseconds over one TCP connection. It declares
+//! nothing and subscribes to nothing, so no node appears and other sessions receive nothing.
+
+pub mod address;
+pub mod error;
+pub mod graph;
+pub mod message;
+pub mod session;
+
+use std::fs::File;
+use std::io::{self, Read as _, Write as _};
+use std::net::{Shutdown, SocketAddr, TcpStream};
+use std::time::{Duration, Instant};
+
+use ros2probe_wire::zenoh::Batch;
+
+use self::address::RouterAddress;
+use self::error::RouterError;
+use self::session::{Session, Step};
+
+/// Longest wait for the connection, for each answer, and between two parts of the last.
+const TIMEOUT: Duration = Duration::from_secs(3);
+/// Longest wait for all tokens.
+const LIMIT: Duration = Duration::from_secs(30);
+/// Wait for the router to end the connection after the goodbye. Ending it first, with bytes of the
+/// router in flight, resets it.
+const LINGER: Duration = Duration::from_millis(200);
+/// Bytes read at once.
+const READ: usize = 64 << 10;
+
+/// Number of batches, and their bytes with the lengths in front.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Traffic {
+    /// Number of batches.
+    pub batches: u32,
+    /// Bytes of TCP payload.
+    pub bytes: u64,
+}
+
+/// A conversation that ended, perhaps at a cap.
+#[derive(Debug)]
+pub struct Answer {
+    /// What the router announced.
+    pub session: Session,
+    /// Sent traffic.
+    pub sent: Traffic,
+    /// Received traffic.
+    pub received: Traffic,
+    /// From the introduction to the goodbye.
+    pub took: Duration,
+}
+
+/// A message that [`converse`] sends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Planned {
+    /// Purpose, for people.
+    pub what: &'static str,
+    /// Bytes with the default configuration of routers.
+    pub bytes: usize,
+    /// How the router decides on the bytes.
+    pub note: &'static str,
+}
+
+/// Returns what [`converse`] sends to a router that answers.
+#[must_use]
+pub fn plan(domain_id: Option<u32>) -> [Planned; 4] {
+    let planned = |what, bytes: Vec<u8>, note| Planned {
+        what,
+        bytes: bytes.len(),
+        note,
+    };
+    let request = message::request(&session::key(domain_id), true);
+    let (cookie, priorities) = (" and the router's cookie", ", 2 less without priorities");
+    [
+        planned("introduction (INIT)", message::introduction([0; 16]), ""),
+        planned("opening (OPEN)", message::opening(&[]), cookie),
+        planned("request (INTEREST)", request, priorities),
+        planned("goodbye (CLOSE)", message::goodbye(), ""),
+    ]
+}
+
+/// Connects to the router. Sends nothing beyond TCP's handshake, and the look-up of a name.
+///
+/// # Errors
+///
+/// Nothing listens at the address, or it cannot be reached.
+pub fn connect(address: &RouterAddress) -> Result<(TcpStream, SocketAddr), RouterError> {
+    let resolved = address.resolve().map_err(|source| RouterError::Resolve {
+        address: address.clone(),
+        source,
+    })?;
+    let mut is_refused = false;
+    let mut failure = io::Error::from(io::ErrorKind::AddrNotAvailable);
+    for peer in resolved {
+        match TcpStream::connect_timeout(&peer, TIMEOUT) {
+            Ok(stream) => return Ok((stream, peer)),
+            Err(error) => {
+                is_refused |= error.kind() == io::ErrorKind::ConnectionRefused;
+                failure = error;
+            }
+        }
+    }
+    let address = address.clone();
+    Err(if is_refused {
+        RouterError::Refused { address }
+    } else {
+        RouterError::Connect {
+            address,
+            source: failure,
+        }
+    })
+}
+
+/// Runs the conversation up to its goodbye.
+///
+/// # Errors
+///
+/// The router breaks, ends or refuses the conversation, or is silent.
+pub fn converse(
+    stream: TcpStream,
+    peer: SocketAddr,
+    domain_id: Option<u32>,
+) -> Result<Answer, RouterError> {
+    let began = Instant::now();
+    let mut conversation = Conversation {
+        stream,
+        peer,
+        after: "connection",
+        limit: TIMEOUT,
+        deadline: began,
+        buffer: Vec::new(),
+        sent: Traffic::default(),
+        received: Traffic::default(),
+    };
+    let introduction = message::introduction(random_id().map_err(RouterError::Random)?);
+    conversation.send("introduction (INIT)", &introduction)?;
+    let mut session = Session::new(domain_id);
+    let ended = conversation.listen(&mut session);
+    // A peer that is no router gets nothing more.
+    if session.router().is_some() {
+        let said = conversation.send("goodbye (CLOSE)", &message::goodbye());
+        if ended.is_ok() {
+            said?;
+        }
+    }
+    ended?;
+    let took = began.elapsed();
+    conversation.linger();
+    Ok(Answer {
+        session,
+        sent: conversation.sent,
+        received: conversation.received,
+        took,
+    })
+}
+
+/// Returns an id of 16 bytes. The last is not zero, so that Zenoh writes all of them.
+fn random_id() -> io::Result<[u8; 16]> {
+    let mut id = [0; 16];
+    File::open("/dev/urandom")?.read_exact(&mut id)?;
+    let [.., last] = &mut id;
+    *last |= 0x80;
+    Ok(id)
+}
+
+struct Conversation {
+    stream: TcpStream,
+    peer: SocketAddr,
+    /// The last message that was sent.
+    after: &'static str,
+    /// Time for the answer, and when it is over.
+    limit: Duration,
+    deadline: Instant,
+    /// Received bytes behind the last complete batch: less than a batch and a read.
+    buffer: Vec<u8>,
+    sent: Traffic,
+    received: Traffic,
+}
+
+impl Conversation {
+    fn send(&mut self, what: &'static str, bytes: &[u8]) -> Result<(), RouterError> {
+        let sent = self.stream.set_write_timeout(Some(TIMEOUT));
+        let sent = sent.and_then(|()| self.stream.write_all(bytes));
+        sent.map_err(|source| self.broken(source))?;
+        self.sent.add(bytes.len());
+        self.after = what;
+        self.within(TIMEOUT);
+        Ok(())
+    }
+
+    /// Sets the time for the next answer.
+    fn within(&mut self, limit: Duration) {
+        self.limit = limit;
+        self.deadline = Instant::now() + limit;
+    }
+
+    /// Receives and answers until the session is over.
+    fn listen(&mut self, session: &mut Session) -> Result<(), RouterError> {
+        let mut chunk = vec![0; READ];
+        let peer = self.peer;
+        let unusable = |why| RouterError::Unusable { peer, why };
+        while !session.is_over() {
+            let length = self.read(&mut chunk)?;
+            self.buffer
+                .extend_from_slice(chunk.get(..length).unwrap_or_default());
+            session.beginning(&self.buffer).map_err(unusable)?;
+            let mut stream = std::mem::take(&mut self.buffer);
+            let mut rest = &stream[..];
+            while let Some((batch, behind)) = Batch::split(rest) {
+                rest = behind;
+                self.received.add(batch.len() + 2);
+                for outgoing in session.receive(batch).map_err(unusable)? {
+                    self.send(outgoing.what, &outgoing.bytes)?;
+                    if session.step() == Step::Request {
+                        self.within(LIMIT);
+                    }
+                }
+                if session.is_over() {
+                    break;
+                }
+            }
+            let read = stream.len() - rest.len();
+            stream.drain(..read);
+            self.buffer = stream;
+        }
+        Ok(())
+    }
+
+    /// Reads at least one byte.
+    fn read(&mut self, chunk: &mut [u8]) -> Result<usize, RouterError> {
+        let silent = |limit| RouterError::Silent {
+            peer: self.peer,
+            after: self.after,
+            limit,
+        };
+        loop {
+            let left = self.deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(silent(self.limit));
+            }
+            let timeout = self.stream.set_read_timeout(Some(left.min(TIMEOUT)));
+            timeout.map_err(|source| self.broken(source))?;
+            match self.stream.read(chunk) {
+                Ok(0) => return Err(self.broken(io::ErrorKind::ConnectionReset.into())),
+                Ok(length) => return Ok(length),
+                Err(error) => match error.kind() {
+                    io::ErrorKind::Interrupted => {}
+                    io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut => {
+                        return Err(silent(TIMEOUT));
+                    }
+                    _ => return Err(self.broken(error)),
+                },
+            }
+        }
+    }
+
+    /// Waits for the router to end the connection.
+    fn linger(&mut self) {
+        let _ = self.stream.shutdown(Shutdown::Write);
+        let end = Instant::now() + LINGER;
+        let mut chunk = [0; 1024];
+        loop {
+            let left = end.saturating_duration_since(Instant::now());
+            if left.is_zero() || self.stream.set_read_timeout(Some(left)).is_err() {
+                return;
+            }
+            match self.stream.read(&mut chunk) {
+                Ok(1..) => {}
+                Ok(0) | Err(_) => return,
+            }
+        }
+    }
+
+    fn broken(&self, source: io::Error) -> RouterError {
+        use io::ErrorKind::{BrokenPipe, ConnectionReset};
+        let (peer, after) = (self.peer, self.after);
+        match source.kind() {
+            BrokenPipe | ConnectionReset => RouterError::Ended { peer, after },
+            _ => RouterError::Broken {
+                peer,
+                after,
+                source,
+            },
+        }
+    }
+}
+
+impl Traffic {
+    fn add(&mut self, length: usize) {
+        self.batches += 1;
+        self.bytes += length as u64;
+    }
+}

@@ -1,0 +1,185 @@
+//! `/chains`: the way of measurements through nodes.
+
+use std::borrow::Cow;
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use ros2probe_api::chains::{Chain, ChainList, ExpectedChain, Hop, Quantiles};
+use ros2probe_model::chain::expected::ExpectedFacts;
+use ros2probe_model::chain::path;
+use ros2probe_model::snapshot::ChainFacts;
+use ros2probe_wire::DomainId;
+use serde::Deserialize;
+use utoipa::IntoParams;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::parameters::Parameters;
+use super::problem::{Code, Problem};
+
+/// The chains of an answer.
+#[derive(Clone, Debug, Default, Deserialize, IntoParams)]
+#[serde(deny_unknown_fields, default)]
+#[into_params(parameter_in = Query)]
+struct Ends {
+    /// Domain id; by default every domain.
+    #[param(minimum = 0, maximum = 232)]
+    domain_id: Option<u32>,
+    /// ROS name of a topic; chains are cut before it, and others left out.
+    from: Option<String>,
+    /// ROS name of a topic; chains are cut after it, and others left out.
+    to: Option<String>,
+}
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(list))
+}
+
+/// Chains of messages with the time of each hop
+#[utoipa::path(
+    get,
+    path = "/chains",
+    tag = "graph",
+    params(Ends),
+    responses((status = 200, description = "Chains.", body = ChainList<'static>))
+)]
+async fn list(
+    State(context): State<Context>,
+    Parameters(ends): Parameters<Ends>,
+) -> Result<Response, Problem> {
+    if let Some(domain_id) = ends.domain_id.filter(|id| *id > DomainId::MAX.0) {
+        let most = DomainId::MAX;
+        let detail = format!("domain_id is {domain_id}, must be between 0 and {most}");
+        return Err(Problem::new(Code::MalformedRequest, detail));
+    }
+    let state = context.state().await;
+    let snapshot = state.known();
+    let is_meant = |domain_id: DomainId| ends.domain_id.is_none_or(|id| DomainId(id) == domain_id);
+    let meant = snapshot.chains.chains.iter();
+    let meant = meant.filter(|facts| is_meant(facts.path.domain_id));
+    let chains = parts(meant, ends.from.as_deref(), ends.to.as_deref());
+    let named = |end: &Option<String>, name: &str| end.as_deref().is_none_or(|end| end == name);
+    let configured = snapshot.chains.expected.iter().filter(|each| {
+        each.domain_id.is_none_or(is_meant)
+            && named(&ends.from, &each.chain.from)
+            && named(&ends.to, &each.chain.to)
+    });
+    let answer = ChainList {
+        timestamp_seconds: snapshot.at.seconds(),
+        chains,
+        expected: configured.map(expected).collect(),
+    };
+    Ok(Json(answer).into_response())
+}
+
+/// Returns the chains, cut at these topics; those that do not pass them are left out.
+pub(crate) fn parts<'a>(
+    facts: impl Iterator<Item = &'a ChainFacts>,
+    from: Option<&str>,
+    to: Option<&str>,
+) -> Vec<Chain<'a>> {
+    let mut chains: Vec<Chain<'a>> = Vec::new();
+    for facts in facts {
+        let part = section(facts, from, to);
+        let Some(chain) = part.and_then(|part| chain(facts, part)) else {
+            continue;
+        };
+        // Chains that differ beyond the ends have the same part.
+        let is_same = |known: &&mut Chain<'_>| is_same(known, &chain);
+        match chains.iter_mut().find(is_same) {
+            Some(known) if known.messages >= chain.messages => {}
+            Some(known) => *known = chain,
+            None => chains.push(chain),
+        }
+    }
+    chains
+}
+
+/// Returns whether both chains go the same way.
+fn is_same(one: &Chain<'_>, other: &Chain<'_>) -> bool {
+    let mut hops = one.hops.iter().zip(&other.hops);
+    (one.domain_id, &one.method, &one.from) == (other.domain_id, &other.method, &other.from)
+        && one.hops.len() == other.hops.len()
+        && hops.all(|(one, other)| (&one.node, &one.output) == (&other.node, &other.output))
+}
+
+/// Returns the positions of the first and last topic of the part between the ends.
+fn section(facts: &ChainFacts, from: Option<&str>, to: Option<&str>) -> Option<(usize, usize)> {
+    let topics = &facts.path.topics;
+    let (first, _) = topics.first()?;
+    let (last, _) = topics.last()?;
+    facts
+        .path
+        .section(from.unwrap_or(first), to.unwrap_or(last))
+}
+
+fn chain(facts: &ChainFacts, (from, to): (usize, usize)) -> Option<Chain<'_>> {
+    let topics = facts.path.topics.get(from..=to)?;
+    let [(first, source), .., (last, _)] = topics else {
+        return None;
+    };
+    let pairs = topics.windows(2).enumerate();
+    let hops = pairs.filter_map(|(offset, ends)| hop(facts, from + offset, ends));
+    let hops: Vec<Hop<'_>> = hops.collect();
+    let slowest = hops.iter().enumerate().max_by(|(_, one), (_, other)| {
+        let median = |hop: &Hop<'_>| hop.latency.p50_seconds;
+        median(one).total_cmp(&median(other))
+    });
+    Some(Chain {
+        domain_id: facts.path.domain_id.0,
+        method: facts.path.method.label().into(),
+        from: Cow::Borrowed(first),
+        to: Cow::Borrowed(last),
+        source: source.as_deref().map(Cow::Borrowed),
+        bottleneck: slowest.map(|(place, _)| place as u64),
+        messages: facts.count,
+        latency: quantiles(facts.between(from, to)),
+        last_seen_seconds: facts.last.seconds(),
+        hops,
+    })
+}
+
+type Topic = (
+    ros2probe_model::names::TopicName,
+    Option<ros2probe_model::names::NodeName>,
+);
+
+fn hop<'a>(facts: &ChainFacts, position: usize, ends: &'a [Topic]) -> Option<Hop<'a>> {
+    let [(input, _), (output, node)] = ends else {
+        return None;
+    };
+    let figures = facts.hop(position);
+    Some(Hop {
+        input: Cow::Borrowed(input),
+        node: node.as_deref().map(Cow::Borrowed),
+        output: Cow::Borrowed(output),
+        latency: quantiles(figures.whole),
+        transit: figures.transit.map(quantiles),
+        wait: figures.wait.map(quantiles),
+        callback: figures.callback.map(quantiles),
+        processing: figures.node.map(quantiles),
+    })
+}
+
+fn expected(facts: &ExpectedFacts) -> ExpectedChain<'_> {
+    let max_latency = facts.chain.max_latency;
+    ExpectedChain {
+        domain_id: facts.domain_id.map(|domain_id| domain_id.0),
+        from: Cow::Borrowed(&facts.chain.from),
+        to: Cow::Borrowed(&facts.chain.to),
+        max_latency_ms: max_latency.map(|max| max.as_secs_f64() * 1e3),
+        method: facts.method.map(|method| method.label().into()),
+        state: facts.state.label().into(),
+        latency: facts.latency.map(quantiles),
+    }
+}
+
+const fn quantiles(figures: path::Quantiles) -> Quantiles {
+    Quantiles {
+        p50_seconds: figures.p50,
+        p99_seconds: figures.p99,
+        maximum_seconds: figures.max,
+    }
+}

@@ -1,0 +1,387 @@
+//! `/inside`: what processes show from inside, and the same facts in answers about topics and
+//! nodes.
+
+use std::borrow::Cow;
+
+use axum::Json;
+use axum::extract::State;
+use axum::response::{IntoResponse, Response};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::Context;
+use super::endpoint::texts;
+use super::parameters::Parameters;
+use super::problem::Problem;
+use super::scope::Scope;
+use crate::agent_facts::InsideSourceFacts;
+use crate::surface::inside_nodes::NodeActivity;
+use ros2probe_api::inside::{
+    Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
+    Process, Publisher, Subscription, TopicInside, Trigger,
+};
+use ros2probe_model::inside::facts::{self, InsideFacts, Quantiles};
+use ros2probe_model::inside::report;
+use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_wire::DomainId;
+
+pub(super) fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::new().routes(routes!(show))
+}
+
+/// Calls inside processes
+///
+/// Publications, takes, messages within processes and callbacks, as uprobes on `libtracetools.so`
+/// show them. The lists are empty unless `capture.inside` is switched on.
+#[utoipa::path(
+    get,
+    path = "/inside",
+    tag = "graph",
+    params(Scope),
+    responses((status = 200, description = "What processes show.", body = Inside<'static>))
+)]
+async fn show(
+    State(context): State<Context>,
+    Parameters(scope): Parameters<Scope>,
+) -> Result<Response, Problem> {
+    let scope = scope.checked()?;
+    let state = context.state().await;
+    let snapshot = state.known();
+    let source = state.agent.inside.as_ref();
+    let answer = inside(snapshot, source, |domain_id| scope.admits(domain_id));
+    Ok(Json(answer).into_response())
+}
+
+fn inside<'a>(
+    snapshot: &'a Snapshot,
+    source: Option<&'a InsideSourceFacts>,
+    admits: impl Fn(DomainId) -> bool,
+) -> Inside<'a> {
+    let mut answer = Inside {
+        timestamp_seconds: snapshot.at.seconds(),
+        mode: Cow::Borrowed(source.map_or("off", |source| source.mode)),
+        reason: source.and_then(|source| source.reason_off.as_deref().map(Cow::Borrowed)),
+        ..Inside::default()
+    };
+    if let Some(source) = source {
+        let libraries = source.libraries.iter().map(|library| Library {
+            path: Cow::Borrowed(&library.path),
+            processes: library.processes,
+            refused: library.refused.as_deref().map(Cow::Borrowed),
+        });
+        answer.libraries = libraries.collect();
+        let counters = source.counters.iter().map(|(name, count)| Counter {
+            name: Cow::Borrowed(name),
+            count: *count,
+        });
+        answer.counters = counters.collect();
+    }
+    let Some(known) = snapshot.inside.as_deref() else {
+        return answer;
+    };
+    let is_here = |owner: &facts::Owner| admits(owner.domain_id);
+    let processes = known.processes.iter();
+    let processes = processes.filter(|each| admits(each.domain_id));
+    answer.processes = processes.map(process).collect();
+    let publishers = known.publishers.iter().filter(|each| is_here(&each.owner));
+    answer.publishers = publishers.map(publisher).collect();
+    let subscriptions = known.subscriptions.iter();
+    let subscriptions = subscriptions.filter(|each| is_here(&each.owner));
+    answer.subscriptions = subscriptions.map(subscription).collect();
+    let buffers = known.buffers.iter().filter(|each| is_here(&each.owner));
+    answer.buffers = buffers.map(buffer).collect();
+    let callbacks = known.callbacks.iter().filter(|each| is_here(&each.owner));
+    answer.callbacks = callbacks.map(callback).collect();
+    let states = known.states.iter().filter(|each| admits(each.domain_id));
+    answer.lifecycle_states = states.map(lifecycle_state).collect();
+    answer
+}
+
+/// Returns what processes show of a topic, without the lists.
+pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
+    let inside = facts.inside.as_deref()?;
+    let counts = inside.counts;
+    Some(TopicInside {
+        published_messages: counts.published,
+        within_process_messages: counts.within_process,
+        taken_messages: counts.taken,
+        failed_takes: counts.failed,
+        enqueued_messages: counts.enqueued,
+        overwritten_messages: counts.overwritten,
+        dequeued_messages: counts.dequeued,
+        intra_process_receptions: counts.receptions,
+        rate_hertz: inside.rate_hz,
+        last_message_timestamp_seconds: inside.last.map(|last| last.seconds()),
+        observed_publishers: inside.publishers,
+        observed_subscriptions: inside.subscriptions,
+        ..TopicInside::default()
+    })
+}
+
+/// Returns what processes show of a topic, with its publishers, subscriptions, buffers and
+/// callbacks.
+pub(super) fn topic_details<'a>(
+    facts: &'a TopicFacts,
+    known: Option<&'a InsideFacts>,
+) -> Option<TopicInside<'a>> {
+    let (mut shown, known) = (topic(facts)?, known?);
+    let name = &facts.name;
+    let is_here = |owner: &facts::Owner| owner.domain_id == facts.domain_id;
+    let own = |owner, topic: &ros2probe_model::names::TopicName| is_here(owner) && topic == name;
+    let publishers = known.publishers.iter();
+    let publishers = publishers.filter(|each| own(&each.owner, &each.topic));
+    shown.publishers = publishers.map(publisher).collect();
+    let subscriptions = known.subscriptions.iter();
+    let subscriptions = subscriptions.filter(|each| own(&each.owner, &each.topic));
+    shown.subscriptions = subscriptions.map(subscription).collect();
+    let buffers = known.buffers.iter();
+    let buffers = buffers.filter(|each| is_here(&each.owner) && each.topic.as_ref() == Some(name));
+    shown.buffers = buffers.map(buffer).collect();
+    let callbacks = known.callbacks.iter();
+    let callbacks = callbacks.filter(|each| {
+        let is_topic = !matches!(each.trigger, report::Trigger::Service(_));
+        is_topic && is_here(&each.owner) && each.trigger.name() == Some(name.as_str())
+    });
+    shown.callbacks = callbacks.map(callback).collect();
+    Some(shown)
+}
+
+/// Returns what processes show of a node; `None` if they show nothing.
+pub(super) fn node<'a>(
+    domain_id: DomainId,
+    name: &str,
+    known: Option<&'a InsideFacts>,
+) -> Option<NodeInside<'a>> {
+    let known = known?;
+    let is_own = |owner: &facts::Owner| {
+        owner.domain_id == domain_id && owner.node.as_ref().is_some_and(|node| *node == *name)
+    };
+    let activities = NodeActivity::all(known);
+    let activity = activities.get(&(domain_id, name)).copied();
+    let activity = activity.unwrap_or_default();
+    let publishers = known.publishers.iter().filter(|each| is_own(&each.owner));
+    let subscriptions = known.subscriptions.iter();
+    let subscriptions = subscriptions.filter(|each| is_own(&each.owner));
+    let buffers = known.buffers.iter().filter(|each| is_own(&each.owner));
+    let callbacks = known.callbacks.iter().filter(|each| is_own(&each.owner));
+    let node = NodeInside {
+        busy_ratio: activity.busy,
+        lifecycle_state: activity.state.map(Cow::Borrowed),
+        publishers: publishers.map(publisher).collect(),
+        subscriptions: subscriptions.map(subscription).collect(),
+        buffers: buffers.map(buffer).collect(),
+        callbacks: callbacks.map(callback).collect(),
+    };
+    (node != NodeInside::default()).then_some(node)
+}
+
+/// Returns the answer's form of a trigger.
+pub(super) fn trigger(trigger: &report::Trigger) -> Trigger<'_> {
+    Trigger {
+        kind: Cow::Borrowed(trigger.label()),
+        name: trigger.name().map(Cow::Borrowed),
+        period_seconds: trigger.period().map(|period| period.as_secs_f64()),
+    }
+}
+
+fn process(facts: &facts::ObservedProcess) -> Process<'_> {
+    Process {
+        process_id: facts.id,
+        process: facts.name.as_deref().map(Cow::Borrowed),
+        domain_id: facts.domain_id.0,
+        nodes: texts(&facts.nodes),
+        cpu_ratio: facts.cpu,
+        calls_per_second: facts.calls_hz,
+        calls: facts.calls,
+        refused_calls: facts.refused,
+        suspended: facts.is_suspended,
+        shows_intra_process: facts.shows_intra_process,
+    }
+}
+
+fn owner(owner: &facts::Owner) -> Owner<'_> {
+    Owner {
+        process_id: owner.process,
+        handle: Cow::Owned(format!("{:#x}", owner.handle)),
+        domain_id: owner.domain_id.0,
+        node: owner.node.as_deref().map(Cow::Borrowed),
+    }
+}
+
+fn durations(quantiles: &Quantiles) -> Option<Durations> {
+    (quantiles.count > 0).then_some(Durations {
+        count: quantiles.count,
+        p50_seconds: quantiles.p50.as_secs_f64(),
+        p99_seconds: quantiles.p99.as_secs_f64(),
+        maximum_seconds: quantiles.maximum.as_secs_f64(),
+    })
+}
+
+fn publisher(facts: &facts::Publisher) -> Publisher<'_> {
+    Publisher {
+        owner: owner(&facts.owner),
+        topic: Cow::Borrowed(&facts.topic),
+        middleware: facts.middleware.as_deref().map(Cow::Borrowed),
+        published_messages: facts.published,
+        within_process_messages: facts.within_process,
+        rate_hertz: facts.rate_hz,
+        last_message_timestamp_seconds: facts.last.seconds(),
+        interval: durations(&facts.interval),
+    }
+}
+
+fn subscription(facts: &facts::Subscription) -> Subscription<'_> {
+    Subscription {
+        owner: owner(&facts.owner),
+        topic: Cow::Borrowed(&facts.topic),
+        middleware: facts.middleware.as_deref().map(Cow::Borrowed),
+        taken_messages: facts.taken,
+        failed_takes: facts.failed,
+        rate_hertz: facts.rate_hz,
+        last_message_timestamp_seconds: facts.last.seconds(),
+        latency: durations(&facts.latency),
+    }
+}
+
+fn buffer(facts: &facts::Buffer) -> Buffer<'_> {
+    Buffer {
+        owner: owner(&facts.owner),
+        topic: facts.topic.as_deref().map(Cow::Borrowed),
+        enqueued_messages: facts.enqueued,
+        overwritten_messages: facts.overwritten,
+        dequeued_messages: facts.dequeued,
+        overwritten_ratio: facts.overwritten_ratio,
+        depth: facts.depth,
+        maximum_depth: facts.max_depth,
+        capacity: facts.capacity,
+        rate_hertz: facts.rate_hz,
+        last_message_timestamp_seconds: facts.last.seconds(),
+        waiting: durations(&facts.waiting),
+    }
+}
+
+fn callback(facts: &facts::Callback) -> Callback<'_> {
+    Callback {
+        owner: owner(&facts.owner),
+        trigger: trigger(&facts.trigger),
+        thread_id: facts.thread,
+        calls: facts.calls,
+        skipped_periods: facts.skipped,
+        rate_hertz: facts.rate_hz,
+        busy_ratio: facts.busy,
+        last_call_timestamp_seconds: facts.last.seconds(),
+        duration: durations(&facts.duration),
+        wait: durations(&facts.wait),
+    }
+}
+
+fn lifecycle_state(facts: &facts::LifecycleState) -> LifecycleState<'_> {
+    LifecycleState {
+        process_id: facts.process,
+        domain_id: facts.domain_id.0,
+        node: facts.node.as_deref().map(Cow::Borrowed),
+        state: Cow::Borrowed(&facts.state),
+        previous_state: Cow::Borrowed(&facts.before),
+        timestamp_seconds: facts.at.seconds(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use ros2probe_model::input::Input;
+    use ros2probe_model::inside::report::{
+        CallbackReport, ProcessReport, PublisherReport, Report, Trigger,
+    };
+    use ros2probe_model::observer::{Observer, Settings};
+    use ros2probe_wire::Timestamp;
+    use ros2probe_wire::time::SECOND;
+
+    use super::*;
+
+    /// A robot whose `/lidar` publishes `/scan` ten times a second.
+    fn robot() -> Snapshot {
+        let mut observer = Observer::new(Settings::default());
+        let start = 1_795_143_000 * SECOND;
+        observer.input(Input::Time(Timestamp(start)));
+        for second in 1..=3 {
+            let at = Timestamp(start + second * SECOND);
+            let mut durations = report::Durations::default();
+            durations.observe(Duration::from_millis(second));
+            let process = ProcessReport {
+                id: 70,
+                nodes: vec!["/lidar".into()],
+                publishers: vec![PublisherReport {
+                    handle: 0x10,
+                    node: None,
+                    topic: "/scan".into(),
+                    middleware: None,
+                    published: 10 * second,
+                    within_process: 0,
+                    last: at,
+                    intervals: report::Durations::default(),
+                }],
+                callbacks: vec![CallbackReport {
+                    handle: 0x20,
+                    node: None,
+                    trigger: Trigger::Timer(Some(Duration::from_millis(100))),
+                    thread: 1,
+                    calls: 10 * second,
+                    last: at,
+                    durations,
+                    waits: report::Durations::default(),
+                    skipped: 0,
+                }],
+                ..ProcessReport::default()
+            };
+            observer.input(Input::Inside(Report {
+                at,
+                has_callbacks: true,
+                processes: vec![process],
+                transitions: Vec::new(),
+            }));
+            observer.input(Input::Time(at));
+        }
+        observer.snapshot(Timestamp(start + 3 * SECOND))
+    }
+
+    #[test]
+    fn reports_become_answers() {
+        let snapshot = robot();
+        let answer = inside(&snapshot, None, |_| true);
+        let publisher = &answer.publishers[0];
+        assert_eq!(publisher.owner.node.as_deref(), Some("/lidar"));
+        assert_eq!(
+            (publisher.published_messages, &*publisher.owner.handle),
+            (30, "0x10")
+        );
+        assert!((publisher.rate_hertz.unwrap() - 10.0).abs() < 0.01);
+        let elsewhere = inside(&snapshot, None, |_| false);
+        assert!(elsewhere.publishers.is_empty() && elsewhere.processes.is_empty());
+
+        let known = snapshot.inside.as_deref();
+        let facts = snapshot.topics.iter().find(|topic| topic.name == "/scan");
+        let topic = topic_details(facts.unwrap(), known).unwrap();
+        assert_eq!((topic.published_messages, topic.publishers.len()), (30, 1));
+        assert!(topic.callbacks.is_empty(), "its timer has no topic");
+
+        let node = node(DomainId(0), "/lidar", known).unwrap();
+        assert_eq!((node.callbacks.len(), node.publishers.len()), (1, 1));
+        assert_eq!(node.callbacks[0].trigger.words(), "timer 100 ms");
+        assert!(super::node(DomainId(0), "/camera", known).is_none());
+    }
+
+    #[test]
+    fn a_source_that_is_off_says_so() {
+        let snapshot = Snapshot::default();
+        assert_eq!(inside(&snapshot, None, |_| true).mode, "off");
+        let source = InsideSourceFacts {
+            mode: "full",
+            reason_off: Some("CAP_BPF is missing".to_owned()),
+            ..InsideSourceFacts::default()
+        };
+        let answer = inside(&snapshot, Some(&source), |_| true);
+        assert_eq!(answer.reason.as_deref(), Some("CAP_BPF is missing"));
+    }
+}

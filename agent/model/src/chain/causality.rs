@@ -1,0 +1,242 @@
+//! Chains by causality: publications within the callback that processes an input.
+//!
+//! A publication is joined with the hop before it by its message: the publication of the input is
+//! the one whose source timestamp is the first on that topic at or after it, within 10 ms.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::{DomainId, Timestamp};
+
+use super::expected::ExpectedChains;
+use super::path::Paths;
+use super::spans::ChainTracer;
+use super::spans::causal::{Step, Traced};
+use super::trace::{Method, Path, Point, Trace};
+use crate::names::{NodeName, TopicName};
+use crate::size::Size;
+use crate::trace::share::Share;
+
+/// Time after which a publication that no other continues ends its chain.
+const QUIET: Duration = Duration::from_secs(2);
+/// Time for which a publication is remembered for those that continue it.
+const REMEMBERED: Duration = Duration::from_secs(5);
+/// Longest time from the begin of a publication to the source timestamp of its message.
+const WRITING: Duration = Duration::from_millis(10);
+/// Largest number of publications that are remembered.
+pub const MAX_PUBLICATIONS: usize = 8192;
+/// Number of the latest publications among which the origin of another is searched.
+const SEARCHED: usize = 2048;
+/// Largest number of hops of a chain.
+const MAX_HOPS: usize = 31;
+
+/// A publication within the callback that processes an input. Times are calendar time.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CausalPublication {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// Process id.
+    pub process: u32,
+    /// The node; `None` if it is not known.
+    pub node: Option<NodeName>,
+    /// Topic of the input.
+    pub input: TopicName,
+    /// Source timestamp of the input; 0 if it is not known.
+    pub input_source: Timestamp,
+    /// Time at which the process took the input from the middleware.
+    pub taken: Timestamp,
+    /// Begin of the callback.
+    pub started: Timestamp,
+    /// Topic of the output.
+    pub output: TopicName,
+    /// Time of the output's publication.
+    pub published: Timestamp,
+}
+
+/// Publications that others may continue.
+#[derive(Debug, Default)]
+pub(super) struct Causality {
+    /// In the order of their arrival.
+    publications: VecDeque<Hop>,
+    evictions: u64,
+}
+
+/// A publication with the way to it.
+#[derive(Debug)]
+struct Hop {
+    /// Model time at which it was added.
+    at: Timestamp,
+    domain_id: DomainId,
+    topics: Vec<(TopicName, Option<NodeName>)>,
+    points: Vec<Point>,
+    /// Spans that others continue, if its trace is exported.
+    traced: Option<Traced>,
+    /// Whether another publication continues it, or it has ended its chain.
+    is_over: bool,
+}
+
+/// What decides about the trace of a publication.
+enum Origin {
+    /// The share of its input's traces: it begins a chain.
+    Share(Share),
+    /// The publication that it continues.
+    Hop(Traced),
+}
+
+impl Causality {
+    /// Adds a publication. `share` returns the traced share of its input.
+    pub(super) fn add(
+        &mut self,
+        publication: &CausalPublication,
+        now: Timestamp,
+        share: impl FnOnce() -> Option<Share>,
+        tracer: &mut ChainTracer,
+    ) {
+        let CausalPublication {
+            domain_id,
+            process: _,
+            node,
+            input,
+            input_source,
+            taken,
+            started,
+            output,
+            published,
+        } = publication;
+        // The clock of the input's writer may be another one.
+        let is_known = input_source.0 != 0;
+        let input_published = if is_known {
+            (*input_source).min(*taken)
+        } else {
+            *taken
+        };
+        let is_origin = |hop: &&mut Hop| {
+            let end = hop.points.last().map(|point| point.published);
+            hop.domain_id == *domain_id
+                && hop.topics.last().is_some_and(|(topic, _)| topic == input)
+                && end.is_some_and(|end| end <= *input_source && *input_source - end <= WRITING)
+        };
+        let mut latest = self.publications.iter_mut().rev().take(SEARCHED);
+        let before = latest.find(is_origin);
+        let (mut topics, mut points, origin) = match before {
+            Some(hop) if hop.points.len() <= MAX_HOPS => {
+                hop.is_over = true;
+                let origin = hop.traced.map(Origin::Hop);
+                (hop.topics.clone(), hop.points.clone(), origin)
+            }
+            _ => {
+                let point = Point {
+                    published: input_published,
+                    arrived: None,
+                    started: None,
+                };
+                let share = is_known.then(share).flatten().map(Origin::Share);
+                (vec![(input.clone(), None)], vec![point], share)
+            }
+        };
+        if let Some(point) = points.last_mut() {
+            point.arrived = is_known.then(|| (*taken).max(point.published));
+            point.started = Some((*started).max(*taken));
+        }
+        topics.push((output.clone(), node.clone()));
+        points.push(Point {
+            published: (*published).max(*started),
+            arrived: None,
+            started: None,
+        });
+        let traced = origin.zip(points.last_chunk()).and_then(|(origin, ends)| {
+            let [input, output] = *ends;
+            let step = Step {
+                publication,
+                input,
+                output,
+            };
+            let latest = self.publications.iter().rev().take(SEARCHED);
+            let known = latest.filter_map(|hop| hop.traced);
+            match origin {
+                Origin::Share(share) => step.begin(share, known, tracer),
+                Origin::Hop(before) => Some(step.go_on(before, known, tracer)),
+            }
+        });
+        if self.publications.len() >= MAX_PUBLICATIONS {
+            self.publications.pop_front();
+            self.evictions += 1;
+        }
+        self.publications.push_back(Hop {
+            at: now,
+            domain_id: *domain_id,
+            topics,
+            points,
+            traced,
+            is_over: false,
+        });
+    }
+
+    /// Ends the chains of publications that no other has continued.
+    pub(super) fn advance(
+        &mut self,
+        now: Timestamp,
+        paths: &mut Paths,
+        expected: &mut ExpectedChains,
+    ) {
+        let quiet = |hop: &&mut Hop| now - hop.at >= QUIET;
+        for hop in self.publications.iter_mut().filter(quiet) {
+            hop.end(paths, expected);
+        }
+        while let Some(hop) = self.publications.front()
+            && now - hop.at >= REMEMBERED
+        {
+            self.publications.pop_front();
+        }
+    }
+
+    /// Ends all chains at the end of the input.
+    pub(super) fn settle(&mut self, paths: &mut Paths, expected: &mut ExpectedChains) {
+        for mut hop in std::mem::take(&mut self.publications) {
+            hop.end(paths, expected);
+        }
+    }
+
+    pub(super) fn sizes(&self) -> Vec<Size> {
+        // The destructuring makes a new table fail to compile until it is listed here.
+        let Self {
+            publications,
+            evictions: _,
+        } = self;
+        let length = |hop: &Hop| {
+            let Hop {
+                at: _,
+                domain_id: _,
+                topics,
+                points,
+                traced: _,
+                is_over: _,
+            } = hop;
+            topics.len().max(points.len())
+        };
+        let longest = publications.iter().map(length).max().unwrap_or(0);
+        vec![
+            Size::new("chains.publications", publications.len(), MAX_PUBLICATIONS),
+            Size::new("chains.publication.hops", longest, MAX_HOPS + 1),
+        ]
+    }
+}
+
+impl Hop {
+    fn end(&mut self, paths: &mut Paths, expected: &mut ExpectedChains) {
+        if std::mem::replace(&mut self.is_over, true) {
+            return;
+        }
+        let path = Path {
+            domain_id: self.domain_id,
+            method: Method::Causality,
+            topics: std::mem::take(&mut self.topics),
+        };
+        let trace = Trace {
+            path: Arc::new(path),
+            points: std::mem::take(&mut self.points),
+        };
+        paths.add(trace, expected);
+    }
+}

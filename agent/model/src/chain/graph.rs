@@ -1,0 +1,193 @@
+//! Which node reads and writes which measured topics with a header.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::sync::Arc;
+
+use ros2probe_wire::{DomainId, Guid, GuidPrefix};
+
+use crate::diagnosis::TopicKey;
+use crate::discovery::Discovery;
+use crate::header::begins_with_header;
+use crate::names::{NodeName, TopicName, TypeName};
+use crate::size::Size;
+use crate::topic::{Topic, TopicId, Topics, Watched};
+use crate::topic_kind::TopicKind;
+use crate::trace::share::Share;
+
+/// Topics that every node has and that cause no message with a header.
+pub(super) const INFRASTRUCTURE: [&str; 3] = ["/clock", "/parameter_events", "/rosout"];
+
+/// A node with its inputs.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct NodeView {
+    pub(super) domain_id: DomainId,
+    pub(super) prefix: GuidPrefix,
+    /// Its name; `None` for a participant without announced nodes.
+    pub(super) name: Option<NodeName>,
+    /// Measured topics with a header that it reads.
+    pub(super) inputs: BTreeMap<TopicId, TopicName>,
+    /// Whether it reads nothing else, so that no input of it is hidden.
+    pub(super) is_complete: bool,
+}
+
+/// A topic as one of its writers' nodes publishes it.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Output {
+    pub(super) node: Arc<NodeView>,
+    pub(super) topic: TopicId,
+    pub(super) key: TopicKey,
+    pub(super) message_type: TypeName,
+    /// Share of the chains from this topic on that is traced.
+    pub(super) share: Option<Share>,
+    /// Whether a node that publishes reads it.
+    pub(super) is_read: bool,
+}
+
+/// The writers of measured topics with a header.
+#[derive(Debug, Default)]
+pub(super) struct Graph {
+    pub(super) outputs: HashMap<Guid, Arc<Output>>,
+}
+
+/// The inputs of a node while the graph is built.
+#[derive(Default)]
+struct Inputs {
+    topics: BTreeMap<TopicId, TopicName>,
+    has_others: bool,
+}
+
+impl NodeView {
+    /// Returns whether both are the same node.
+    pub(super) fn is_same(&self, other: &Self) -> bool {
+        match (&self.name, &other.name) {
+            (Some(name), Some(other)) => name == other,
+            (None, None) => self.prefix == other.prefix,
+            _ => false,
+        }
+    }
+}
+
+impl Graph {
+    /// Builds the graph from discovery and the measured topics. `share` returns the traced share of
+    /// a topic.
+    pub(super) fn of(
+        discovery: &Discovery,
+        topics: &Topics,
+        share: impl Fn(&Topic) -> Option<Share>,
+    ) -> Self {
+        let owners = owners(discovery);
+        let mut nodes: HashMap<(GuidPrefix, Option<&NodeName>), Inputs> = HashMap::new();
+        let mut domains = HashMap::new();
+        let mut writers = Vec::new();
+        for (id, topic) in topics.iter() {
+            let is_input = is_stamped(topic, discovery) && topic.watched == Watched::Yes;
+            for reader in &topic.readers {
+                let owner = (reader.prefix, owners.get(reader).copied());
+                let inputs = nodes.entry(owner).or_default();
+                if is_input {
+                    inputs.topics.insert(id, topic.naming.name.clone());
+                } else if matches!(topic.naming.kind, TopicKind::Topic | TopicKind::Dds) {
+                    let name: &str = &topic.naming.name;
+                    inputs.has_others |= !INFRASTRUCTURE.contains(&name);
+                }
+            }
+            if is_input {
+                for writer in &topic.writers {
+                    let owner = (writer.prefix, owners.get(writer).copied());
+                    domains.insert(owner, topic.domain_id);
+                    writers.push((*writer, owner, id));
+                }
+            }
+        }
+        let mut views = HashMap::new();
+        let mut read = BTreeSet::new();
+        for (owner, domain_id) in domains {
+            let inputs = nodes.remove(&owner).unwrap_or_default();
+            let (prefix, name) = owner;
+            let view = NodeView {
+                domain_id,
+                prefix,
+                name: name.cloned(),
+                is_complete: !inputs.has_others && name.is_some(),
+                inputs: if name.is_some() {
+                    inputs.topics
+                } else {
+                    BTreeMap::new()
+                },
+            };
+            read.extend(view.inputs.keys().copied());
+            views.insert(owner, Arc::new(view));
+        }
+        let mut outputs = HashMap::with_capacity(writers.len());
+        for (writer, owner, id) in writers {
+            let (Some(view), Some(topic)) = (views.get(&owner), topics.get(id)) else {
+                continue;
+            };
+            let endpoint = discovery.endpoints().get(&writer);
+            let output = Output {
+                node: Arc::clone(view),
+                topic: id,
+                key: key(topic),
+                message_type: endpoint
+                    .map(|writer| writer.message_type.clone())
+                    .unwrap_or_default(),
+                share: share(topic),
+                is_read: read.contains(&id),
+            };
+            outputs.insert(writer, Arc::new(output));
+        }
+        Self { outputs }
+    }
+
+    pub(super) fn sizes(&self, endpoints: usize) -> Vec<Size> {
+        // The destructuring makes a new table fail to compile until it is listed here.
+        let Self { outputs } = self;
+        let inputs = outputs.values().map(|each| inputs(&each.node)).max();
+        vec![
+            Size::new("chains.outputs", outputs.len(), endpoints),
+            Size::new("chains.inputs", inputs.unwrap_or(0), endpoints),
+        ]
+    }
+}
+
+fn inputs(node: &NodeView) -> usize {
+    let NodeView {
+        domain_id: _,
+        prefix: _,
+        name: _,
+        inputs,
+        is_complete: _,
+    } = node;
+    inputs.len()
+}
+
+/// Returns the node of each endpoint.
+pub(super) fn owners(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
+    let mut owners = HashMap::new();
+    for participant in discovery.participants().values() {
+        for node in &participant.nodes {
+            for guid in node.writers.iter().chain(&node.readers) {
+                owners.insert(*guid, &node.name);
+            }
+        }
+    }
+    owners
+}
+
+/// Returns whether it is a ROS topic whose messages begin with a header.
+pub(super) fn is_stamped(topic: &Topic, discovery: &Discovery) -> bool {
+    let endpoint = |guid| discovery.endpoints().get(guid);
+    let mut writers = topic.writers.iter().filter_map(endpoint);
+    topic.naming.kind == TopicKind::Topic
+        && writers.any(|writer| begins_with_header(&writer.message_type))
+}
+
+/// Returns the identity of a topic.
+pub(super) fn key(topic: &Topic) -> TopicKey {
+    TopicKey {
+        domain_id: topic.domain_id,
+        dds_name: topic.naming.dds_name.clone(),
+        name: topic.naming.name.clone(),
+        kind: topic.naming.kind,
+    }
+}

@@ -1,0 +1,236 @@
+//! Spans of the messages with one stamp.
+//!
+//! The stamp alone identifies the measurement if it has nanoseconds and is of the present. Then all
+//! agents that see a part of the chain report one trace. Rounded, simulated and recorded stamps
+//! come more than once: there, the first message of the chain is a part of the identity.
+
+use std::sync::Arc;
+
+use ros2probe_wire::Timestamp;
+
+use super::{ChainMessage, ChainSpan, ChainStage, ChainTracer, SpanId};
+use crate::chain::stamps::{Published, Stamp};
+use crate::chain::trace::Method;
+use crate::header::stamp_time;
+use crate::identity::Identity;
+use crate::trace::Message;
+
+/// A stamp that is a multiple of this many nanoseconds may be that of another robot, too.
+const COARSE: u32 = 1000;
+
+/// The messages with one stamp, in the order of their publication.
+pub(in crate::chain) struct Stamped<'a> {
+    pub(in crate::chain) stamp: Stamp,
+    pub(in crate::chain) messages: &'a [&'a Published],
+    /// For each message the one that it continues by an accepted hop, which is before it.
+    pub(in crate::chain) causes: &'a [Option<usize>],
+}
+
+/// A hop: its input, its output, and when the input reached the node, if that was observed here.
+struct Hop<'a> {
+    input: &'a Published,
+    output: &'a Published,
+    arrived: Option<Timestamp>,
+}
+
+impl Stamped<'_> {
+    /// Completes the spans of all messages whose trace is exported.
+    pub(in crate::chain) fn trace(&self, tracer: &mut ChainTracer) {
+        let is_traced = |message: &&Published| message.output.share.is_some();
+        if !self.messages.iter().any(is_traced) {
+            return;
+        }
+        for (index, message) in self.messages.iter().enumerate() {
+            if let Some(trace_id) = self.trace_id(index) {
+                if let Some(hop) = self.hop(index) {
+                    self.pass(index, &hop, trace_id, tracer);
+                }
+                if message.is_local {
+                    self.publish(index, message, trace_id, tracer);
+                }
+            }
+        }
+    }
+
+    /// Returns the trace of a message, or `None` if it is in no chain or not exported.
+    fn trace_id(&self, index: usize) -> Option<u128> {
+        if self.cause(index).is_none() && !self.causes.contains(&Some(index)) {
+            return None;
+        }
+        let mut first = index;
+        while let Some(cause) = self.cause(first) {
+            first = cause;
+        }
+        let first = self.messages.get(first)?;
+        let trace_id = identity(self.stamp, first);
+        first.output.share?.takes(trace_id).then_some(trace_id)
+    }
+
+    fn cause(&self, index: usize) -> Option<usize> {
+        let cause = self.causes.get(index).copied().flatten();
+        cause.filter(|cause| *cause < index)
+    }
+
+    /// Returns the hop that ends with this message.
+    fn hop(&self, index: usize) -> Option<Hop<'_>> {
+        let (input, output) = (self.cause(index)?, self.messages.get(index)?);
+        let input = self.messages.get(input)?;
+        // The arrival at another host is observed there.
+        let arrived = if output.is_local {
+            input.reached(output)
+        } else {
+            None
+        };
+        Some(Hop {
+            input,
+            output,
+            arrived,
+        })
+    }
+
+    /// Completes the span of a publication on this host.
+    fn publish(&self, index: usize, message: &Published, trace_id: u128, tracer: &mut ChainTracer) {
+        let end = if message.sampled {
+            message.published
+        } else {
+            message.at
+        };
+        tracer.finish(ChainSpan {
+            parent: self.hop(index).map(|hop| hop.id(trace_id)),
+            ..self.span(
+                (ChainStage::Publish, publish(message, trace_id)),
+                (message, message),
+                (message.published, end),
+                trace_id,
+            )
+        });
+    }
+
+    /// Completes the spans of a hop.
+    fn pass(&self, index: usize, hop: &Hop<'_>, trace_id: u128, tracer: &mut ChainTracer) {
+        let Hop {
+            input,
+            output,
+            arrived,
+        } = *hop;
+        let parent = self.cause(index).map(|cause| self.anchor(cause, trace_id));
+        let messages = (input, output);
+        let span = |named, times| ChainSpan {
+            parent,
+            ..self.span(named, messages, times, trace_id)
+        };
+        let Some(arrived) = arrived else {
+            let times = (input.published, output.published);
+            let named = (ChainStage::Hop, hop.id(trace_id));
+            return tracer.finish(with_output(span(named, times), output));
+        };
+        // A node may publish several messages because of one.
+        let is_same = |other: &usize| {
+            self.cause(*other) == self.cause(index)
+                && self.hop(*other).is_some_and(|other| {
+                    other.arrived.is_some() && other.output.output.node.is_same(&output.output.node)
+                })
+        };
+        if !(0..index).any(|other| is_same(&other)) {
+            let named = (ChainStage::Transit, transit(hop, trace_id));
+            tracer.finish(span(named, (input.published, arrived)));
+        }
+        let named = (ChainStage::Node, hop.id(trace_id));
+        let times = (arrived, output.published);
+        tracer.finish(with_output(span(named, times), output));
+    }
+
+    /// Returns the span that stands for a message: its publication, or the hop to it if that was on
+    /// another host.
+    fn anchor(&self, index: usize, trace_id: u128) -> SpanId {
+        match (self.messages.get(index), self.hop(index)) {
+            (Some(message), Some(hop)) if !message.is_local => hop.id(trace_id),
+            (Some(message), _) => publish(message, trace_id),
+            (None, _) => SpanId::of(ChainStage::Publish, trace_id, &[]),
+        }
+    }
+
+    /// Returns a span without a parent, about a message and the node that publishes another one.
+    fn span(
+        &self,
+        (stage, id): (ChainStage, SpanId),
+        (message, of_node): (&Published, &Published),
+        (begin, end): (Timestamp, Timestamp),
+        trace_id: u128,
+    ) -> ChainSpan {
+        let output = &message.output;
+        let own_trace = Message::identity(message.writer, message.number);
+        let is_sent = message.is_local && !message.sampled;
+        let share = output.share.filter(|_| is_sent);
+        ChainSpan {
+            stage,
+            trace_id,
+            id,
+            parent: None,
+            begin,
+            end: end.max(begin),
+            domain_id: output.node.domain_id,
+            method: Method::Stamps,
+            topic: output.key.name.clone(),
+            node: of_node.output.node.name.clone(),
+            output: None,
+            message: Some(Arc::new(ChainMessage {
+                writer: message.writer,
+                sequence_number: message.number,
+                message_type: output.message_type.clone(),
+                size: message.size,
+                stamp: self.stamp,
+                own_trace: share.and_then(|share| share.takes(own_trace).then_some(own_trace)),
+            })),
+        }
+    }
+}
+
+impl Hop<'_> {
+    /// Returns the id of the span that ends with the output.
+    fn id(&self, trace_id: u128) -> SpanId {
+        let stage = match self.arrived {
+            Some(_) => ChainStage::Node,
+            None => ChainStage::Hop,
+        };
+        let (input, output) = (key(self.input), key(self.output));
+        SpanId::of(stage, trace_id, &[&input, &output])
+    }
+}
+
+fn publish(message: &Published, trace_id: u128) -> SpanId {
+    SpanId::of(ChainStage::Publish, trace_id, &[&key(message)])
+}
+
+fn transit(hop: &Hop<'_>, trace_id: u128) -> SpanId {
+    let node = &hop.output.output.node;
+    let name = node.name.as_deref().unwrap_or_default();
+    let values: [&[u8]; 3] = [&key(hop.input), &node.prefix.0, name.as_bytes()];
+    SpanId::of(ChainStage::Transit, trace_id, &values)
+}
+
+/// Returns bytes that identify the message.
+fn key(message: &Published) -> [u8; 16] {
+    Message::identity(message.writer, message.number).to_be_bytes()
+}
+
+fn with_output(span: ChainSpan, output: &Published) -> ChainSpan {
+    ChainSpan {
+        output: Some(output.output.key.name.clone()),
+        ..span
+    }
+}
+
+/// Returns the trace of the messages with this stamp.
+fn identity(stamp: Stamp, first: &Published) -> u128 {
+    let (seconds, nanoseconds) = stamp;
+    let mut identity = Identity::of(b"ros2 chain by stamps");
+    identity.add(&first.output.node.domain_id.0.to_be_bytes());
+    identity.add(&seconds.to_be_bytes());
+    identity.add(&nanoseconds.to_be_bytes());
+    let is_present = stamp_time(stamp, first.published).is_some();
+    if nanoseconds.is_multiple_of(COARSE) || !is_present {
+        identity.add(&key(first));
+    }
+    identity.bits()
+}

@@ -1,0 +1,441 @@
+//! What a source reports about calls inside processes: cumulative figures, once a second.
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::inside::{BUCKETS, bucket, bucket_start};
+use ros2probe_wire::{DomainId, Timestamp};
+
+use crate::histogram::Histogram;
+use crate::names::{NodeName, TopicName};
+
+/// A report about calls inside processes. Handles that have not changed since the last report are
+/// left out.
+#[derive(Clone, Debug, Default)]
+pub struct Report {
+    /// Time at which the figures were read.
+    pub at: Timestamp,
+    /// Whether callbacks are observed, and not only messages.
+    pub has_callbacks: bool,
+    /// Processes with changes, and those that have ended since.
+    pub processes: Vec<ProcessReport>,
+    /// Lifecycle transitions since the last report.
+    pub transitions: Vec<Transition>,
+}
+
+impl Report {
+    /// Converts all times.
+    pub fn convert(&mut self, convert: impl Fn(Timestamp) -> Timestamp) {
+        self.at = convert(self.at);
+        for transition in &mut self.transitions {
+            transition.at = convert(transition.at);
+        }
+        for process in &mut self.processes {
+            let publishers = process.publishers.iter_mut().map(|each| &mut each.last);
+            let subscriptions = process.subscriptions.iter_mut().map(|each| &mut each.last);
+            let buffers = process.buffers.iter_mut().map(|each| &mut each.last);
+            let callbacks = process.callbacks.iter_mut().map(|each| &mut each.last);
+            let all = publishers.chain(subscriptions);
+            for last in all.chain(buffers).chain(callbacks) {
+                *last = convert(*last);
+            }
+        }
+    }
+}
+
+/// One process.
+#[derive(Clone, Debug, Default)]
+pub struct ProcessReport {
+    /// Process id in the initial namespace.
+    pub id: u32,
+    /// Name of the process.
+    pub name: Option<Arc<str>>,
+    /// Its domain, from `ROS_DOMAIN_ID` of its environment.
+    pub domain_id: DomainId,
+    /// CPU time so far, user and system.
+    pub cpu: Duration,
+    /// Calls observed.
+    pub hits: u64,
+    /// Calls that were not counted because there were too many handles.
+    pub refused: u64,
+    /// The process exceeds its budget, and its calls are no longer counted.
+    pub is_suspended: bool,
+    /// The process has ended; these are its last figures.
+    pub has_ended: bool,
+    /// Its library reports every step of intra-process messages (rclcpp of Iron and later), not
+    /// only their callbacks.
+    pub shows_intra_process: bool,
+    /// Nodes that it created while it was observed.
+    pub nodes: Vec<NodeName>,
+    /// Publishers.
+    pub publishers: Vec<PublisherReport>,
+    /// Subscriptions that take from the middleware.
+    pub subscriptions: Vec<SubscriptionReport>,
+    /// Ring buffers of intra-process subscriptions.
+    pub buffers: Vec<BufferReport>,
+    /// Callbacks.
+    pub callbacks: Vec<CallbackReport>,
+}
+
+/// One publisher.
+#[derive(Clone, Debug)]
+pub struct PublisherReport {
+    /// Its address, which identifies it in its process.
+    pub handle: u64,
+    /// Its node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware, such as `rmw_fastrtps_cpp`.
+    pub middleware: Option<Arc<str>>,
+    /// Messages published.
+    pub published: u64,
+    /// Messages among them passed directly to subscriptions in the same process.
+    pub within_process: u64,
+    /// Time of the last one.
+    pub last: Timestamp,
+    /// Time between consecutive ones.
+    pub intervals: Durations,
+}
+
+/// One subscription.
+#[derive(Clone, Debug)]
+pub struct SubscriptionReport {
+    /// Its address.
+    pub handle: u64,
+    /// Its node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic.
+    pub topic: TopicName,
+    /// Identifier of its middleware.
+    pub middleware: Option<Arc<str>>,
+    /// Messages taken from the middleware.
+    pub taken: u64,
+    /// Attempts that returned no message.
+    pub failed: u64,
+    /// Time of the last message.
+    pub last: Timestamp,
+    /// Time between consecutive messages.
+    pub intervals: Durations,
+    /// Time from the source timestamp to the take.
+    pub latency: Durations,
+}
+
+/// The ring buffer of one intra-process subscription.
+#[derive(Clone, Debug)]
+pub struct BufferReport {
+    /// Its address.
+    pub handle: u64,
+    /// The subscription's node, if known.
+    pub node: Option<NodeName>,
+    /// ROS name of its topic; `None` until a publication shows it.
+    pub topic: Option<TopicName>,
+    /// Messages put into the buffer.
+    pub enqueued: u64,
+    /// Messages overwritten before they were taken: lost.
+    pub overwritten: u64,
+    /// Messages taken.
+    pub dequeued: u64,
+    /// Messages in the buffer after the last entry.
+    pub depth: u32,
+    /// The largest of these so far.
+    pub max_depth: u32,
+    /// Capacity, if the process created the buffer while it was observed.
+    pub capacity: Option<u32>,
+    /// Time of the last entry.
+    pub last: Timestamp,
+    /// Time that messages spent in the buffer.
+    pub waiting: Durations,
+}
+
+/// One callback of rclcpp.
+#[derive(Clone, Debug)]
+pub struct CallbackReport {
+    /// Its address.
+    pub handle: u64,
+    /// Its node, if known.
+    pub node: Option<NodeName>,
+    /// What triggers it.
+    pub trigger: Trigger,
+    /// Thread of its last call.
+    pub thread: u32,
+    /// Completed calls.
+    pub calls: u64,
+    /// End of the last one.
+    pub last: Timestamp,
+    /// Duration of the calls.
+    pub durations: Durations,
+    /// Time from being ready to the start: since a timer was due, since a message entered its ring
+    /// buffer, or since its source timestamp beyond the least such time seen.
+    pub waits: Durations,
+    /// Periods in which a timer was not called.
+    pub skipped: u64,
+}
+
+/// What triggers a callback.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Trigger {
+    /// Messages from the middleware.
+    Subscription(TopicName),
+    /// Messages from the same process; the topic is unknown if the process was started before.
+    IntraProcess(Option<TopicName>),
+    /// A timer; the period is unknown if its structure cannot be read.
+    Timer(Option<Duration>),
+    /// A service with its name, or another callback without one.
+    Service(Option<Arc<str>>),
+}
+
+impl Trigger {
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(&self) -> &'static str {
+        match self {
+            Self::Subscription(_) => "subscription",
+            Self::IntraProcess(_) => "intra_process",
+            Self::Timer(_) => "timer",
+            Self::Service(_) => "service",
+        }
+    }
+
+    /// Returns the topic or service, if it is known.
+    #[must_use]
+    pub fn name(&self) -> Option<&str> {
+        match self {
+            Self::Subscription(topic) | Self::IntraProcess(Some(topic)) => Some(topic),
+            Self::Service(name) => name.as_deref(),
+            Self::IntraProcess(None) | Self::Timer(_) => None,
+        }
+    }
+
+    /// Returns the timer's period, if it is known.
+    #[must_use]
+    pub const fn period(&self) -> Option<Duration> {
+        match self {
+            Self::Timer(period) => *period,
+            _ => None,
+        }
+    }
+}
+
+/// Describes the trigger: `/scan`, `timer of 50 ms`, `service /reset`.
+impl fmt::Display for Trigger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Subscription(topic) | Self::IntraProcess(Some(topic)) => f.write_str(topic),
+            Self::IntraProcess(None) => f.write_str("messages of the same process"),
+            Self::Timer(Some(period)) => write!(f, "timer of {period:?}"),
+            Self::Timer(None) => f.write_str("timer"),
+            Self::Service(Some(name)) => write!(f, "service {name}"),
+            Self::Service(None) => f.write_str("service"),
+        }
+    }
+}
+
+/// A transition of a managed node.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Transition {
+    /// Process of the node.
+    pub process: u32,
+    /// The node, if the process created it while it was observed.
+    pub node: Option<NodeName>,
+    /// Label of the state before.
+    pub start: Arc<str>,
+    /// Label of the state after.
+    pub goal: Arc<str>,
+    /// Time of the transition.
+    pub at: Timestamp,
+}
+
+/// A distribution of durations, cumulative: four buckets for each power of two.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Durations {
+    /// Counts by [`bucket`].
+    counts: Box<[u64; BUCKETS]>,
+    sum: u64,
+    minimum: u64,
+    maximum: u64,
+}
+
+impl Default for Durations {
+    fn default() -> Self {
+        Self {
+            counts: Box::new([0; BUCKETS]),
+            sum: 0,
+            minimum: 0,
+            maximum: 0,
+        }
+    }
+}
+
+impl Durations {
+    /// Creates a distribution from the kernel's counts, and from sum, minimum and maximum in
+    /// nanoseconds.
+    #[must_use]
+    pub fn new(counts: &[u32; BUCKETS], sum: u64, minimum: u64, maximum: u64) -> Self {
+        Self {
+            counts: Box::new(counts.map(u64::from)),
+            sum,
+            minimum,
+            maximum,
+        }
+    }
+
+    /// Adds one duration.
+    pub fn observe(&mut self, duration: Duration) {
+        let nanoseconds = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
+        self.minimum = match self.count() {
+            0 => nanoseconds,
+            _ => self.minimum.min(nanoseconds),
+        };
+        if let Some(count) = self.counts.get_mut(bucket(nanoseconds)) {
+            *count += 1;
+        }
+        self.sum = self.sum.saturating_add(nanoseconds);
+        self.maximum = self.maximum.max(nanoseconds);
+    }
+
+    /// Returns the number of durations.
+    #[must_use]
+    pub fn count(&self) -> u64 {
+        self.counts.iter().sum()
+    }
+
+    /// Returns their sum.
+    #[must_use]
+    pub const fn sum(&self) -> Duration {
+        Duration::from_nanos(self.sum)
+    }
+
+    /// Returns the smallest and largest duration; `None` if the distribution is empty.
+    #[must_use]
+    pub fn range(&self) -> Option<(Duration, Duration)> {
+        let range = (self.minimum, self.maximum);
+        (self.count() > 0).then(|| (Duration::from_nanos(range.0), Duration::from_nanos(range.1)))
+    }
+
+    /// Estimates the duration below which this share of all lies, between a bucket's bounds, which
+    /// differ by a quarter at most. Returns `None` if the distribution is empty.
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "an estimate, below 2^35 nanoseconds"
+    )]
+    pub fn quantile(&self, part: f64) -> Option<Duration> {
+        let (least, largest) = self.range()?;
+        let wanted = self.count() as f64 * part;
+        let mut below = 0.0;
+        for (index, count) in self.counts.iter().enumerate() {
+            let count = *count as f64;
+            if count > 0.0 && below + count >= wanted {
+                let start = bucket_start(index) as f64;
+                let width = bucket_start(index + 1) as f64 - start;
+                let value = start + width * (wanted - below).max(0.0) / count;
+                return Some(Duration::from_nanos(value as u64).clamp(least, largest));
+            }
+            below += count;
+        }
+        Some(largest)
+    }
+
+    /// Returns the durations added since `earlier`, an older state of this distribution; its
+    /// maximum is that of the highest bucket in use, if it is lower.
+    #[must_use]
+    pub fn since(&self, earlier: &Self) -> Self {
+        if self.count() < earlier.count() {
+            return self.clone();
+        }
+        let mut counts = self.counts.clone();
+        for (count, before) in counts.iter_mut().zip(earlier.counts.iter()) {
+            *count = count.saturating_sub(*before);
+        }
+        let highest = counts.iter().rposition(|count| *count > 0);
+        let lowest = counts.iter().position(|count| *count > 0);
+        Self {
+            counts,
+            sum: self.sum.saturating_sub(earlier.sum),
+            minimum: self.minimum.max(lowest.map_or(0, bucket_start)),
+            maximum: highest.map_or(0, |highest| self.maximum.min(bucket_start(highest + 1))),
+        }
+    }
+
+    /// Adds all durations of another distribution.
+    pub fn merge(&mut self, other: &Self) {
+        if other.count() == 0 {
+            return;
+        }
+        self.minimum = match self.count() {
+            0 => other.minimum,
+            _ => self.minimum.min(other.minimum),
+        };
+        for (count, more) in self.counts.iter_mut().zip(other.counts.iter()) {
+            *count += more;
+        }
+        self.sum = self.sum.saturating_add(other.sum);
+        self.maximum = self.maximum.max(other.maximum);
+    }
+
+    /// Returns the number of durations of at most this many nanoseconds; exact if it is a start of
+    /// a bucket.
+    #[must_use]
+    pub fn up_to(&self, nanoseconds: u64) -> u64 {
+        self.counts.iter().take(bucket(nanoseconds)).sum()
+    }
+
+    /// Returns the durations in the buckets of the metrics. A bucket across a bound belongs to the
+    /// next one, so that a duration is never shown too short.
+    #[must_use]
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "the bounds are between 100 microseconds and 10 seconds"
+    )]
+    pub fn histogram(&self) -> Histogram {
+        let up_to = |seconds: f64| self.up_to((seconds * 1e9) as u64);
+        let range = self.range().unwrap_or_default();
+        let range = (range.0.as_secs_f64(), range.1.as_secs_f64());
+        Histogram::of(up_to, self.count(), self.sum().as_secs_f64(), range)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_lie_within_a_quarter_of_the_truth() {
+        let mut durations = Durations::default();
+        for microseconds in 1..=1000 {
+            durations.observe(Duration::from_micros(microseconds));
+        }
+        assert_eq!(durations.count(), 1000);
+        for part in [0.5, 0.9, 0.99] {
+            let truth = 0.001 * part;
+            let found = durations.quantile(part).unwrap().as_secs_f64();
+            assert!((found / truth - 1.0).abs() < 0.2, "{part}: {found}");
+        }
+        assert_eq!(durations.quantile(1.0), Some(Duration::from_millis(1)));
+        assert_eq!(Durations::default().quantile(0.5), None);
+    }
+
+    #[test]
+    fn what_came_after_is_the_difference_and_merging_adds_up() {
+        let mut durations = Durations::default();
+        durations.observe(Duration::from_millis(1));
+        let earlier = durations.clone();
+        durations.observe(Duration::from_millis(200));
+        let since = durations.since(&earlier);
+        assert_eq!(
+            (since.count(), since.sum()),
+            (1, Duration::from_millis(200))
+        );
+        let median = since.quantile(0.5).unwrap();
+        assert!((150..=200).contains(&median.as_millis()), "{median:?}");
+        let mut both = earlier;
+        both.merge(&since);
+        assert_eq!((both.count(), both.sum()), (2, durations.sum()));
+        assert_eq!(both.up_to(bucket_start(50)), 1);
+    }
+}

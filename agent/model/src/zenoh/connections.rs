@@ -1,0 +1,155 @@
+//! Begin and end of connections, with the tokens and sessions that end with them.
+
+use std::collections::HashMap;
+use std::time::Duration;
+
+use ros2probe_wire::GuidPrefix;
+use ros2probe_wire::zenoh::ZenohId;
+
+use super::stream::{Flow, StreamId, Unseen};
+use super::stream_state::StreamState;
+use super::{MAX_DIRECTIONS, MAX_UNSEEN, Zenoh};
+
+impl Zenoh {
+    /// Returns the other direction, seen at the same place or, on the loopback interface, at the
+    /// other socket.
+    pub(super) fn opposite(&self, stream: &StreamId) -> Option<&StreamState> {
+        let known = self.directions.get(&stream.reversed());
+        let elsewhere = || {
+            self.directions
+                .get(self.flows.get(&stream.flow.reversed())?)
+        };
+        known.or_else(elsewhere).map(|direction| &**direction)
+    }
+
+    /// Returns the sockets of this host that a session owns, as far as is known.
+    pub fn sockets(&self, session: GuidPrefix) -> impl Iterator<Item = u64> + '_ {
+        let owned = self.directions.iter().filter(move |(stream, direction)| {
+            let owner = direction.owner(stream);
+            owner.is_some_and(|owner| owner.guid_prefix() == session)
+        });
+        owned.map(|(stream, _)| stream.socket)
+    }
+
+    pub(super) fn direction(&mut self, stream: &StreamId) -> Option<&mut StreamState> {
+        if !self.directions.contains_key(stream) {
+            if self.directions.len() >= MAX_DIRECTIONS {
+                self.evictions += 1;
+                let oldest = self.directions.iter();
+                let oldest = oldest.min_by_key(|(id, direction)| (direction.last_seen, **id));
+                let oldest = oldest.map(|(id, _)| *id)?;
+                self.begin(&oldest);
+            }
+            let mut direction = Box::<StreamState>::default();
+            direction.sender = self.remembered.take(stream.flow);
+            self.directions.insert(*stream, direction);
+            self.flows.insert(stream.flow, *stream);
+        }
+        self.directions
+            .get_mut(stream)
+            .map(|direction| &mut **direction)
+    }
+
+    pub(super) fn begin(&mut self, stream: &StreamId) {
+        for flow in [stream.flow, stream.flow.reversed()] {
+            self.remembered.take(flow);
+        }
+        if let Some(known) = self.remove(stream) {
+            self.disconnect(stream, &known);
+        }
+        let connection = stream.flow.connection();
+        self.unseen.retain(|(_, other)| *other != connection);
+    }
+
+    /// Records that the sender leaves the connection. If it is the first to do so and has no other
+    /// connection, its session has ended. Its declarations end with the connection.
+    pub(super) fn leave(&mut self, stream: &StreamId) {
+        if self.remembered.sender(stream.flow).is_some() {
+            self.direction(stream);
+        }
+        let Some(direction) = self.directions.get_mut(stream) else {
+            return;
+        };
+        self.revision += 1;
+        if std::mem::replace(&mut direction.has_left, true) {
+            return;
+        }
+        let session = direction.session();
+        if self.opposite(stream).is_some_and(|other| other.has_left) {
+            return;
+        }
+        if let Some(session) = session {
+            let mut others = self.directions.iter();
+            let is_open = others.any(|(id, direction)| {
+                direction.session() == Some(session)
+                    && !direction.has_left
+                    && self.opposite(id).is_none_or(|other| !other.has_left)
+            });
+            if !is_open && !self.remembered.has(session) {
+                self.graph.end(session);
+            }
+        }
+        if let Some(direction) = self.directions.get_mut(stream) {
+            direction.token_ids.clear();
+            for token in std::mem::take(&mut direction.tokens) {
+                self.graph.undeclare(&token, stream, None);
+            }
+        }
+    }
+
+    /// Records that the sender has closed the connection.
+    pub(super) fn end(&mut self, stream: &StreamId) {
+        self.leave(stream);
+        let Some(direction) = self.directions.get_mut(stream) else {
+            return;
+        };
+        self.chain_bytes -= direction.held();
+        direction.interrupt();
+        direction.has_ended = true;
+        if self.opposite(stream).is_none_or(|other| other.has_ended) {
+            let elsewhere = self.flows.get(&stream.flow.reversed()).copied();
+            let ids = [Some(*stream), Some(stream.reversed()), elsewhere];
+            for id in ids.into_iter().flatten() {
+                if let Some(direction) = self.remove(&id) {
+                    self.disconnect(&id, &direction);
+                }
+            }
+        }
+        let connection = stream.flow.connection();
+        self.unseen.retain(|(_, other)| *other != connection);
+    }
+
+    pub(super) fn note_unseen(&mut self, reason: Unseen, flow: Flow) {
+        if self.unseen.len() < MAX_UNSEEN {
+            self.unseen.insert((reason, flow.connection()));
+        }
+    }
+
+    fn remove(&mut self, stream: &StreamId) -> Option<Box<StreamState>> {
+        let known = self.directions.remove(stream)?;
+        self.chain_bytes -= known.held();
+        if self.flows.get(&stream.flow) == Some(stream) {
+            self.flows.remove(&stream.flow);
+        }
+        Some(known)
+    }
+
+    /// Removes what a connection declares. A token lives on until it is undeclared or its session
+    /// ends.
+    fn disconnect(&mut self, stream: &StreamId, direction: &StreamState) {
+        for token in &direction.tokens {
+            self.graph.disconnect(token, stream);
+        }
+    }
+}
+
+/// Returns the lease of a session that a connection shows.
+pub(super) fn lease(
+    directions: &HashMap<StreamId, Box<StreamState>>,
+    session: ZenohId,
+) -> Option<Duration> {
+    let own = directions
+        .values()
+        .filter(|direction| direction.sender.is_some_and(|side| side.zid == session));
+    own.filter_map(|direction| direction.lease).max()
+}

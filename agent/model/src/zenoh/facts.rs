@@ -1,0 +1,39 @@
+//! Figures of Zenoh for the snapshot.
+
+use super::stream::Unseen;
+
+/// Figures of Zenoh.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ZenohFacts {
+    /// Connections of Zenoh at present, each counted once.
+    pub connections: u64,
+    /// Routers at present.
+    pub routers: u64,
+    /// What was counted since the start.
+    pub counters: Counters,
+    /// Connections of which nothing or no payload can be read, in the order of [`Unseen::ALL`].
+    pub unseen: [u64; Unseen::ALL.len()],
+    /// Entries left out because a table was full.
+    pub evictions: u64,
+}
+
+impl ZenohFacts {
+    /// Returns each reason for which connections cannot be read, with their number.
+    pub fn unseen(&self) -> impl Iterator<Item = (Unseen, u64)> {
+        let reasons = Unseen::ALL.into_iter().zip(self.unseen);
+        reasons.filter(|(_, connections)| *connections > 0)
+    }
+}
+
+/// What was counted since the start.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Batches.
+    pub batches: u64,
+    /// Times that bytes of a connection were missing.
+    pub gaps: u64,
+    /// Messages without an attachment of ROS.
+    pub foreign: u64,
+    /// Messages of which some FRAGMENTs are missing.
+    pub incomplete: u64,
+}

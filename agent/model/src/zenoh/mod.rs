@@ -1,0 +1,256 @@
+//! Zenoh: sessions, liveliness tokens and messages of rmw_zenoh, as participants, endpoints and
+//! records.
+//!
+//! The rest of the model knows no Zenoh. A session is a participant, with a GUID prefix of the
+//! vendor [`VendorId::ZENOH`](ros2probe_wire::rtps::VendorId::ZENOH). A liveliness token is an
+//! endpoint, or two with a service. A message with an attachment is a sample of the writer whose
+//! token has the attachment's gid.
+//!
+//! Routers pass messages on. A message to a router counts for its writer, and is no delivery.
+
+mod batch;
+mod connections;
+mod declarations;
+mod endpoints;
+mod facts;
+mod graph;
+mod messages;
+mod remembered;
+mod replies;
+mod session_state;
+mod stream;
+mod stream_state;
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use ros2probe_wire::zenoh::{Batch, Bytes, Gid, WhatAmI, ZenohId};
+use ros2probe_wire::{Guid, GuidPrefix, Reason, SequenceNumber, Timestamp};
+
+use crate::discovery::Endpoint;
+use crate::route::Destination;
+use crate::size::{Size, largest};
+pub use endpoints::unknown_guid;
+pub use facts::{Counters, ZenohFacts};
+use graph::Graph;
+pub use graph::GraphChange;
+pub use remembered::ZenohMemory;
+use remembered::{MAX_REMEMBERED, Remembered};
+use replies::Replies;
+pub use stream::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
+use stream_state::StreamState;
+
+/// Most directions of connections with state.
+const MAX_DIRECTIONS: usize = 4096;
+/// Most bytes of messages in FRAGMENTs, of all connections.
+const MAX_CHAIN_BYTES: usize = 64 << 20;
+/// Most connections of which nothing can be read that are remembered.
+const MAX_UNSEEN: usize = 1024;
+
+/// A message that rmw_zenoh sent: a sample of a topic, a request, or a reply.
+#[derive(Clone, Copy, Debug)]
+pub struct ZenohSample<'a> {
+    /// Its writer.
+    pub writer: Guid,
+    /// Its number, counted by the writer.
+    pub number: SequenceNumber,
+    /// Time of publication, by the writer's clock.
+    pub source_timestamp: Option<Timestamp>,
+    /// The payload, of which the capture may have the beginning only.
+    pub payload: Bytes<'a>,
+    /// The session that receives it, if known.
+    pub receiver: Option<GuidPrefix>,
+    /// Whether the receiver is a router.
+    pub is_relayed: bool,
+    /// Time of its first FRAGMENT.
+    pub began: Timestamp,
+    /// With a request or reply: gid of the client, and the number of the request.
+    pub call: Option<(Gid, SequenceNumber)>,
+}
+
+/// What a report shows.
+#[derive(Debug)]
+pub enum Shown<'a> {
+    /// A message.
+    Sample(&'a ZenohSample<'a>),
+    /// A session owns a socket of this host.
+    Owner(u64, GuidPrefix),
+    /// The session may not own the socket, contrary to [`Self::Owner`].
+    Disowned(u64, GuidPrefix),
+    /// A session sent something.
+    Alive(ZenohId),
+    /// A restored session, which only a router declares: the router sent something.
+    Relayed(ZenohId),
+    /// Bytes for this destination were not captured.
+    Missed(Destination),
+    /// Bytes could not be read.
+    Malformed(Reason),
+}
+
+/// All connections of Zenoh.
+#[derive(Debug, Default)]
+pub struct Zenoh {
+    directions: HashMap<StreamId, Box<StreamState>>,
+    /// The direction that was last seen of each flow.
+    flows: HashMap<Flow, StreamId>,
+    /// The graph in the tokens.
+    pub graph: Graph,
+    replies: Replies,
+    remembered: Remembered,
+    unseen: BTreeSet<(Unseen, Flow)>,
+    chain_bytes: usize,
+    counters: Counters,
+    /// Increases with the senders that [`Self::memory`] contains.
+    revision: u64,
+    evictions: u64,
+}
+
+/// The place of a message.
+#[derive(Clone, Copy)]
+struct Place<'a> {
+    stream: &'a StreamId,
+    /// Time of its last byte.
+    time: Timestamp,
+    /// Time of its first FRAGMENT, or that of the batch.
+    began: Timestamp,
+}
+
+impl Zenoh {
+    /// Processes a report. With `wants_bytes`, payloads are requested.
+    pub fn report(
+        &mut self,
+        report: &StreamReport<'_>,
+        wants_bytes: bool,
+        show: &mut impl FnMut(Shown<'_>),
+    ) {
+        let (stream, time) = (report.stream, report.time);
+        self.remembered.expire(time);
+        match report.event {
+            StreamEvent::Begin => self.begin(stream),
+            StreamEvent::End => self.end(stream),
+            StreamEvent::Gap => {
+                self.counters.gaps += 1;
+                show(Shown::Missed(stream.flow.destination));
+                if let Some(direction) = self.directions.get_mut(stream) {
+                    self.chain_bytes -= direction.held();
+                    direction.interrupt();
+                }
+            }
+            StreamEvent::Unseen(reason) => self.note_unseen(reason, stream.flow),
+            StreamEvent::Batch { bytes, length } => {
+                self.counters.batches += 1;
+                let place = Place {
+                    stream,
+                    time,
+                    began: time,
+                };
+                self.batch(place, Batch::new(bytes, length.into()), wants_bytes, show);
+            }
+        }
+    }
+
+    /// Returns the figures.
+    #[must_use]
+    pub fn facts(&self) -> ZenohFacts {
+        let live = || {
+            self.directions
+                .iter()
+                .filter(|(_, direction)| !direction.has_left)
+        };
+        let connections: BTreeSet<_> = live().map(|(stream, _)| stream.flow.connection()).collect();
+        let sides = live().filter_map(|(_, direction)| direction.sender);
+        let routers = sides.filter(|side| side.whatami == WhatAmI::Router);
+        let routers: BTreeSet<_> = routers.map(|side| side.zid).collect();
+        let unseen = Unseen::ALL.map(|reason| {
+            let of_reason = self.unseen.iter().filter(|(other, _)| *other == reason);
+            of_reason.count() as u64
+        });
+        ZenohFacts {
+            connections: connections.len() as u64,
+            routers: routers.len() as u64,
+            unseen,
+            evictions: self.evictions + self.graph.refused,
+            counters: self.counters,
+        }
+    }
+
+    /// Returns whether anything of Zenoh was seen.
+    #[must_use]
+    pub fn is_used(&self) -> bool {
+        self.counters.batches > 0 || !self.unseen.is_empty()
+    }
+
+    /// Returns what to save of the connections.
+    #[must_use]
+    pub fn memory(&self) -> ZenohMemory {
+        let (senders, relayed) = self.remembered.parts();
+        let (mut senders, mut relayed) = (senders.clone(), relayed.clone());
+        for (stream, direction) in &self.directions {
+            if let Some(side) = direction.sender.filter(|_| !direction.has_left) {
+                senders.insert(stream.flow, side);
+            }
+        }
+        let connected: BTreeSet<_> = self
+            .directions
+            .values()
+            .filter_map(|direction| direction.session())
+            .chain(senders.values().map(|side| side.zid))
+            .collect();
+        relayed.extend(self.graph.sessions());
+        ZenohMemory::new(&senders, &(&relayed - &connected))
+    }
+
+    /// Returns a number that increases with the connections of [`Self::memory`].
+    #[must_use]
+    pub const fn revision(&self) -> u64 {
+        self.revision
+    }
+
+    /// Restores saved connections, and the endpoints of their sessions, which discovery has.
+    pub fn restore(
+        &mut self,
+        memory: &ZenohMemory,
+        endpoints: &HashMap<Guid, Box<Endpoint>>,
+        now: Timestamp,
+    ) {
+        self.remembered.restore(memory, now);
+        let sessions = self.remembered.sessions().into_iter();
+        let sessions: BTreeMap<_, _> = sessions.map(|zid| (zid.guid_prefix(), zid)).collect();
+        for (guid, endpoint) in endpoints {
+            if guid.prefix.is_zenoh() {
+                let session = sessions.get(&guid.prefix).copied();
+                self.graph.restore(*guid, endpoint, session);
+            }
+        }
+    }
+
+    /// Returns the size and cap of each table.
+    #[must_use]
+    pub fn sizes(&self) -> Vec<Size> {
+        // The destructuring makes a new table fail to compile until it is listed here.
+        let Self {
+            directions,
+            flows,
+            graph,
+            replies,
+            remembered,
+            unseen,
+            chain_bytes,
+            counters: _,
+            revision: _,
+            evictions: _,
+        } = self;
+        let (saved, relayed) = remembered.sizes();
+        let mut sizes = largest(directions.values().flat_map(|each| each.sizes()));
+        sizes.extend(graph.sizes());
+        sizes.extend([
+            Size::new("zenoh.directions", directions.len(), MAX_DIRECTIONS),
+            Size::new("zenoh.flows", flows.len(), MAX_DIRECTIONS),
+            Size::new("zenoh.chains.bytes", *chain_bytes, MAX_CHAIN_BYTES),
+            Size::new("zenoh.unseen", unseen.len(), MAX_UNSEEN),
+            Size::new("zenoh.remembered", saved, MAX_REMEMBERED),
+            Size::new("zenoh.relayed", relayed, MAX_REMEMBERED),
+            replies.size(),
+        ]);
+        sizes
+    }
+}

@@ -1,0 +1,249 @@
+//! State of one direction of a connection: who sends, its aliases, its tokens, and the messages in
+//! FRAGMENTs.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::zenoh::{Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId};
+
+use super::stream::StreamId;
+use crate::size::Size;
+
+/// Most aliases of one direction.
+pub(super) const MAX_ALIASES: usize = 16_384;
+/// Most declared tokens of one direction.
+pub(super) const MAX_TOKENS: usize = 16_384;
+/// Longest key that is kept.
+pub(super) const MAX_KEY: usize = 4096;
+/// Most bytes of one message in FRAGMENTs.
+const MAX_MESSAGE: usize = 32 << 20;
+/// Lanes: eight priorities, reliable and best effort.
+pub(super) const LANES: usize = 16;
+/// Bytes kept of a message whose payload is not requested: everything before the payload.
+const HEAD: usize = 8192;
+/// Publications of one source after which the sender is taken for that source.
+const PRESUMED: u32 = 3;
+
+/// A key with its meaning.
+#[derive(Clone, Debug)]
+pub(super) struct Alias {
+    pub(super) key: Arc<str>,
+    /// Whether it is of a topic or service of ROS.
+    pub(super) is_topic: bool,
+}
+
+/// A message of which some FRAGMENTs have arrived.
+#[derive(Debug)]
+pub(super) struct Chain {
+    lane: Lane,
+    /// Number of the next FRAGMENT.
+    next: u32,
+    /// Time of the first.
+    pub(super) began: Timestamp,
+    /// The beginning of the message, or all of it.
+    pub(super) bytes: Vec<u8>,
+    /// Bytes that have arrived.
+    pub(super) length: usize,
+    is_wanted: bool,
+}
+
+/// One direction of a connection.
+#[derive(Debug, Default)]
+pub(super) struct StreamState {
+    /// The sender, from its INIT.
+    pub(super) sender: Option<Side>,
+    /// Source of all publications so far, and their number, if the INIT was missed.
+    presumed: Option<(ZenohId, u32)>,
+    is_ambiguous: bool,
+    pub(super) lease: Option<Duration>,
+    pub(super) aliases: HashMap<u16, Alias>,
+    /// Tokens that the sender declares.
+    pub(super) tokens: BTreeSet<Arc<str>>,
+    /// Their numbers; between routers all are 0.
+    pub(super) token_ids: HashMap<u32, Arc<str>>,
+    pub(super) chains: Vec<Chain>,
+    /// Whether the sender has sent CLOSE, or closed it.
+    pub(super) has_left: bool,
+    /// Whether the sender has closed it.
+    pub(super) has_ended: bool,
+    /// Time of the last batch.
+    pub(super) last_seen: Timestamp,
+}
+
+impl Chain {
+    /// Returns the bytes that it holds.
+    pub(super) fn held(&self) -> usize {
+        // The destructuring makes a new list fail to compile until it is listed here.
+        let Self {
+            lane: _,
+            next: _,
+            began: _,
+            bytes,
+            length: _,
+            is_wanted: _,
+        } = self;
+        bytes.len()
+    }
+}
+
+impl Alias {
+    fn new(key: &str) -> Self {
+        let is_topic = match Key::parse(key) {
+            Ok(Key::Topic(topic)) => topic.buffer.is_none(),
+            _ => false,
+        };
+        Self {
+            key: key.into(),
+            is_topic,
+        }
+    }
+}
+
+impl StreamState {
+    /// Returns the session that sends, as far as is known.
+    pub(super) fn session(&self) -> Option<ZenohId> {
+        let presumed = self.presumed.filter(|(_, count)| *count >= PRESUMED);
+        let presumed = presumed.filter(|_| !self.is_ambiguous);
+        self.sender
+            .map(|side| side.zid)
+            .or(presumed.map(|(zid, _)| zid))
+    }
+
+    /// Returns the session that owns the socket at which the direction was seen, if it sends there
+    /// and its process is on this host.
+    pub(super) fn owner(&self, stream: &StreamId) -> Option<ZenohId> {
+        if stream.socket == 0 || !stream.outgoing {
+            return None;
+        }
+        // A router that passes on publications of one session looks like that session. It sends from
+        // its port to the sessions of its host, and to other hosts.
+        let is_certain =
+            self.sender.is_some() || stream.is_loopback() && stream.flow.source.port != PORT;
+        self.session().filter(|_| is_certain)
+    }
+
+    /// Notes the source of a publication. A sender of several sources' is a router.
+    pub(super) fn note_source(&mut self, source: ZenohId) {
+        match &mut self.presumed {
+            Some((known, count)) if *known == source => *count = count.saturating_add(1),
+            Some(_) => self.is_ambiguous = true,
+            None => self.presumed = Some((source, 1)),
+        }
+    }
+
+    /// Adds an alias; returns whether there was room.
+    pub(super) fn declare(&mut self, id: u16, alias: Alias) -> bool {
+        let is_full = self.aliases.len() >= MAX_ALIASES && !self.aliases.contains_key(&id);
+        if is_full {
+            return false;
+        }
+        self.aliases.insert(id, alias);
+        true
+    }
+
+    /// Adds a FRAGMENT. Returns the message if it is complete; its bytes may be the beginning only.
+    pub(super) fn fragment(
+        &mut self,
+        fragment: &Fragment<'_>,
+        time: Timestamp,
+        begins: impl FnOnce(&[u8]) -> Option<bool>,
+        room: usize,
+    ) -> Option<Chain> {
+        let place = self
+            .chains
+            .iter()
+            .position(|chain| chain.lane == fragment.lane);
+        let number = fragment.sequence_number;
+        let known = place.map(|place| self.chains.swap_remove(place));
+        if fragment.is_dropped {
+            return None;
+        }
+        let known = known.filter(|known| known.next == number && !fragment.is_first);
+        let mut chain = match known {
+            Some(chain) => chain,
+            None => {
+                let is_wanted = begins(fragment.bytes.captured)?;
+                Chain {
+                    lane: fragment.lane,
+                    next: number,
+                    began: time,
+                    bytes: Vec::new(),
+                    length: 0,
+                    is_wanted,
+                }
+            }
+        };
+        let captured = fragment.bytes.captured;
+        let is_whole_so_far = chain.bytes.len() == chain.length;
+        chain.length += fragment.bytes.length;
+        let most = if chain.is_wanted { MAX_MESSAGE } else { HEAD };
+        let kept = most.saturating_sub(chain.bytes.len()).min(room);
+        if is_whole_so_far {
+            chain
+                .bytes
+                .extend_from_slice(captured.get(..kept).unwrap_or(captured));
+        }
+        chain.next = Resolution::DEFAULT.next(number);
+        if !fragment.has_more {
+            return Some(chain);
+        }
+        if self.chains.len() < LANES {
+            self.chains.push(chain);
+        }
+        None
+    }
+
+    /// Forgets the unfinished messages: bytes are missing.
+    pub(super) fn interrupt(&mut self) {
+        self.chains.clear();
+    }
+
+    /// Returns the bytes of unfinished messages.
+    pub(super) fn held(&self) -> usize {
+        self.chains.iter().map(Chain::held).sum()
+    }
+
+    /// Returns the size and cap of each list.
+    pub(super) fn sizes(&self) -> [Size; 3] {
+        // The destructuring makes a new list fail to compile until it is listed here.
+        let Self {
+            sender: _,
+            presumed: _,
+            is_ambiguous: _,
+            lease: _,
+            aliases,
+            tokens,
+            token_ids,
+            chains,
+            has_left: _,
+            has_ended: _,
+            last_seen: _,
+        } = self;
+        let declared = tokens.len().max(token_ids.len());
+        [
+            Size::new("zenoh.aliases", aliases.len(), MAX_ALIASES),
+            Size::new("zenoh.declared", declared, MAX_TOKENS),
+            Size::new("zenoh.chains", chains.len(), LANES),
+        ]
+    }
+}
+
+/// Returns the alias or the own key of an expression.
+pub(super) fn resolve(
+    expression: WireExpr<'_>,
+    table: Option<&HashMap<u16, Alias>>,
+) -> Option<Alias> {
+    if let Some(key) = expression.key() {
+        return (key.len() <= MAX_KEY).then(|| Alias::new(key));
+    }
+    let alias = table?.get(&expression.scope)?;
+    if expression.suffix.is_empty() {
+        return Some(alias.clone());
+    }
+    if alias.key.len() + expression.suffix.len() > MAX_KEY {
+        return None;
+    }
+    Some(Alias::new(&format!("{}{}", alias.key, expression.suffix)))
+}

@@ -1,0 +1,165 @@
+//! One truth per topic: the network's counts, or those from inside.
+
+use super::*;
+use ros2probe_model::snapshot::{Source, Transport, WatchState};
+
+/// A world with a writer and a reader of `/scan` in participants of two processes.
+fn pair(writer_process: u16, reader_process: u16) -> (World, Guid) {
+    let mut world = World::new();
+    let one = world.participant(1, writer_process);
+    let other = world.participant(2, reader_process);
+    let writer = Guid::new(one, EntityId([0, 1, 1, 3]));
+    let reader = Guid::new(other, EntityId([0, 1, 1, 4]));
+    world.announce(writer, "rt/scan", STRING);
+    world.announce(reader, "rt/scan", STRING);
+    (world, writer)
+}
+
+/// Sends samples with these numbers over the network.
+fn samples(world: &mut World, writer: Guid, numbers: std::ops::RangeInclusive<u64>) {
+    for number in numbers {
+        let message = Message::from_fast(writer.prefix);
+        world.put(message.data(writer.entity, number, &[0, 1, 0, 0, 1, 2, 3, 4]));
+    }
+}
+
+fn report(world: &World, published: u64) -> Vec<ProcessReport> {
+    vec![ProcessReport {
+        publishers: vec![publisher("/scan", published, world.now)],
+        ..process(70)
+    }]
+}
+
+#[test]
+fn the_network_counts_what_it_sees_and_nothing_is_added() {
+    let (mut world, writer) = pair(70, 71);
+    for second in 1..=10 {
+        samples(&mut world, writer, 10 * second - 9..=10 * second);
+        let reports = report(&world, 10 * second + 7);
+        world.second(reports);
+        let topic = world.topic("/scan");
+        assert_eq!(topic.source, Source::Wire);
+        assert_eq!(topic.measurement.unwrap().messages, 10 * second);
+    }
+    assert_eq!(world.inside("/scan").counts.published, 107);
+}
+
+#[test]
+fn without_a_datagram_the_counts_come_from_inside() {
+    let (mut world, _) = pair(70, 70);
+    for second in 1..=10 {
+        let reports = report(&world, 10 * second);
+        world.second(reports);
+    }
+    let topic = world.topic("/scan");
+    assert_eq!(topic.source, Source::Inside);
+    let measured = topic.measurement.unwrap();
+    assert_eq!((measured.messages, measured.bytes), (100, 0));
+    assert!((measured.rate_hz - 10.0).abs() < 0.01);
+}
+
+#[test]
+fn both_ends_of_one_participant_are_observed() {
+    let mut world = World::new();
+    let prefix = world.participant(1, 70);
+    world.announce(Guid::new(prefix, EntityId([0, 1, 1, 3])), "rt/scan", STRING);
+    world.announce(Guid::new(prefix, EntityId([0, 1, 1, 4])), "rt/scan", STRING);
+    assert_eq!(
+        world.topic("/scan").observed_pairs(Transport::SameProcess),
+        0
+    );
+    let reports = report(&world, 1);
+    world.second(reports);
+    let topic = world.topic("/scan");
+    assert_eq!(topic.observed_pairs(Transport::SameProcess), 1);
+    assert_eq!(topic.observed_pairs(Transport::Network), 0);
+}
+
+#[test]
+fn a_total_continues_when_the_last_remote_subscriber_leaves() {
+    let (mut world, writer) = pair(70, 71);
+    let mut last = 0;
+    for second in 1..=20 {
+        if second <= 8 || second > 16 {
+            samples(&mut world, writer, 10 * second - 9..=10 * second);
+        }
+        let reports = report(&world, 10 * second);
+        world.second(reports);
+        let topic = world.topic("/scan");
+        let measured = topic.measurement.unwrap();
+        assert!(measured.messages >= last, "{second}");
+        last = measured.messages;
+        if (12..=16).contains(&second) {
+            assert_eq!(topic.source, Source::Inside, "{second}");
+            assert!((measured.rate_hz - 10.0).abs() < 0.1);
+        }
+    }
+    assert_eq!(world.topic("/scan").source, Source::Wire);
+    // The seconds of doubt are not counted twice.
+    assert!((165..=200).contains(&last), "{last}");
+}
+
+#[test]
+fn expectations_hold_on_a_topic_that_only_processes_show() {
+    let mut world = World::new();
+    let watch = |expectations: &str| {
+        let mut watch = Watch::named("/scan").unwrap();
+        watch.expectations.min_rate_hz = Some(expectations.parse().unwrap());
+        Input::Watchlist(Arc::new(Watchlist::new(vec![watch]).unwrap()))
+    };
+    world.observer.input(watch("15"));
+    let mut published = 0;
+    let mut step = |world: &mut World, rate: u64, seconds: u64| {
+        for _ in 0..seconds {
+            published += rate;
+            let report = ProcessReport {
+                publishers: vec![publisher("/scan", published, world.now)],
+                subscriptions: vec![subscription("/scan", published, world.now)],
+                ..process(70)
+            };
+            world.second(vec![report]);
+        }
+        let watches = &world.snapshot().watches;
+        (
+            watches[0].topics[0].state,
+            watches[0].topics[0].violations.clone(),
+        )
+    };
+    assert_eq!(step(&mut world, 20, 15), (WatchState::Ok, Vec::new()));
+    let violated = (WatchState::Violated, vec!["min_rate_hz"]);
+    assert_eq!(step(&mut world, 5, 15), violated);
+    assert_eq!(step(&mut world, 20, 15).0, WatchState::Ok);
+}
+
+#[test]
+fn a_topic_without_a_watch_is_listed_without_a_measurement() {
+    let mut world = World::new();
+    world.watch("/other");
+    let reports = report(&world, 5);
+    world.second(reports);
+    let topic = world.topic("/scan");
+    assert!(topic.measurement.is_none());
+    assert_eq!(topic.source, Source::Inside);
+    assert_eq!(topic.inside.unwrap().counts.published, 5);
+}
+
+#[test]
+fn times_follow_a_clock_that_is_set() {
+    let mut world = World::new();
+    let reports = report(&world, 5);
+    world.second(reports);
+    let hour = 3_600 * SECOND;
+    world
+        .observer
+        .input(Input::ClockSet(i64::try_from(hour).unwrap()));
+    world.now += hour;
+    world.observer.input(Input::Time(Timestamp(world.now)));
+    let reports = report(&world, 9);
+    let at = world.now;
+    world.second(reports);
+    let topic = world.topic("/scan");
+    assert_eq!(topic.measurement.unwrap().last_message, Some(Timestamp(at)));
+    let facts = world.snapshot().inside.unwrap();
+    assert_eq!(facts.publishers[0].last, Timestamp(at));
+    assert_eq!(facts.at, Timestamp(at + 500 * MILLISECOND));
+}

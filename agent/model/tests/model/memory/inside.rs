@@ -1,0 +1,143 @@
+//! Memory of the figures from inside processes, at the caps of their tables.
+
+use std::time::Duration;
+
+use ros2probe_daemon::agent_facts::InsideSourceFacts;
+use ros2probe_model::inside::report::{
+    CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
+};
+use ros2probe_testing::repository;
+use ros2probe_wire::DomainId;
+use ros2probe_wire::time::SECOND;
+
+use super::*;
+
+const PROCESSES: u32 = 1024;
+const HANDLES: u64 = 4;
+
+/// Returns a process with two callbacks and two publishers, of a topic each, after some seconds.
+fn process(id: u32, second: u64, now: u64) -> ProcessReport {
+    let mut durations = Durations::default();
+    for bit in 10..30 {
+        (0..second).for_each(|_| durations.observe(Duration::from_nanos(1 << bit)));
+    }
+    let topic = |handle: u64| format!("/robot/sensor_{id:04}_{handle}/data_raw");
+    let callback = |handle: u64| CallbackReport {
+        handle,
+        node: Some(format!("/robot/driver_{id:04}").into()),
+        trigger: Trigger::Subscription(topic(handle).as_str().into()),
+        thread: id,
+        calls: 20 * second,
+        last: Timestamp(now),
+        durations: durations.clone(),
+        waits: durations.clone(),
+        skipped: 0,
+    };
+    let publisher = |handle: u64| PublisherReport {
+        handle,
+        node: Some(format!("/robot/driver_{id:04}").into()),
+        topic: topic(handle).as_str().into(),
+        middleware: Some("rmw_fastrtps_cpp".into()),
+        published: 20 * second,
+        within_process: 0,
+        last: Timestamp(now),
+        intervals: durations.clone(),
+    };
+    ProcessReport {
+        id,
+        name: Some(format!("driver_{id:04}").into()),
+        domain_id: DomainId(0),
+        nodes: vec![format!("/robot/driver_{id:04}").into()],
+        shows_intra_process: true,
+        callbacks: (0..HANDLES / 2).map(callback).collect(),
+        publishers: (HANDLES / 2..HANDLES).map(publisher).collect(),
+        ..ProcessReport::default()
+    }
+}
+
+/// Returns the number of MiB in the `MemoryMax=` of a file.
+fn memory_max(path: &str) -> usize {
+    let text = fs::read_to_string(repository(path)).unwrap();
+    let mut lines = text.lines();
+    let value = lines.find_map(|line| line.strip_prefix("MemoryMax=")?.strip_suffix('M'));
+    value.unwrap().parse().unwrap()
+}
+
+/// Compares the tables at their caps, with two snapshots and a page, with the `MemoryMax` that
+/// `docs/inside.md` gives the service with `capture.inside`.
+#[test]
+fn figures_from_inside_processes_fit_into_the_memory_that_their_page_adds() {
+    let _alone = ALONE.lock().unwrap();
+    let before = resident();
+    let mut observer = Observer::new(Settings::default());
+    let watches = Watchlist::new(vec![Watch::named("/none").unwrap()]).unwrap();
+    observer.input(Input::Watchlist(Arc::new(watches)));
+    observer.input(Input::Time(Timestamp(host::START)));
+    let mut now = host::START;
+    for second in 1..=12 {
+        now += SECOND;
+        let transition = |id: u32| Transition {
+            process: id,
+            node: Some(format!("/robot/driver_{id:04}").into()),
+            start: "activating".into(),
+            goal: "active".into(),
+            at: Timestamp(now),
+        };
+        observer.input(Input::Inside(Report {
+            at: Timestamp(now),
+            has_callbacks: true,
+            processes: (1..=PROCESSES).map(|id| process(id, second, now)).collect(),
+            transitions: (1..=PROCESSES).map(transition).collect(),
+        }));
+        observer.input(Input::Time(Timestamp(now)));
+        observer.drain();
+    }
+    let modelled = resident() - before;
+    let facts = observer.snapshot(Timestamp(now)).inside.unwrap();
+    assert_eq!(facts.processes.len(), 1024);
+    assert_eq!(facts.callbacks.len() + facts.publishers.len(), 4096);
+    assert_eq!(facts.states.len(), 1024);
+    drop(facts);
+    let sources = MetricSources::new(
+        SourceKind::Host,
+        ros2probe_daemon::settings_cell::Settings {
+            histograms: true,
+            ..Default::default()
+        },
+    );
+    let exposition = Exposition::new(sources.clone());
+    let (mut pages, mut kept) = (Vec::new(), Vec::new());
+    for _ in 0..2 {
+        let agent = AgentFacts {
+            inside: Some(InsideSourceFacts {
+                mode: "full",
+                ..InsideSourceFacts::default()
+            }),
+            ..AgentFacts::new(SourceKind::Host, Instant::now())
+        };
+        sources
+            .latest
+            .publish(observer.snapshot(Timestamp(now)), agent);
+        kept.push(sources.latest.state());
+        pages.push(exposition.render(Format::Classic).unwrap());
+    }
+    let all = resident() - before;
+    let kernel = 7 << 20;
+    let (unit, with_inside) = (
+        memory_max("systemd/ros2probe.service"),
+        memory_max("docs/inside.md"),
+    );
+    println!(
+        "model {} KiB, with two snapshots and pages ({} KiB each) {} KiB; the page adds {} MiB",
+        modelled >> 10,
+        pages[0].len() >> 10,
+        all >> 10,
+        with_inside - unit
+    );
+    let added = (with_inside - unit) << 20;
+    assert!(all + kernel <= added, "{all} bytes and {kernel} of {added}");
+    assert!(
+        (all + kernel) * 3 >= added,
+        "the page adds far too much: {all} and {kernel} of {added}"
+    );
+}

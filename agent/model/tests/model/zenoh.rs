@@ -1,0 +1,586 @@
+//! Sessions of Zenoh: what appears, what ends, and what hostile senders cannot do.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use ros2probe_model::discovery::Memory;
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{Snapshot, SocketFacts, TopicFacts};
+use ros2probe_model::watch::{Expectations, Retain, Watch, Watchlist};
+use ros2probe_model::zenoh::{StreamEvent, StreamId, Unseen, ZenohFacts};
+use ros2probe_testing::zenoh::{
+    Role, connection, declare_key, declare_token, fragment, frame, init, open, publisher, push,
+    report, response, send, undeclare_token,
+};
+use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::zenoh::{Gid, ZenohId};
+
+const START: u64 = 1_800_000_000 * SECOND;
+const TALKER: [u8; 16] = [0x11; 16];
+const ROUTER: [u8; 16] = [0x22; 16];
+const LISTENER: [u8; 16] = [0x33; 16];
+const LATE: [u8; 16] = [0x44; 16];
+const KEEP_ALIVE: u8 = 0x04;
+const KEY: &str = "0/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported";
+
+fn observer() -> Observer {
+    let mut observer = Observer::new(Settings::default());
+    let watch = Watch {
+        pattern: "/**".to_owned(),
+        domain_id: None,
+        expectations: Expectations::default(),
+        per_subscriber: false,
+        trace: 0.0,
+        retain: Retain::None,
+    };
+    let watchlist = Watchlist::new(vec![watch]).unwrap();
+    observer.input(Input::Watchlist(watchlist.into()));
+    observer
+}
+
+/// Opens a connection from `one`, a peer, to `other`.
+fn connect(observer: &mut Observer, port: u16, one: [u8; 16], (other, role): ([u8; 16], Role)) {
+    let [there, back] = connection(port);
+    report(observer, &there, START, StreamEvent::Begin);
+    send(observer, &there, START, &init(one, Role::Peer, None));
+    send(observer, &back, START, &init(other, role, Some(&[])));
+    send(observer, &there, START, &open(60));
+    send(observer, &back, START, &open(60));
+}
+
+/// A talker with a connection to a router and one to a listener, which it publishes to.
+fn talking() -> (Observer, [u8; 16]) {
+    let mut observer = observer();
+    connect(&mut observer, 1000, TALKER, (ROUTER, Role::Router));
+    connect(&mut observer, 1001, TALKER, (LISTENER, Role::Peer));
+    let token = publisher(TALKER, 10, "/chatter");
+    for port in [1000, 1001] {
+        let [there, _] = connection(port);
+        let declared = [declare_key(3, KEY), declare_token(1, &token)];
+        send(&mut observer, &there, START, &frame(7, &declared));
+    }
+    (observer, Gid::of_token(&token).0)
+}
+
+fn chatter(snapshot: &Snapshot) -> Option<&TopicFacts> {
+    let mut topics = snapshot.topics.iter();
+    topics.find(|topic| *topic.name == *"/chatter")
+}
+
+fn messages(observer: &Observer) -> u64 {
+    let snapshot = observer.snapshot(Timestamp(START + SECOND));
+    let measurement = chatter(&snapshot).and_then(|topic| topic.measurement.as_deref());
+    measurement.map_or(0, |measurement| measurement.messages)
+}
+
+fn participants(observer: &Observer, at: u64) -> usize {
+    observer.snapshot(Timestamp(at)).participants.len()
+}
+
+#[test]
+fn a_message_on_two_connections_counts_once_and_reaches_the_peer_only() {
+    let (mut observer, gid) = talking();
+    for number in 1..=10 {
+        let batch = frame(8, &[push(3, gid, number, b"\0\x01\0\0\x06\0\0\0hello\0")]);
+        for port in [1000, 1001] {
+            let [there, _] = connection(port);
+            send(&mut observer, &there, START + number, &batch);
+        }
+    }
+    assert_eq!(messages(&observer), 10);
+    let snapshot = observer.snapshot(Timestamp(START + SECOND));
+    let received = chatter(&snapshot).unwrap().received.as_deref().unwrap();
+    assert_eq!((received.messages, received.duplicates), (10, 0));
+    assert_eq!(snapshot.participants.len(), 1);
+}
+
+/// Returns the losses of the topic and of its receivers, after the talker has sent ten messages a
+/// second. Those with a `missing` number did not arrive, and `gap` precedes the number after them.
+fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {
+    let (mut observer, gid) = talking();
+    let [there, _] = connection(1001);
+    for number in (1..=30).filter(|number| !missing.contains(number)) {
+        let at = START + number * SECOND / 10;
+        if number == missing.end
+            && let Some(gap) = gap
+        {
+            report(&mut observer, &there, at, gap);
+        }
+        let batch = frame(8, &[push(3, gid, number, b"\0\x01\0\0")]);
+        send(&mut observer, &there, at, &batch);
+    }
+    observer.input(Input::Time(Timestamp(START + 20 * SECOND)));
+    let snapshot = observer.snapshot(Timestamp(START + 20 * SECOND));
+    let topic = chatter(&snapshot).unwrap();
+    (
+        topic.measurement.as_deref().unwrap().lost,
+        topic.received.as_deref().unwrap().lost(),
+    )
+}
+
+#[test]
+fn a_number_that_a_congested_publisher_left_out_is_lost() {
+    assert_eq!(lost(12..13, None), (1, 1));
+}
+
+#[test]
+fn what_a_gap_in_the_capture_hides_is_no_loss() {
+    assert_eq!(lost(12..15, Some(StreamEvent::Gap)), (0, 0));
+}
+
+#[test]
+fn the_history_that_a_late_subscription_requests_is_delivered_to_it_only() {
+    let (mut observer, gid) = talking();
+    let [there, _] = connection(1001);
+    let payload = b"\0\x01\0\0";
+    for number in 1..=5 {
+        let at = START + number * SECOND / 10;
+        send(
+            &mut observer,
+            &there,
+            at,
+            &frame(8, &[push(3, gid, number, payload)]),
+        );
+    }
+    connect(&mut observer, 1002, TALKER, (LATE, Role::Peer));
+    let [there, _] = connection(1002);
+    for number in 1..=5 {
+        let at = START + 2 * SECOND + number;
+        send(
+            &mut observer,
+            &there,
+            at,
+            &frame(8, &[response(KEY, gid, number, payload)]),
+        );
+    }
+    let snapshot = observer.snapshot(Timestamp(START + 3 * SECOND));
+    let topic = chatter(&snapshot).unwrap();
+    let measurement = topic.measurement.as_deref().unwrap();
+    assert_eq!((measurement.messages, measurement.duplicates), (5, 0));
+    let received = topic.received.as_deref().unwrap();
+    assert_eq!((received.messages, received.duplicates), (10, 0));
+}
+
+#[test]
+fn a_session_ends_with_its_last_connection_and_not_with_the_router() {
+    let (mut observer, _) = talking();
+    let [to_router, from_router] = connection(1000);
+    let [to_peer, from_peer] = connection(1001);
+    let at = START + SECOND;
+    // The router is restarted: it closes first, and the talker after it.
+    report(&mut observer, &from_router, at, StreamEvent::End);
+    report(&mut observer, &to_router, at, StreamEvent::End);
+    assert_eq!(participants(&observer, at), 1);
+    report(&mut observer, &to_peer, at + SECOND, StreamEvent::End);
+    report(&mut observer, &from_peer, at + SECOND, StreamEvent::End);
+    assert_eq!(participants(&observer, at + SECOND), 0);
+}
+
+/// Sees a direction at the socket of its sender.
+fn at_socket(stream: StreamId, socket: u64) -> StreamId {
+    StreamId {
+        socket,
+        outgoing: true,
+        ..stream
+    }
+}
+
+/// Reports the process that holds a socket.
+fn hold(observer: &mut Observer, cookie: u64, process: u32) {
+    observer.input(Input::Socket(SocketFacts {
+        cookie,
+        process_id: Some(process),
+        process: Some("talker".into()),
+        cgroup: Some("/robot".into()),
+        ..SocketFacts::default()
+    }));
+}
+
+/// Returns process id, name and control group of the talker's session.
+fn process(observer: &Observer) -> (Option<u32>, Option<String>, Option<String>) {
+    let snapshot = observer.snapshot(Timestamp(START + 10 * SECOND));
+    let prefix = ZenohId::from_le_bytes(&TALKER).unwrap().guid_prefix();
+    let mut participants = snapshot.participants.iter();
+    let process = &participants
+        .find(|each| each.guid.prefix == prefix)
+        .unwrap()
+        .process;
+    let text = |text: &Option<Arc<str>>| text.as_ref().map(ToString::to_string);
+    (process.id, text(&process.name), text(&process.cgroup))
+}
+
+fn held(process: u32) -> (Option<u32>, Option<String>, Option<String>) {
+    let (name, cgroup) = ("talker".to_owned(), "/robot".to_owned());
+    (Some(process), Some(name), Some(cgroup))
+}
+
+#[test]
+fn a_session_runs_in_the_process_that_sends_its_init() {
+    let mut observer = observer();
+    let [there, back] = connection(1000);
+    let [there, back] = [at_socket(there, 8), at_socket(back, 9)];
+    hold(&mut observer, 9, 900);
+    send(
+        &mut observer,
+        &there,
+        START,
+        &init(TALKER, Role::Peer, None),
+    );
+    let ack = init(ROUTER, Role::Router, Some(&[]));
+    send(&mut observer, &back, START, &ack);
+    // The first node appears seconds later, and the process is found later still.
+    let at = START + 5 * SECOND;
+    let token = publisher(TALKER, 10, "/chatter");
+    let declared = frame(7, &[declare_key(3, KEY), declare_token(1, &token)]);
+    send(&mut observer, &there, at, &declared);
+    // The router repeats the token.
+    send(&mut observer, &back, at, &declared);
+    assert_eq!(process(&observer), (None, None, None));
+    hold(&mut observer, 8, 800);
+    assert_eq!(process(&observer), held(800));
+}
+
+#[test]
+fn a_session_whose_init_was_missed_runs_in_the_process_that_sends_its_messages() {
+    let sending = |source: u16, outgoing| {
+        let (mut observer, gid) = talking();
+        let [mut there, _] = connection(source);
+        there = at_socket(there, 8);
+        there.outgoing = outgoing;
+        hold(&mut observer, 8, 800);
+        let batch = |number| frame(8, &[push(3, gid, number, b"\0\x01\0\0")]);
+        for number in 1..=2 {
+            send(&mut observer, &there, START, &batch(number));
+        }
+        assert_eq!(process(&observer).0, None);
+        send(&mut observer, &there, START, &batch(3));
+        (observer, there)
+    };
+    let (mut observer, there) = sending(1002, true);
+    assert_eq!(process(&observer), held(800));
+    // Another source: it is a router.
+    let token = publisher(LISTENER, 10, "/chatter");
+    let declared = frame(9, &[declare_token(2, &token)]);
+    send(&mut observer, &connection(1001)[1], START, &declared);
+    let other = frame(10, &[push(3, Gid::of_token(&token).0, 1, b"\0\x01\0\0")]);
+    send(&mut observer, &there, START, &other);
+    assert_eq!(process(&observer).0, None);
+    let (from_router, received) = (sending(7447, true).0, sending(1002, false).0);
+    assert_eq!(process(&from_router).0, None, "a router passes messages on");
+    assert_eq!(process(&received).0, None, "the receiver's process");
+}
+
+#[test]
+fn a_process_stays_known_when_the_connection_that_showed_it_ends() {
+    let (mut observer, _) = talking();
+    let [short, _] = connection(1002);
+    let [short, long] = [at_socket(short, 8), at_socket(connection(1003)[0], 9)];
+    hold(&mut observer, 8, 800);
+    hold(&mut observer, 9, 800);
+    send(
+        &mut observer,
+        &short,
+        START,
+        &init(TALKER, Role::Peer, None),
+    );
+    send(&mut observer, &long, START, &[4]);
+    report(&mut observer, &short, START, StreamEvent::End);
+    observer.input(Input::SocketClosed(8));
+    assert_eq!(process(&observer), held(800));
+    observer.input(Input::SocketClosed(9));
+    assert_eq!(process(&observer).0, None);
+}
+
+#[test]
+fn a_restarted_agent_knows_who_sends_and_notices_the_end() {
+    let (mut before, gid) = talking();
+    let token = publisher(LISTENER, 10, "/status");
+    // The listener is silent, and announced by the router only.
+    let [_, from_router] = connection(1000);
+    let declared = [declare_token(2, &token)];
+    send(&mut before, &from_router, START, &frame(7, &declared));
+    let remote = publisher([0x44; 16], 10, "/status");
+    let declared = [declare_token(3, &remote)];
+    send(&mut before, &from_router, START, &frame(8, &declared));
+    let memory = before.memory();
+    let text = serde_json::to_string(&memory).unwrap();
+    let memory: Memory = serde_json::from_str(&text).unwrap();
+
+    let mut after = observer();
+    let start = START + 10 * SECOND;
+    after.input(Input::Restored {
+        memory: &memory,
+        now: Timestamp(start),
+    });
+    assert_eq!(after.memory().zenoh, memory.zenoh);
+    assert_eq!(participants(&after, start), 3);
+    let [there, back] = connection(1001);
+    let [to_router, from_router] = connection(1000);
+    for number in 1..=5 {
+        let at = start + number * 25 * SECOND;
+        let batch = frame(9, &[push(3, gid, number, b"\0\x01\0\0")]);
+        send(&mut after, &there, at, &batch);
+        for silent in [&back, &to_router, &from_router] {
+            send(&mut after, silent, at, &[KEEP_ALIVE]);
+        }
+    }
+    let at = start + 150 * SECOND;
+    let snapshot = after.snapshot(Timestamp(at));
+    assert_eq!(snapshot.participants.len(), 3);
+    assert_eq!(snapshot.zenoh.as_ref().unwrap().routers, 1);
+    let topics = &snapshot.topics;
+    let topic = topics.iter().find(|topic| *topic.name == *"/chatter");
+    let deliveries = &topic.unwrap().deliveries;
+    let listener = ZenohId::from_le_bytes(&LISTENER).unwrap().guid_prefix();
+    assert_eq!(deliveries.len(), 1, "{deliveries:?}");
+    assert!(format!("{deliveries:?}").contains(&listener.to_string()));
+
+    // Its process is killed.
+    report(&mut after, &back, at, StreamEvent::End);
+    report(&mut after, &there, at, StreamEvent::End);
+    assert_eq!(participants(&after, at), 2);
+}
+
+#[test]
+fn restored_connections_that_are_gone_keep_no_session() {
+    let (before, _) = talking();
+    let memory = before.memory();
+    let mut after = observer();
+    after.input(Input::Restored {
+        memory: &memory,
+        now: Timestamp(START),
+    });
+    // Another session has the address of the talker.
+    connect(&mut after, 1000, [0x55; 16], (ROUTER, Role::Router));
+    let at = START + 100 * SECOND;
+    after.input(Input::Time(Timestamp(at)));
+    assert_eq!(participants(&after, at), 0);
+}
+
+#[test]
+fn an_undeclared_token_takes_its_endpoint_and_the_last_one_its_session() {
+    let (mut observer, _) = talking();
+    let [there, _] = connection(1000);
+    let at = START + SECOND;
+    send(&mut observer, &there, at, &frame(9, &[undeclare_token(1)]));
+    let snapshot = observer.snapshot(Timestamp(at));
+    assert_eq!((snapshot.participants.len(), snapshot.nodes.len()), (0, 0));
+}
+
+#[test]
+fn fragments_become_one_message_and_a_missing_one_breaks_it() {
+    let (mut observer, gid) = talking();
+    let [there, _] = connection(1001);
+    let payload = vec![7; 100_000];
+    for (number, missing) in [(1, None), (2, Some(1)), (3, None)] {
+        let message = push(3, gid, number, &payload);
+        let parts: Vec<_> = message.chunks(40_000).collect();
+        for (index, part) in parts.iter().enumerate() {
+            if missing == Some(index) {
+                continue;
+            }
+            let sequence = u32::try_from(index).unwrap();
+            let batch = fragment(sequence, index == 0, index + 1 < parts.len(), part);
+            send(&mut observer, &there, START + number, &batch);
+        }
+    }
+    assert_eq!(messages(&observer), 2);
+    let snapshot = observer.snapshot(Timestamp(START + SECOND));
+    assert!(snapshot.zenoh.as_ref().unwrap().counters.incomplete > 0);
+    let measurement = chatter(&snapshot).unwrap().measurement.as_deref();
+    assert_eq!(measurement.unwrap().bytes, 200_000);
+}
+
+#[test]
+fn features_that_hide_messages_are_named() {
+    let mut observer = observer();
+    for (port, extension, reason) in [
+        (1, 0x06, Unseen::Compression),
+        (2, 0x05, Unseen::LowLatency),
+    ] {
+        let [there, back] = connection(port);
+        send(
+            &mut observer,
+            &there,
+            START,
+            &init(TALKER, Role::Peer, None),
+        );
+        send(
+            &mut observer,
+            &back,
+            START,
+            &init(ROUTER, Role::Router, Some(&[extension])),
+        );
+        let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
+        assert_eq!(unseen(&facts, reason), 1);
+    }
+    let mut other = init(TALKER, Role::Peer, None);
+    other[1] = 8;
+    let [there, _] = connection(3);
+    send(&mut observer, &there, START, &other);
+    report(
+        &mut observer,
+        &there,
+        START,
+        StreamEvent::Unseen(Unseen::Tls),
+    );
+    let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
+    assert_eq!(unseen(&facts, Unseen::Version), 1);
+    assert_eq!(unseen(&facts, Unseen::Tls), 1);
+    report(&mut observer, &there, START, StreamEvent::End);
+    let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
+    assert_eq!(unseen(&facts, Unseen::Tls), 0);
+}
+
+fn unseen(facts: &ZenohFacts, reason: Unseen) -> u64 {
+    let known = facts.unseen().find(|(other, _)| *other == reason);
+    known.map_or(0, |(_, connections)| connections)
+}
+
+/// Every table stays within its cap.
+fn bounded(observer: &Observer) {
+    for size in observer.sizes() {
+        assert!(size.entries <= size.cap, "{size:?}");
+    }
+}
+
+#[test]
+fn connections_without_end_replace_the_longest_silent() {
+    let mut observer = observer();
+    for number in 0..6000_u32 {
+        let [mut there, _] = connection(1);
+        there.interface = number;
+        send(
+            &mut observer,
+            &there,
+            START + u64::from(number),
+            &init(TALKER, Role::Peer, None),
+        );
+    }
+    bounded(&observer);
+    let facts = observer.snapshot(Timestamp(START + SECOND)).zenoh.unwrap();
+    assert!(facts.evictions >= 1900, "{facts:?}");
+}
+
+#[test]
+fn aliases_tokens_and_keys_beyond_their_caps_are_left_out() {
+    let mut observer = observer();
+    connect(&mut observer, 1000, TALKER, (ROUTER, Role::Router));
+    let [there, _] = connection(1000);
+    for id in 0..17_000_u16 {
+        send(
+            &mut observer,
+            &there,
+            START,
+            &frame(1, &[declare_key(id + 1, KEY)]),
+        );
+    }
+    let long = format!("0/{}/t/TypeHashNotSupported", "a".repeat(60_000));
+    send(
+        &mut observer,
+        &there,
+        START,
+        &frame(1, &[declare_key(60_000, &long)]),
+    );
+    for entity in 0..40_000 {
+        let token = publisher(TALKER, entity, "/chatter");
+        send(
+            &mut observer,
+            &there,
+            START,
+            &frame(1, &[declare_token(entity + 1, &token)]),
+        );
+    }
+    bounded(&observer);
+    let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
+    assert!(facts.evictions > 7000, "{facts:?}");
+}
+
+#[test]
+fn a_token_that_everybody_declares_remembers_so_many() {
+    let mut observer = observer();
+    let token = publisher(TALKER, 10, "/chatter");
+    for port in 0..100 {
+        let [there, _] = connection(port);
+        send(
+            &mut observer,
+            &there,
+            START,
+            &frame(1, &[declare_token(1, &token)]),
+        );
+    }
+    bounded(&observer);
+    assert_eq!(participants(&observer, START), 1);
+}
+
+#[test]
+fn endless_fragments_are_bounded() {
+    let (mut observer, gid) = talking();
+    let requests = Vec::new();
+    observer.input(Input::SampleRequests(std::sync::Arc::new(requests)));
+    let part = vec![7; 60_000];
+    for port in 0..8 {
+        let [there, _] = connection(port);
+        // A request that never ends: it is kept whole until its bound.
+        let mut first = vec![0x1c, 1, 0, 0x03];
+        first.extend_from_slice(&part[..50_000]);
+        let message = push(3, gid, 1, &part);
+        let begin = if port % 2 == 0 { &message } else { &first };
+        send(
+            &mut observer,
+            &there,
+            START,
+            &fragment(0, true, true, begin),
+        );
+        for number in 1..700 {
+            send(
+                &mut observer,
+                &there,
+                START,
+                &fragment(number, false, true, &part),
+            );
+        }
+    }
+    bounded(&observer);
+}
+
+#[test]
+fn unseen_connections_are_bounded() {
+    let mut observer = observer();
+    for number in 0..2000_u32 {
+        let [mut there, _] = connection(1);
+        there.flow.source.address[0] = u8::try_from(number % 256).unwrap();
+        there.flow.source.address[1] = u8::try_from(number / 256).unwrap();
+        report(
+            &mut observer,
+            &there,
+            START,
+            StreamEvent::Unseen(Unseen::Tls),
+        );
+    }
+    bounded(&observer);
+    let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
+    assert_eq!(unseen(&facts, Unseen::Tls), 1024);
+}
+
+proptest::proptest! {
+    #[test]
+    fn any_batches_are_bounded(
+        batches in proptest::collection::vec(
+            (0..4_u16, proptest::bool::ANY, proptest::collection::vec(proptest::num::u8::ANY, 0..120)),
+            0..100,
+        )
+    ) {
+        let (mut observer, _) = talking();
+        for (port, is_back, batch) in &batches {
+            let [there, back] = connection(999 + port);
+            let stream = if *is_back { back } else { there };
+            send(&mut observer, &stream, START, batch);
+            let message = frame(1, std::slice::from_ref(batch));
+            send(&mut observer, &stream, START, &message);
+        }
+        bounded(&observer);
+    }
+}

@@ -1,0 +1,202 @@
+//! What the sample robot's processes show from inside.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use ros2probe_daemon::agent_facts::{InsideLibrary, InsideSourceFacts};
+use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
+use ros2probe_model::inside::facts::{
+    Buffer, Callback, InsideFacts, LifecycleState, ObservedProcess, Owner, Publisher, Quantiles,
+    Subscription, TopicCounts, TopicInside,
+};
+use ros2probe_model::inside::report::{Durations, Trigger};
+use ros2probe_model::names::TopicName;
+use ros2probe_wire::{DomainId, Timestamp};
+
+const LAST: Timestamp = Timestamp(1_700_000_000_000_000_000);
+
+/// Returns the facts of one process with a publisher, a subscription, a buffer and two callbacks of
+/// `/points`.
+pub fn inside() -> InsideFacts {
+    let topic = TopicName::from("/points");
+    InsideFacts {
+        at: LAST,
+        has_callbacks: true,
+        processes: vec![ObservedProcess {
+            id: 42,
+            name: Some("mapper".into()),
+            domain_id: DomainId(0),
+            cpu: Some(0.25),
+            calls_hz: Some(120.0),
+            calls: 36_000,
+            refused: 3,
+            is_suspended: false,
+            shows_intra_process: true,
+            nodes: vec!["/lidar".into()],
+        }],
+        publishers: vec![Publisher {
+            owner: owner(0x10),
+            topic: topic.clone(),
+            middleware: Some("rmw_fastrtps_cpp".into()),
+            published: 1_000,
+            within_process: 900,
+            rate_hz: Some(10.0),
+            last: LAST,
+            interval: quantiles(),
+        }],
+        subscriptions: vec![Subscription {
+            owner: owner(0x20),
+            topic: topic.clone(),
+            middleware: Some("rmw_fastrtps_cpp".into()),
+            taken: 990,
+            failed: 4,
+            rate_hz: Some(9.9),
+            last: LAST,
+            latency: quantiles(),
+        }],
+        buffers: vec![Buffer {
+            owner: owner(0x30),
+            topic: Some(topic.clone()),
+            enqueued: 900,
+            overwritten: 126,
+            dequeued: 770,
+            overwritten_ratio: Some(0.14),
+            depth: 4,
+            max_depth: 5,
+            capacity: Some(5),
+            rate_hz: Some(9.0),
+            last: LAST,
+            waiting: quantiles(),
+        }],
+        callbacks: vec![
+            callback(0x40, Trigger::Subscription(topic)),
+            callback(0x50, Trigger::Timer(Some(Duration::from_millis(50)))),
+        ],
+        states: vec![LifecycleState {
+            process: 42,
+            domain_id: DomainId(0),
+            node: Some("/lidar".into()),
+            state: "active".into(),
+            before: "activating".into(),
+            at: LAST,
+        }],
+    }
+}
+
+/// Returns what these processes show of a topic.
+pub fn topic() -> TopicInside {
+    TopicInside {
+        counts: TopicCounts {
+            published: 1_000,
+            within_process: 900,
+            taken: 990,
+            failed: 4,
+            enqueued: 900,
+            overwritten: 126,
+            dequeued: 770,
+            receptions: 770,
+        },
+        messages: 1_000,
+        rate_hz: 10.0,
+        last: Some(LAST),
+        publishers: 1,
+        subscriptions: 2,
+        depth: 4,
+        latency: durations(),
+        waiting: durations(),
+    }
+}
+
+/// Returns the state of the source.
+pub fn source() -> InsideSourceFacts {
+    InsideSourceFacts {
+        mode: "full",
+        libraries: vec![
+            InsideLibrary {
+                path: "/opt/ros/jazzy/lib/libtracetools.so".to_owned(),
+                processes: 7,
+                refused: None,
+            },
+            InsideLibrary {
+                path: "/ws/libtracetools.so".to_owned(),
+                processes: 1,
+                refused: Some("it has no function ros_trace_rcl_publish".to_owned()),
+            },
+        ],
+        counters: vec![("hits", 36_000), ("suspended", 0)],
+        reason_off: None,
+    }
+}
+
+/// Returns a finding of each kind that only processes show.
+pub fn findings(topic: &TopicKey) -> [Diagnosis; 4] {
+    [
+        Diagnosis::SlowCallback {
+            topic: Some(topic.clone()),
+            callback: owner(0x40),
+            trigger: Trigger::Subscription(topic.name.clone()),
+            duration: Duration::from_millis(120),
+            period: Duration::from_millis(50),
+            is_own_period: false,
+        },
+        Diagnosis::ExecutorWait {
+            topic: None,
+            callback: owner(0x50),
+            trigger: Trigger::Timer(Some(Duration::from_millis(50))),
+            wait: Duration::from_millis(300),
+        },
+        Diagnosis::IntraProcessOverflow {
+            topic: topic.clone(),
+            queue: owner(0x30),
+            overwritten_permille: 140,
+        },
+        Diagnosis::ObservationSuspended {
+            domain_id: DomainId(0),
+            process: 42,
+            name: Some("mapper".into()),
+        },
+    ]
+}
+
+fn owner(handle: u64) -> Owner {
+    Owner {
+        process: 42,
+        handle,
+        domain_id: DomainId(0),
+        node: Some("/lidar".into()),
+    }
+}
+
+fn callback(handle: u64, trigger: Trigger) -> Callback {
+    Callback {
+        owner: owner(handle),
+        trigger,
+        thread: 43,
+        calls: 990,
+        skipped: 6,
+        rate_hz: Some(9.9),
+        busy: Some(0.4),
+        last: LAST,
+        duration: quantiles(),
+        wait: quantiles(),
+        durations: durations(),
+        waits: durations(),
+    }
+}
+
+fn quantiles() -> Quantiles {
+    Quantiles {
+        count: 90,
+        p50: Duration::from_millis(12),
+        p99: Duration::from_millis(40),
+        maximum: Duration::from_millis(44),
+    }
+}
+
+fn durations() -> Arc<Durations> {
+    let mut durations = Durations::default();
+    for milliseconds in [1, 12, 40] {
+        durations.observe(Duration::from_millis(milliseconds));
+    }
+    durations.into()
+}

@@ -1,0 +1,201 @@
+/* A process that calls libtracetools.so in the order of rclcpp (Iron), from commands on standard
+ * input. Each command is answered by a line. -DPLACE=240 or 248: offset of rmw_handle. */
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/wait.h>
+#include <time.h>
+#include <unistd.h>
+
+void ros_trace_rcl_node_init(const void *, const void *, const char *, const char *);
+void ros_trace_rcl_publisher_init(const void *, const void *, const void *, const char *, size_t);
+void ros_trace_rcl_subscription_init(const void *, const void *, const void *, const char *, size_t);
+void ros_trace_rclcpp_subscription_init(const void *, const void *);
+void ros_trace_rclcpp_subscription_callback_added(const void *, const void *);
+void ros_trace_rcl_timer_init(const void *, int64_t);
+void ros_trace_rclcpp_timer_callback_added(const void *, const void *);
+void ros_trace_rclcpp_timer_link_node(const void *, const void *);
+void ros_trace_callback_start(const void *, bool);
+void ros_trace_callback_end(const void *);
+void ros_trace_rcl_lifecycle_state_machine_init(const void *, const void *);
+void ros_trace_rcl_lifecycle_transition(const void *, const char *, const char *);
+void ros_trace_rcl_publish(const void *, const void *);
+void ros_trace_rmw_take(const void *, const void *, int64_t, bool);
+void ros_trace_rclcpp_executor_get_next_ready(void);
+void ros_trace_rclcpp_executor_execute(const void *);
+#ifndef HUMBLE
+void ros_trace_rclcpp_intra_publish(const void *, const void *);
+void ros_trace_rclcpp_construct_ring_buffer(const void *, uint64_t);
+void ros_trace_rclcpp_ring_buffer_enqueue(const void *, uint64_t, uint64_t, bool);
+void ros_trace_rclcpp_ring_buffer_dequeue(const void *, uint64_t, uint64_t);
+void ros_trace_rclcpp_buffer_to_ipb(const void *, const void *);
+void ros_trace_rclcpp_ipb_to_subscription(const void *, const void *);
+#endif
+
+/* rmw_publisher_t and rmw_subscription_t begin alike. */
+struct rmw { const char *identifier; void *data; const char *topic; char rest[32]; };
+struct impl { char before[PLACE]; struct rmw *rmw; };
+struct handle { struct impl *impl; };
+struct timer_impl { char before[40]; uint64_t period; int64_t last, next; };
+struct timer { struct timer_impl *impl; };
+
+static struct rmw made_rmw(const char *topic) {
+    struct rmw rmw = { "rmw_test_cpp", 0, topic, { 0 } };
+    return rmw;
+}
+static int64_t clock_now(clockid_t clock) {
+    struct timespec now;
+    clock_gettime(clock, &now);
+    return now.tv_sec * 1000000000LL + now.tv_nsec;
+}
+static void pass(int64_t microseconds) {
+    int64_t end = clock_now(CLOCK_MONOTONIC) + microseconds * 1000;
+    while (clock_now(CLOCK_MONOTONIC) < end) {}
+}
+
+static struct rmw out_rmw, in_rmw;
+static struct impl out_impl, in_impl;
+static struct handle out = { &out_impl }, in = { &in_impl };
+static struct timer_impl timer_impl;
+static struct timer timer = { &timer_impl };
+static char node, object, machine, owner;
+static char callback[8], buffer[8], timer_callback, message;
+static uint64_t capacity = 4, filled, writes, reads;
+
+/* One message into the ring buffer, as rclcpp's RingBufferImplementation does it. */
+static void enqueue(void) {
+#ifndef HUMBLE
+    bool full = filled == capacity;
+    ros_trace_rclcpp_intra_publish(&out, &message);
+    ros_trace_rclcpp_ring_buffer_enqueue(buffer, writes++ % capacity, filled + 1, full);
+    if (full) reads++; else filled++;
+#endif
+}
+static bool dequeue(void) {
+#ifndef HUMBLE
+    if (!filled) return false;
+    ros_trace_rclcpp_ring_buffer_dequeue(buffer, reads++ % capacity, filled - 1);
+    filled--;
+#endif
+    return true;
+}
+
+int main(int argc, char **argv) {
+    char line[256], what[64];
+    const char *input = argc > 1 ? argv[1] : "/in", *output = argc > 2 ? argv[2] : "/out";
+    const char *name = argc > 3 ? argv[3] : "filter";
+    out_rmw = made_rmw(output);
+    in_rmw = made_rmw(input);
+    out_impl.rmw = &out_rmw;
+    in_impl.rmw = &in_rmw;
+    memset(out_impl.before, 0x5a, sizeof out_impl.before);
+    while (fgets(line, sizeof line, stdin)) {
+        long n = 0, us = 0;
+        if (sscanf(line, "%63s %ld %ld", what, &n, &us) < 1) continue;
+        if (!strcmp(what, "init")) {
+            ros_trace_rcl_node_init(&node, 0, name, "/robot1");
+            ros_trace_rcl_publisher_init(&out, &node, &out_rmw, output, 10);
+            ros_trace_rcl_subscription_init(&in, &node, &in_rmw, input, 10);
+            ros_trace_rclcpp_subscription_init(&in, &object);
+            ros_trace_rclcpp_subscription_callback_added(&object, callback);
+#ifndef HUMBLE
+            ros_trace_rclcpp_construct_ring_buffer(buffer, capacity);
+            ros_trace_rclcpp_buffer_to_ipb(buffer, &owner);
+            ros_trace_rclcpp_ipb_to_subscription(&owner, &object);
+#endif
+            ros_trace_rcl_timer_init(&timer, 1000000);
+            ros_trace_rclcpp_timer_callback_added(&timer, &timer_callback);
+            ros_trace_rclcpp_timer_link_node(&timer, &node);
+            ros_trace_rcl_lifecycle_state_machine_init(&node, &machine);
+        } else if (!strcmp(what, "transition")) {
+            ros_trace_rcl_lifecycle_transition(&machine, "inactive", "active");
+        } else if (!strcmp(what, "publish")) {
+            for (long i = 0; i < n; i++) { ros_trace_rcl_publish(&out, &message); pass(us); }
+        } else if (!strcmp(what, "both")) {
+            /* To subscriptions of the same process and to others. */
+            for (long i = 0; i < n; i++) { enqueue(); ros_trace_rcl_publish(&out, &message); }
+        } else if (!strcmp(what, "enqueue")) {
+            for (long i = 0; i < n; i++) enqueue();
+        } else if (!strcmp(what, "receive")) {
+            /* Each message of the ring buffer in a callback of `us` microseconds. */
+            long i = 0;
+            for (; i < n && dequeue(); i++) {
+                ros_trace_callback_start(callback + 1, true);
+                pass(us);
+                ros_trace_callback_end(callback + 1);
+            }
+            printf("%ld ", i);
+        } else if (!strcmp(what, "take")) {
+            /* Messages stamped 5 ms ago; the callback publishes after `us` microseconds, and the
+               nanoseconds until then are printed. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&in);
+                ros_trace_rmw_take(&in_rmw, &message, clock_now(CLOCK_REALTIME) - 5000000, true);
+                int64_t began = clock_now(CLOCK_MONOTONIC);
+                ros_trace_callback_start(callback, false);
+                pass(us);
+                int64_t published = clock_now(CLOCK_MONOTONIC);
+                ros_trace_rcl_publish(&out, &message);
+                ros_trace_callback_end(callback);
+                printf("%ld ", (long)(published - began));
+            }
+        } else if (!strcmp(what, "relay")) {
+            /* The message with the source timestamp `n`: the callback publishes after `us`
+               microseconds. Prints the source timestamp of its output, and the nanoseconds. */
+            ros_trace_rclcpp_executor_get_next_ready();
+            ros_trace_rclcpp_executor_execute(&in);
+            ros_trace_rmw_take(&in_rmw, &message, n, true);
+            int64_t began = clock_now(CLOCK_MONOTONIC);
+            ros_trace_callback_start(callback, false);
+            pass(us);
+            int64_t published = clock_now(CLOCK_MONOTONIC);
+            ros_trace_rcl_publish(&out, &message);
+            int64_t source = clock_now(CLOCK_REALTIME);
+            ros_trace_callback_end(callback);
+            printf("%ld %ld ", (long)source, (long)(published - began));
+        } else if (!strcmp(what, "miss")) {
+            for (long i = 0; i < n; i++) ros_trace_rmw_take(&in_rmw, &message, 0, false);
+        } else if (!strcmp(what, "timer")) {
+            /* A timer of 1 ms, called `us` microseconds late by rcl's steady clock;
+               the last call skips two periods. */
+            timer_impl.period = 1000000;
+            int64_t next = clock_now(CLOCK_MONOTONIC_RAW) + 1000000;
+            for (long i = 0; i < n; i++) {
+                while (clock_now(CLOCK_MONOTONIC_RAW) < next + us * 1000) {}
+                timer_impl.last = clock_now(CLOCK_MONOTONIC_RAW);
+                next += 1000000;
+                while (next <= timer_impl.last) next += 1000000;
+                if (i == n - 1) next += 2000000;
+                timer_impl.next = next;
+                ros_trace_rclcpp_executor_get_next_ready();
+                ros_trace_rclcpp_executor_execute(&timer);
+                ros_trace_callback_start(&timer_callback, false);
+                ros_trace_callback_end(&timer_callback);
+            }
+        } else if (!strcmp(what, "nowhere")) {
+            /* Handles that point to nothing, all of them different. */
+            for (long i = 0; i < n; i++) {
+                ros_trace_rcl_publish((void *)(uintptr_t)(0x1000 + 8 * i), 0);
+                ros_trace_rmw_take((void *)(uintptr_t)(0xdead0000beef0000 + 8 * i), 0, -1, true);
+                ros_trace_callback_start((void *)(uintptr_t)(8 * i), i & 1);
+                ros_trace_callback_end((void *)(uintptr_t)(8 * i + 1));
+                ros_trace_rcl_node_init((void *)(uintptr_t)i, 0, (char *)8, (char *)-1);
+                ros_trace_rclcpp_executor_execute((void *)(uintptr_t)i);
+            }
+        } else if (!strcmp(what, "fork")) {
+            /* Children that publish once and end. */
+            for (long i = 0; i < n; i++) {
+                pid_t child = fork();
+                if (!child) { ros_trace_rcl_publish(&out, &message); _exit(0); }
+                waitpid(child, 0, 0);
+            }
+        }
+        printf("%s\n", what);
+        fflush(stdout);
+    }
+    return 0;
+}

@@ -1,0 +1,366 @@
+//! Calls of `libtracetools.so` inside observed processes, as the kernel programs aggregate them.
+//!
+//! Shared binary layout with the kernel programs. Words are in the host's byte order. Times are
+//! CLOCK_MONOTONIC nanoseconds unless a field says otherwise. Handles are addresses in the observed
+//! process; nothing here trusts them.
+
+use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+
+/// Observed processes at a time.
+pub const PROCESS_CAPACITY: u32 = 1_024;
+/// Publishers, subscriptions, ring buffers and callbacks of all processes.
+pub const HANDLE_CAPACITY: u32 = 4_096;
+/// Threads whose last calls are remembered; the least recent ones are forgotten.
+pub const THREAD_CAPACITY: u32 = 8_192;
+/// Messages in ring buffers whose time of entry is remembered; the oldest are forgotten.
+pub const WAITING_CAPACITY: u32 = 8_192;
+/// Bytes of a name, with its final zero; a longer one is cut.
+pub const NAME_BYTES: usize = 256;
+/// Buckets of a distribution.
+pub const BUCKETS: usize = 96;
+/// Causal publications reported per callback and second.
+pub const HOPS_PER_SECOND: u32 = 128;
+
+/// Durations below this share the first bucket, in nanoseconds.
+const FLOOR: u64 = 1 << FLOOR_BITS;
+const FLOOR_BITS: u32 = 10;
+/// Each power of two is divided into this many buckets.
+const STEPS: u64 = 4;
+
+/// Returns the bucket of a duration in nanoseconds: four buckets for each power of two, from 1 µs
+/// to 17 s. A bucket's bounds differ by a quarter at most.
+#[inline(always)]
+#[must_use]
+pub const fn bucket(nanoseconds: u64) -> usize {
+    if nanoseconds < FLOOR {
+        return 0;
+    }
+    // The kernel's instruction set has no count of leading zeros.
+    let (mut bits, mut rest) = (0, nanoseconds);
+    if rest >> 32 != 0 {
+        (bits, rest) = (bits + 32, rest >> 32);
+    }
+    if rest >> 16 != 0 {
+        (bits, rest) = (bits + 16, rest >> 16);
+    }
+    if rest >> 8 != 0 {
+        (bits, rest) = (bits + 8, rest >> 8);
+    }
+    if rest >> 4 != 0 {
+        (bits, rest) = (bits + 4, rest >> 4);
+    }
+    if rest >> 2 != 0 {
+        (bits, rest) = (bits + 2, rest >> 2);
+    }
+    if rest >> 1 != 0 {
+        bits += 1;
+    }
+    let step = nanoseconds >> (bits - 2) & (STEPS - 1);
+    let index = (bits - FLOOR_BITS) as u64 * STEPS + step;
+    if index < BUCKETS as u64 {
+        index as usize
+    } else {
+        BUCKETS - 1
+    }
+}
+
+/// Returns the least duration of a bucket in nanoseconds; 0 for the first.
+#[must_use]
+pub const fn bucket_start(index: usize) -> u64 {
+    if index == 0 {
+        return 0;
+    }
+    let (power, step) = (index as u64 / STEPS, index as u64 % STEPS);
+    FLOOR << power | step << (FLOOR_BITS as u64 + power - 2)
+}
+
+/// Kinds of handles.
+pub mod kind {
+    /// `rcl_publisher_t`.
+    pub const PUBLISHER: u32 = 1;
+    /// `rmw_subscription_t`.
+    pub const SUBSCRIPTION: u32 = 2;
+    /// A ring buffer of intra-process messages (rclcpp of Iron and later).
+    pub const BUFFER: u32 = 3;
+    /// A callback of rclcpp.
+    pub const CALLBACK: u32 = 4;
+    /// `rcl_timer_t`; occurs only as a callback's trigger.
+    pub const TIMER: u32 = 5;
+}
+
+/// A handle in a process.
+#[derive(
+    Clone, Copy, Default, PartialEq, Eq, Hash, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Handle {
+    /// Its address.
+    pub address: u64,
+    /// Thread group id of the process, in the initial namespace.
+    pub process: u32,
+    /// One of [`kind`].
+    pub kind: u32,
+}
+
+/// Which distribution of [`Figures`] a duration belongs to.
+pub mod distribution {
+    /// Time between consecutive publications, takes or entries; a callback's duration.
+    pub const INTERVAL: usize = 0;
+    /// From the source timestamp to the take; in the ring buffer; a callback's wait.
+    pub const DELAY: usize = 1;
+}
+
+/// Cumulative figures of one handle.
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub struct Figures {
+    /// Publications, messages taken, messages put into the buffer, completed calls.
+    pub count: u64,
+    /// Takes without a message, messages overwritten in the buffer, skipped periods of the timer.
+    pub failed: u64,
+    /// Publications to subscriptions in the same process, messages taken from the buffer, calls
+    /// for intra-process messages.
+    pub within: u64,
+    /// Time of the last event that `count` counts.
+    pub last: u64,
+    /// Sums by [`distribution`], in nanoseconds.
+    pub sums: [u64; 2],
+    /// Largest values by [`distribution`].
+    pub maxima: [u64; 2],
+    /// Smallest values by [`distribution`], plus 1; 0 = no value.
+    pub minima: [u64; 2],
+    /// The buffer's publisher; what triggers the callback: a subscription, buffer or timer; kind 0
+    /// = unknown, or a service.
+    pub trigger: Handle,
+    /// Messages in the buffer after the last entry.
+    pub depth: u32,
+    /// The largest of these.
+    pub max_depth: u32,
+    /// Thread that made the last call.
+    pub thread: u32,
+    /// Attempts to announce the handle's name; the programs stop once it was announced.
+    pub announced: u32,
+    /// Begin of the second in which `hops` were reported.
+    pub hops_since: u64,
+    /// Time at which the timer's last call was due.
+    pub due: u64,
+    /// Period of the timer in nanoseconds; 0 = unknown, or no timer.
+    pub period: u64,
+    /// Causal publications reported in this second.
+    pub hops: u32,
+    /// Unused.
+    pub unused: u32,
+    /// Counts by [`distribution`] and [`bucket`].
+    pub buckets: [[u32; BUCKETS]; 2],
+}
+
+/// State of one process.
+#[derive(
+    Clone, Copy, Default, PartialEq, Eq, Debug, FromBytes, IntoBytes, Immutable, KnownLayout,
+)]
+#[repr(C)]
+pub struct Process {
+    /// Calls seen, also those that were not counted.
+    pub hits: u64,
+    /// Calls for handles beyond [`HANDLE_CAPACITY`].
+    pub refused: u64,
+    /// One of [`state`].
+    pub state: u32,
+    /// Offset of `rmw_handle` in the process's rcl structures; 0 = unknown.
+    pub rmw_handle_at: u32,
+    /// Offset of the period in `rcl_timer_impl_t`; 0 = unknown.
+    pub timer_period_at: u32,
+    /// Unused.
+    pub unused: u32,
+}
+
+/// Clocks other than CLOCK_MONOTONIC.
+pub mod clock {
+    /// CLOCK_REALTIME.
+    pub const REALTIME: u32 = 0;
+    /// CLOCK_MONOTONIC_RAW.
+    pub const MONOTONIC_RAW: u32 = 1;
+    /// Number of these clocks.
+    pub const COUNT: u32 = 2;
+}
+
+/// How the calls of a process are treated.
+pub mod state {
+    /// They are counted.
+    pub const COUNTED: u32 = 0;
+    /// Their budget is exceeded: only their number is counted.
+    pub const SUSPENDED: u32 = 1;
+    /// The process is outside of the observed control group.
+    pub const OUTSIDE: u32 = 2;
+}
+
+/// Kinds of [`Announcement`]; in brackets the fields that they use.
+pub mod announced {
+    /// A node (`address`, `text` = name, `second` = namespace).
+    pub const NODE: u32 = 1;
+    /// A publisher (`address`, `parent` = node or 0, `text` = topic, `second` = middleware).
+    pub const PUBLISHER: u32 = 2;
+    /// A subscription (`address` = rmw handle, `parent` = node or 0, `value` = rcl handle or 0,
+    /// `text` = topic, `second` = middleware).
+    pub const SUBSCRIPTION: u32 = 3;
+    /// An rclcpp subscription (`address`, `parent` = rcl handle).
+    pub const SUBSCRIPTION_OBJECT: u32 = 4;
+    /// A callback (`address`, `parent` = rclcpp subscription).
+    pub const SUBSCRIPTION_CALLBACK: u32 = 5;
+    /// A timer (`address`, `value` = period in nanoseconds).
+    pub const TIMER: u32 = 6;
+    /// A timer's node (`address`, `parent`).
+    pub const TIMER_NODE: u32 = 7;
+    /// A callback (`address`, `parent` = timer).
+    pub const TIMER_CALLBACK: u32 = 8;
+    /// A service (`address`, `parent` = node, `text` = name).
+    pub const SERVICE: u32 = 9;
+    /// A callback (`address`, `parent` = service).
+    pub const SERVICE_CALLBACK: u32 = 10;
+    /// A state machine (`address`, `parent` = node).
+    pub const STATE_MACHINE: u32 = 11;
+    /// A transition (`address` = state machine, `text` = start state, `second` = goal state).
+    pub const TRANSITION: u32 = 12;
+    /// A ring buffer (`address`, `value` = capacity).
+    pub const BUFFER: u32 = 13;
+    /// An intra-process buffer (`address`, `parent` = ring buffer).
+    pub const BUFFER_OWNER: u32 = 14;
+    /// An intra-process buffer's subscription (`address` = buffer, `parent` = rclcpp subscription).
+    pub const BUFFER_SUBSCRIPTION: u32 = 15;
+    /// A causal publication: the item is a [`Hop`](super::Hop) instead.
+    pub const HOP: u32 = 16;
+}
+
+/// A name or a relation, sent once for each handle.
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub struct Announcement {
+    /// One of [`announced`].
+    pub kind: u32,
+    /// Thread group id of the process.
+    pub process: u32,
+    /// Its thread.
+    pub thread: u32,
+    /// Unused.
+    pub unused: u32,
+    /// Time of the call.
+    pub time: u64,
+    /// See [`announced`].
+    pub address: u64,
+    /// See [`announced`].
+    pub parent: u64,
+    /// See [`announced`].
+    pub value: u64,
+    /// Ends with a zero; empty if it could not be read.
+    pub text: [u8; NAME_BYTES],
+    /// As `text`.
+    pub second: [u8; NAME_BYTES],
+}
+
+/// A publication during a callback that handles a message.
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[repr(C)]
+pub struct Hop {
+    /// [`announced::HOP`].
+    pub kind: u32,
+    /// Thread group id of the process.
+    pub process: u32,
+    /// Its thread.
+    pub thread: u32,
+    /// 1 = the publisher has subscriptions in the same process, which get the message directly.
+    pub within: u32,
+    /// Time of the publication.
+    pub published: u64,
+    /// The publisher.
+    pub publisher: u64,
+    /// What triggers the callback: a subscription or buffer.
+    pub input: Handle,
+    /// Source timestamp of the handled message, nanoseconds since the Unix epoch; 0 = unknown.
+    pub source_timestamp: u64,
+    /// Time at which it was taken.
+    pub taken: u64,
+    /// Time at which the callback began.
+    pub started: u64,
+    /// The callback.
+    pub callback: u64,
+}
+
+/// Counters of the programs, per CPU; the value is the index.
+#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[repr(u32)]
+pub enum Counter {
+    /// Calls seen.
+    Hits = 0,
+    /// Calls among them of processes beyond their budget.
+    Suspended,
+    /// Calls of processes beyond [`PROCESS_CAPACITY`].
+    ProcessesFull,
+    /// Calls for handles beyond [`HANDLE_CAPACITY`].
+    HandlesFull,
+    /// Handles whose name could not be read.
+    Unreadable,
+    /// Announcements lost because the ring was full; those of endpoints are repeated.
+    AnnouncementsLost,
+    /// Causal publications lost because the ring was full.
+    HopsLost,
+    /// Causal publications beyond [`HOPS_PER_SECOND`], not reported.
+    HopsSkipped,
+}
+
+impl Counter {
+    /// Every counter, in index order.
+    pub const ALL: [Self; 8] = [
+        Self::Hits,
+        Self::Suspended,
+        Self::ProcessesFull,
+        Self::HandlesFull,
+        Self::Unreadable,
+        Self::AnnouncementsLost,
+        Self::HopsLost,
+        Self::HopsSkipped,
+    ];
+
+    /// Returns the label value.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Hits => "hits",
+            Self::Suspended => "suspended",
+            Self::ProcessesFull => "processes_full",
+            Self::HandlesFull => "handles_full",
+            Self::Unreadable => "unreadable",
+            Self::AnnouncementsLost => "announcements_lost",
+            Self::HopsLost => "hops_lost",
+            Self::HopsSkipped => "hops_skipped",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_duration_lies_between_its_bucket_s_start_and_the_next() {
+        let mut nanoseconds = 1;
+        while nanoseconds < 1 << 34 {
+            let index = bucket(nanoseconds);
+            assert!(bucket_start(index) <= nanoseconds, "{nanoseconds}");
+            assert!(nanoseconds < bucket_start(index + 1), "{nanoseconds}");
+            nanoseconds += 1 + nanoseconds / 7;
+        }
+        assert_eq!(bucket(0), 0);
+        assert_eq!(bucket(u64::MAX), BUCKETS - 1);
+        assert_eq!(bucket_start(1), 1_280);
+        for index in 0..BUCKETS {
+            assert_eq!(bucket(bucket_start(index)), index);
+        }
+    }
+
+    #[test]
+    fn counters_are_listed_in_index_order() {
+        for (index, counter) in Counter::ALL.into_iter().enumerate() {
+            assert_eq!(counter as usize, index, "{}", counter.label());
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! Zenoh 1.x (wire version 9) as rmw_zenoh_cpp speaks it, read without joining.
+//!
+//! A stream is a sequence of batches with a length prefix ([`Batch::split`]). A [`Batch`] yields
+//! transport messages and the [`NetworkMessage`]s of its `FRAME`s; all borrow from the input. A
+//! message longer than a batch comes in [`Fragment`]s. The kernel may copy only the head of a
+//! batch: each message that is complete up to its payload is read, and the payload has its length
+//! on the wire ([`Bytes`]).
+//!
+//! [`TopicKey`], [`Token`] and [`Attachment`] are rmw_zenoh's conventions on top: names and types
+//! of publications, the graph of nodes and endpoints, and the identity of each sample. [`Gid`]s
+//! are hashes of tokens, so a publication's attachment leads to its topic without any alias.
+//!
+//! The decoder keeps no state. Its user keeps the tables of aliases, one a connection and
+//! direction, and the chains of fragments, one a lane. Unknown extensions are skipped, so later 1.x
+//! versions stay readable. Numbers that exceed their field and extensions with a wrong length are
+//! errors, where Zenoh cuts off the number or reads on.
+//!
+//! Zenoh has no specification of the wire: the comments name files of its crate `zenoh-protocol`
+//! 1.10, and of rmw_zenoh. The tests compare this decoder with Zenoh's own, `zenoh-codec`.
+
+mod attachment;
+mod batch;
+mod body;
+mod declare;
+mod expression;
+mod extension;
+mod identity;
+mod key;
+mod network;
+mod reader;
+mod session;
+mod token;
+mod token_qos;
+#[cfg(test)]
+mod vectors;
+
+/// TCP port of routers: the default of `rmw_zenohd`.
+pub const PORT: u16 = 7447;
+
+pub use attachment::{Attachment, Gid};
+pub use batch::{Batch, Close, Fragment, Frame, Lane, Message, Priority};
+pub use body::{Del, Encoding, Put, Query, Response as ResponseBody, Sample};
+pub use declare::Declaration;
+pub use expression::{Mapping, WireExpr};
+pub use identity::{EntityGlobalId, HlcTimestamp, SourceInfo, ZenohId};
+pub use key::{Buffer, Key, TopicKey};
+pub use network::{
+    Common, Declare, Interest, MessageQos, NetworkMessage, Oam, Push, Request, Response,
+    ResponseFinal,
+};
+pub use reader::{Bytes, vle};
+pub use session::{
+    Features, Init, Join, NextSequenceNumbers, Open, Resolution, Session, Side, Unobservable,
+    VERSION, WhatAmI,
+};
+pub use token::{BridgeToken, EndpointKind, EndpointToken, NodeToken, Token};
