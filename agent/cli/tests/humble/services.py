@@ -1,6 +1,6 @@
 """A client and a server of real ROS 2 services and of an action, and what the client logs.
 
-    services.py serve           answers /add after some milliseconds, never answers /hang,
+    services.py serve LOG       answers /add after some milliseconds, never answers /hang,
                                 executes goals of /fib
     services.py call LOG COUNT  waits for the server, then obeys lines on standard input:
                                 `add` calls /add COUNT times, `hang` calls /hang once,
@@ -10,7 +10,9 @@
 Both print `ready`; the client prints `done` after each line. The log has one line of JSON for each
 call: the times at which the call that sends the request began (`began`) and returned (`sent`), and
 at which the response was received by the middleware, if that reports it, and taken from it. It was
-not there yet at `absent`. Both
+not there yet at `absent`. The log of the
+server has one line for each answer of /add: the times at which the middleware received the request
+(0 where it does not report that), and at which the call that sends the answer began (`sent`). Both
 processes have real-time priority, so that other programs do not delay what they log.
 """
 
@@ -55,10 +57,23 @@ def execute(goal):
     return Fibonacci.Result(sequence=[0, 1])
 
 
-def serve():
+def log_answers(service, file):
+    send = service.send_response
+
+    def send_and_log(response, header):
+        sent = time.time_ns()
+        send(response, header)
+        line = {"received": header.received_timestamp, "sent": sent}
+        file.write(json.dumps(line) + "\n")
+
+    service.send_response = send_and_log
+
+
+def serve(log):
     node = rclpy.create_node("server")
     group = ReentrantCallbackGroup()
-    node.create_service(AddTwoInts, "add", add, callback_group=group)
+    adder = node.create_service(AddTwoInts, "add", add, callback_group=group)
+    log_answers(adder, open(log, "w", buffering=1))
     node.create_service(Trigger, "hang", hang, callback_group=group)
     server = ActionServer(node, Fibonacci, "fib", execute, callback_group=group)
     say("ready")

@@ -12,12 +12,15 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::{run, wait_until};
 use serde::Deserialize;
+use serde::de::DeserializeOwned;
 
 use crate::host::{Host, Middleware};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Log of the client, in the directory of the host.
 const LOG: &str = "calls.jsonl";
+/// Log of the server, likewise.
+const ANSWERS: &str = "answers.jsonl";
 const EXACT: Middleware = Middleware::FastExact("uprobe");
 const CALLS: usize = 1000;
 /// Largest difference between the agent's and the client's median and mean.
@@ -30,13 +33,25 @@ const TAIL: f64 = 0.000_2;
 struct Logged {
     #[serde(default)]
     goal: bool,
-    /// Time at which the request was with the network.
+    /// Time at which the call that sends the request began.
+    #[serde(default)]
+    began: i64,
+    /// Time at which the request was with the network, or with the middleware's thread that sends.
     sent: i64,
     /// Time at which the response had not arrived; `received` where the middleware reports that.
     #[serde(default)]
     absent: i64,
     /// Time at which the middleware received the response, or the client took it.
     received: i64,
+}
+
+/// One answer in the server's log, in nanoseconds.
+#[derive(Deserialize)]
+struct Answered {
+    /// Time at which the middleware received the request.
+    received: i64,
+    /// Time at which the call that sends the response began.
+    sent: i64,
 }
 
 #[test]
@@ -158,7 +173,9 @@ impl<'n> Robot<'n> {
     /// Starts agent, server and client.
     fn ready(&self) -> Result<(Agent<'n>, Process, Process)> {
         let agent = self.host.agent("service_timeout_s: 2\n")?;
-        let mut server = self.host.python("services.py", &["serve"])?;
+        let mut server = self
+            .host
+            .python("services.py", &["serve", &self.host.path(ANSWERS)])?;
         server.wait_for("ready", PATIENCE)?;
         if self.host.middleware == EXACT {
             agent.scrape_until("the uprobe is attached", |page| {
@@ -179,18 +196,25 @@ impl<'n> Robot<'n> {
 
     /// Compares the agent's figures with the client's log.
     fn compare(&self, page: &Scrape) -> Result<()> {
-        let logged = self.logged()?;
-        // A reply may arrive before the call that sends the request returns.
-        let seconds = |each: &Logged, end: i64| (end - each.sent) as f64 / 1e9;
-        let (goals, calls): (Vec<_>, Vec<_>) = logged.iter().partition(|each| each.goal);
+        let logged = self.logged(LOG, CALLS + 1)?;
+        let (goals, calls): (Vec<Logged>, Vec<Logged>) =
+            logged.into_iter().partition(|each: &Logged| each.goal);
         ensure!(calls.len() == CALLS, "{}", calls.len());
-        let sorted = |end: fn(&Logged) -> i64| {
-            let times = calls.iter().map(|each| seconds(each, end(each)));
-            let mut times: Vec<f64> = times.collect();
-            times.sort_by(f64::total_cmp);
-            times
+        let (least, most) = if self.host.middleware == Middleware::Zenoh {
+            // Threads of Zenoh send and receive: a request is on its way for longer than the server
+            // takes, and for less than the client waits.
+            let answers: Vec<Answered> = self.logged(ANSWERS, CALLS)?;
+            (
+                sorted(answers.iter().map(|each| each.sent - each.received)),
+                sorted(calls.iter().map(|each| each.received - each.began)),
+            )
+        } else {
+            // A reply may arrive before the call that sends the request returns.
+            (
+                sorted(calls.iter().map(|each| each.absent - each.sent)),
+                sorted(calls.iter().map(|each| each.received - each.sent)),
+            )
         };
-        let (least, most) = (sorted(|each| each.absent), sorted(|each| each.received));
         let of_agent = |figure: &str| {
             let name = format!("ros2_service_latency_{figure}");
             count(page, &name, "/add")
@@ -214,7 +238,7 @@ impl<'n> Robot<'n> {
             );
         }
         let goal = goals.first().context("no goal")?;
-        let goal = seconds(goal, goal.received);
+        let goal = (goal.received - goal.sent) as f64 / 1e9;
         let labels = [("ros_action", "/fib")];
         let seen = page.sum("ros2_action_goal_duration_p50_seconds", &labels);
         println!("goal: agent {seen:.6} s, client {goal:.6} s");
@@ -223,14 +247,22 @@ impl<'n> Robot<'n> {
         Ok(())
     }
 
-    fn logged(&self) -> Result<Vec<Logged>> {
+    /// Returns the lines of a log of this name once it has this many.
+    fn logged<T: DeserializeOwned>(&self, name: &str, count: usize) -> Result<Vec<T>> {
         let mut logged = Vec::new();
         wait_until("the log is complete", || {
-            let text = fs::read_to_string(self.host.file(LOG))?;
-            let lines = text.lines().map(serde_json::from_str::<Logged>);
+            let text = fs::read_to_string(self.host.file(name))?;
+            let lines = text.lines().map(serde_json::from_str::<T>);
             logged = lines.flatten().collect();
-            Ok(logged.len() > CALLS)
+            Ok(logged.len() >= count)
         })?;
         Ok(logged)
     }
+}
+
+/// Returns these nanoseconds in seconds, the shortest first.
+fn sorted(times: impl Iterator<Item = i64>) -> Vec<f64> {
+    let mut times: Vec<f64> = times.map(|time| time as f64 / 1e9).collect();
+    times.sort_by(f64::total_cmp);
+    times
 }

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
-use ros2probe_wire::zenoh::{Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId};
+use ros2probe_wire::zenoh::{
+    Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId,
+};
 
 use super::stream::StreamId;
 use crate::size::Size;
