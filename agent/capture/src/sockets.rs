@@ -20,6 +20,8 @@ use ros2probe_model::snapshot::SocketFacts;
 
 /// Interval of looking for new sockets: every second round of an idle agent.
 const PERIOD: u64 = 19 * SECOND / 10;
+/// Least interval while a connection of Zenoh begins, which may last for less than a second.
+const SOON: u64 = SECOND / 10;
 /// Interval of reading all owners again: sockets are closed, and count their drops.
 const ALL_PERIOD: u64 = 15 * SECOND;
 /// Most queries for the owner of a socket that was not found.
@@ -61,7 +63,9 @@ impl Sockets {
 
     /// Queries if it is due, and passes changes to the model.
     pub fn follow(&mut self, filter: &Filter, now: u64, observer: &mut Observer) {
-        if now.saturating_sub(self.looked) < PERIOD {
+        let is_awaited = observer.awaits_holders();
+        let interval = if is_awaited { SOON } else { PERIOD };
+        if now.saturating_sub(self.looked) < interval {
             return;
         }
         self.looked = now;
@@ -85,6 +89,9 @@ impl Sockets {
                 known.reported = Some(facts.clone());
                 observer.input(Input::Socket(facts));
             }
+        }
+        if is_awaited {
+            observer.link_sessions();
         }
     }
 

@@ -197,6 +197,17 @@ impl Receivers {
         self.generation += 1;
     }
 
+    /// Returns the session of Zenoh that runs in a process, unless several do.
+    #[must_use]
+    pub fn session_in(&self, process_id: u32) -> Option<GuidPrefix> {
+        let candidates = self.processes.get(&process_id)?;
+        let mut sessions = candidates.0.iter().filter(|prefix| prefix.is_zenoh());
+        sessions
+            .next()
+            .filter(|_| sessions.next().is_none())
+            .copied()
+    }
+
     /// Returns whether a socket of this host sends for this participant.
     #[must_use]
     pub fn is_local(&self, prefix: &GuidPrefix) -> bool {

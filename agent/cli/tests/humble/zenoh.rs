@@ -5,6 +5,7 @@
 
 mod bag;
 mod hosts;
+mod late;
 mod mixed;
 mod restart;
 mod viewer;
@@ -213,40 +214,6 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
         page.0
     );
     ensure!(page.sum("ros2probe_zenoh_routers", &[]) == 1.0);
-    Ok(())
-}
-
-#[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
-fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
-    let network = Namespace::alone()?;
-    let host = Host::new(&network, Middleware::Zenoh)?;
-    let _router = host.router("")?;
-    let mut sensor = publisher(&host, "sensor", "/imu", &["200", "300", "2000", "RELIABLE"])?;
-    let mut one = subscription(&host, "one", "/imu", &["2000", "RELIABLE"])?;
-    sensor.wait_for("matched", PATIENCE)?;
-    publish(&mut sensor, 200, 200)?;
-    let agent = host.agent(WATCH)?;
-    publish(&mut sensor, 1000, 1200)?;
-    let page = agent.scrape_until("an unknown writer", |page| {
-        page.sum("ros2_unknown_writer_messages_total", &[]) >= 900.0
-    })?;
-    println!("{}", page.sum("ros2_unknown_writer_messages_total", &[]));
-    discover(&host)?;
-    agent.scrape_until("names", |page| {
-        page.samples("ros2_node_info", &[("ros_node", "/sensor")])
-            .count()
-            == 1
-    })?;
-    let before = messages(&agent, "/imu")?;
-    publish(&mut sensor, 1000, 2200)?;
-    wait_until("the messages count", || {
-        Ok(messages(&agent, "/imu")? == before + 1000.0)
-    })
-    .with_context(|| format!("{before}"))?;
-    let log = settled_log(&mut one)?;
-    ensure!(log.missing == 0, "{log:?}");
-    runs_in(&agent, "/sensor", &sensor)?;
     Ok(())
 }
 

@@ -96,6 +96,7 @@ impl Observer {
                 known.is_some_and(|known| known.topic.is_none())
             });
             self.topics.expire(now, self.settings.topic_grace);
+            self.link_sessions();
             self.receivers.tidy(&self.discovery);
             self.discovery
                 .locate(|prefix| self.receivers.is_local(prefix));

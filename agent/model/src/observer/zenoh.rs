@@ -9,7 +9,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, RtpsTime, SequenceNumbe
 use super::Observer;
 use crate::discovery::{Origin, Priority};
 use crate::services::service::CallId;
-use crate::zenoh::{GraphChange, Shown, StreamId, StreamReport, ZenohSample, unknown_guid};
+use crate::zenoh::{GraphChange, Holder, Shown, StreamId, StreamReport, ZenohSample, unknown_guid};
 
 /// Bytes of the payload in which a header's stamp ends, behind the encapsulation.
 const STAMP_END: usize = 12;
@@ -49,6 +49,38 @@ impl Observer {
         }
         self.zenoh = zenoh;
         self.change_zenoh_graph(at);
+    }
+
+    /// Returns whether a connection of Zenoh has begun since [`Self::link_sessions`]. It may be short,
+    /// so the process that holds its socket should be looked up soon.
+    #[must_use]
+    pub const fn awaits_holders(&self) -> bool {
+        self.zenoh.has_begun
+    }
+
+    /// Learns from the processes that hold the sockets which sessions of Zenoh send.
+    pub fn link_sessions(&mut self) {
+        self.zenoh.has_begun = false;
+        let receivers = &self.receivers;
+        let holder = |socket| {
+            let process_id = receivers.sockets().get(socket)?.process_id?;
+            Some(Holder {
+                process_id,
+                session: receivers.session_in(process_id),
+            })
+        };
+        for change in self.zenoh.link(holder) {
+            if change.before == change.after {
+                continue;
+            }
+            if let Some(before) = change.before {
+                self.receivers
+                    .sends_no_longer(change.socket, before.guid_prefix());
+            }
+            if let Some(after) = change.after {
+                self.receivers.sends(change.socket, after.guid_prefix());
+            }
+        }
     }
 
     /// Names writers of Zenoh in changed verdicts as the wire does, by their gid. Readers have no

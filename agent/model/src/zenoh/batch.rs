@@ -86,6 +86,7 @@ impl Zenoh {
         direction.sender = Some(side);
         if let Some(owner) = direction.owner(stream) {
             show(Shown::Owner(stream.socket, owner.guid_prefix()));
+            self.has_begun = true;
         }
         self.revision += 1;
     }

@@ -15,6 +15,7 @@ mod endpoints;
 mod facts;
 mod graph;
 mod messages;
+mod processes;
 mod remembered;
 mod replies;
 mod session_state;
@@ -23,7 +24,7 @@ mod stream_state;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-use ros2probe_wire::zenoh::{Batch, Bytes, Gid, WhatAmI, ZenohId};
+use ros2probe_wire::zenoh::{Batch, Bytes, Gid, Side, WhatAmI, ZenohId};
 use ros2probe_wire::{Guid, GuidPrefix, Reason, SequenceNumber, Timestamp};
 
 use crate::discovery::Endpoint;
@@ -33,6 +34,7 @@ pub use endpoints::unknown_guid;
 pub use facts::{Counters, ZenohFacts};
 use graph::Graph;
 pub use graph::GraphChange;
+pub use processes::Holder;
 pub use remembered::ZenohMemory;
 use remembered::{MAX_REMEMBERED, Remembered};
 use replies::Replies;
@@ -99,6 +101,8 @@ pub struct Zenoh {
     unseen: BTreeSet<(Unseen, Flow)>,
     chain_bytes: usize,
     counters: Counters,
+    /// Whether a session of this host has sent an INIT since the last [`Self::link`].
+    pub has_begun: bool,
     /// Increases with the senders that [`Self::memory`] contains.
     revision: u64,
     evictions: u64,
@@ -185,7 +189,11 @@ impl Zenoh {
         let (senders, relayed) = self.remembered.parts();
         let (mut senders, mut relayed) = (senders.clone(), relayed.clone());
         for (stream, direction) in &self.directions {
-            if let Some(side) = direction.sender.filter(|_| !direction.has_left) {
+            let linked = direction.linked.map(|zid| Side {
+                zid,
+                whatami: WhatAmI::Peer,
+            });
+            if let Some(side) = direction.sender.or(linked).filter(|_| !direction.has_left) {
                 senders.insert(stream.flow, side);
             }
         }
@@ -236,6 +244,7 @@ impl Zenoh {
             unseen,
             chain_bytes,
             counters: _,
+            has_begun: _,
             revision: _,
             evictions: _,
         } = self;

@@ -6,9 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
-use ros2probe_wire::zenoh::{
-    Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId,
-};
+use ros2probe_wire::zenoh::{Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId};
 
 use super::stream::StreamId;
 use crate::size::Size;
@@ -56,6 +54,8 @@ pub(super) struct Chain {
 pub(super) struct StreamState {
     /// The sender, from its INIT.
     pub(super) sender: Option<Side>,
+    /// The session of the process that sends, if the INIT was missed.
+    pub(super) linked: Option<ZenohId>,
     /// Source of all publications so far, and their number, if the INIT was missed.
     presumed: Option<(ZenohId, u32)>,
     is_ambiguous: bool,
@@ -110,7 +110,13 @@ impl StreamState {
         let presumed = presumed.filter(|_| !self.is_ambiguous);
         self.sender
             .map(|side| side.zid)
+            .or(self.linked)
             .or(presumed.map(|(zid, _)| zid))
+    }
+
+    /// Returns whether no other session's publication was seen.
+    pub(super) fn sends_only_for(&self, session: ZenohId) -> bool {
+        !self.is_ambiguous && self.presumed.is_none_or(|(zid, _)| zid == session)
     }
 
     /// Returns the session that owns the socket at which the direction was seen, if it sends there
@@ -121,8 +127,9 @@ impl StreamState {
         }
         // A router that passes on publications of one session looks like that session. It sends from
         // its port to the sessions of its host, and to other hosts.
-        let is_certain =
-            self.sender.is_some() || stream.is_loopback() && stream.flow.source.port != PORT;
+        let is_certain = self.sender.is_some()
+            || self.linked.is_some()
+            || stream.is_loopback() && stream.flow.source.port != PORT;
         self.session().filter(|_| is_certain)
     }
 
@@ -212,6 +219,7 @@ impl StreamState {
         // The destructuring makes a new list fail to compile until it is listed here.
         let Self {
             sender: _,
+            linked: _,
             presumed: _,
             is_ambiguous: _,
             lease: _,

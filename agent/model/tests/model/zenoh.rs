@@ -1,14 +1,15 @@
 //! Sessions of Zenoh: what appears, what ends, and what hostile senders cannot do.
 
+mod processes;
+
 use std::ops::Range;
-use std::sync::Arc;
 
 use ros2probe_model::discovery::Memory;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Snapshot, SocketFacts, TopicFacts};
+use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_model::watch::{Expectations, Retain, Watch, Watchlist};
-use ros2probe_model::zenoh::{StreamEvent, StreamId, Unseen, ZenohFacts};
+use ros2probe_model::zenoh::{StreamEvent, Unseen, ZenohFacts};
 use ros2probe_testing::zenoh::{
     Role, connection, declare_key, declare_token, fragment, frame, init, open, publisher, push,
     report, response, send, undeclare_token,
@@ -176,121 +177,6 @@ fn a_session_ends_with_its_last_connection_and_not_with_the_router() {
     report(&mut observer, &to_peer, at + SECOND, StreamEvent::End);
     report(&mut observer, &from_peer, at + SECOND, StreamEvent::End);
     assert_eq!(participants(&observer, at + SECOND), 0);
-}
-
-/// Sees a direction at the socket of its sender.
-fn at_socket(stream: StreamId, socket: u64) -> StreamId {
-    StreamId {
-        socket,
-        outgoing: true,
-        ..stream
-    }
-}
-
-/// Reports the process that holds a socket.
-fn hold(observer: &mut Observer, cookie: u64, process: u32) {
-    observer.input(Input::Socket(SocketFacts {
-        cookie,
-        process_id: Some(process),
-        process: Some("talker".into()),
-        cgroup: Some("/robot".into()),
-        ..SocketFacts::default()
-    }));
-}
-
-/// Returns process id, name and control group of the talker's session.
-fn process(observer: &Observer) -> (Option<u32>, Option<String>, Option<String>) {
-    let snapshot = observer.snapshot(Timestamp(START + 10 * SECOND));
-    let prefix = ZenohId::from_le_bytes(&TALKER).unwrap().guid_prefix();
-    let mut participants = snapshot.participants.iter();
-    let process = &participants
-        .find(|each| each.guid.prefix == prefix)
-        .unwrap()
-        .process;
-    let text = |text: &Option<Arc<str>>| text.as_ref().map(ToString::to_string);
-    (process.id, text(&process.name), text(&process.cgroup))
-}
-
-fn held(process: u32) -> (Option<u32>, Option<String>, Option<String>) {
-    let (name, cgroup) = ("talker".to_owned(), "/robot".to_owned());
-    (Some(process), Some(name), Some(cgroup))
-}
-
-#[test]
-fn a_session_runs_in_the_process_that_sends_its_init() {
-    let mut observer = observer();
-    let [there, back] = connection(1000);
-    let [there, back] = [at_socket(there, 8), at_socket(back, 9)];
-    hold(&mut observer, 9, 900);
-    send(
-        &mut observer,
-        &there,
-        START,
-        &init(TALKER, Role::Peer, None),
-    );
-    let ack = init(ROUTER, Role::Router, Some(&[]));
-    send(&mut observer, &back, START, &ack);
-    // The first node appears seconds later, and the process is found later still.
-    let at = START + 5 * SECOND;
-    let token = publisher(TALKER, 10, "/chatter");
-    let declared = frame(7, &[declare_key(3, KEY), declare_token(1, &token)]);
-    send(&mut observer, &there, at, &declared);
-    // The router repeats the token.
-    send(&mut observer, &back, at, &declared);
-    assert_eq!(process(&observer), (None, None, None));
-    hold(&mut observer, 8, 800);
-    assert_eq!(process(&observer), held(800));
-}
-
-#[test]
-fn a_session_whose_init_was_missed_runs_in_the_process_that_sends_its_messages() {
-    let sending = |source: u16, outgoing| {
-        let (mut observer, gid) = talking();
-        let [mut there, _] = connection(source);
-        there = at_socket(there, 8);
-        there.outgoing = outgoing;
-        hold(&mut observer, 8, 800);
-        let batch = |number| frame(8, &[push(3, gid, number, b"\0\x01\0\0")]);
-        for number in 1..=2 {
-            send(&mut observer, &there, START, &batch(number));
-        }
-        assert_eq!(process(&observer).0, None);
-        send(&mut observer, &there, START, &batch(3));
-        (observer, there)
-    };
-    let (mut observer, there) = sending(1002, true);
-    assert_eq!(process(&observer), held(800));
-    // Another source: it is a router.
-    let token = publisher(LISTENER, 10, "/chatter");
-    let declared = frame(9, &[declare_token(2, &token)]);
-    send(&mut observer, &connection(1001)[1], START, &declared);
-    let other = frame(10, &[push(3, Gid::of_token(&token).0, 1, b"\0\x01\0\0")]);
-    send(&mut observer, &there, START, &other);
-    assert_eq!(process(&observer).0, None);
-    let (from_router, received) = (sending(7447, true).0, sending(1002, false).0);
-    assert_eq!(process(&from_router).0, None, "a router passes messages on");
-    assert_eq!(process(&received).0, None, "the receiver's process");
-}
-
-#[test]
-fn a_process_stays_known_when_the_connection_that_showed_it_ends() {
-    let (mut observer, _) = talking();
-    let [short, _] = connection(1002);
-    let [short, long] = [at_socket(short, 8), at_socket(connection(1003)[0], 9)];
-    hold(&mut observer, 8, 800);
-    hold(&mut observer, 9, 800);
-    send(
-        &mut observer,
-        &short,
-        START,
-        &init(TALKER, Role::Peer, None),
-    );
-    send(&mut observer, &long, START, &[4]);
-    report(&mut observer, &short, START, StreamEvent::End);
-    observer.input(Input::SocketClosed(8));
-    assert_eq!(process(&observer), held(800));
-    observer.input(Input::SocketClosed(9));
-    assert_eq!(process(&observer).0, None);
 }
 
 #[test]
