@@ -1,4 +1,4 @@
-//! Who sends on connections that are older than the agent, by the process that holds the socket.
+//! Senders on connections that are older than the agent, by the process that holds the socket.
 //!
 //! A session has one connection to a router. A process with one such connection therefore has one
 //! session, and all of its connections are of this session.
