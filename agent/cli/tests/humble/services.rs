@@ -1,4 +1,4 @@
-//! Real services and an action of ROS 2 Humble: the agent's times agree with the client's log, a
+//! Real services and an action of ROS 2 Humble: the agent's times agree with the logs of both ends, a
 //! hanging call is found, and a lost reply is no answer.
 //!
 //! Needs root and ROS 2 Humble: `make test-ros2`.
@@ -23,9 +23,9 @@ const LOG: &str = "calls.jsonl";
 const ANSWERS: &str = "answers.jsonl";
 const EXACT: Middleware = Middleware::FastExact("uprobe");
 const CALLS: usize = 1000;
-/// Largest difference between the agent's and the client's median and mean.
+/// How far the agent's median and mean may be outside of what server and client log.
 const CLOSE: f64 = 0.000_1;
-/// Largest difference of the 99th percentile, which a delay of ten calls changes.
+/// Likewise the 99th percentile, which a delay of ten calls changes.
 const TAIL: f64 = 0.000_2;
 
 /// One call or goal of the client's log, in nanoseconds.
@@ -34,13 +34,7 @@ struct Logged {
     #[serde(default)]
     goal: bool,
     /// Time at which the call that sends the request began.
-    #[serde(default)]
     began: i64,
-    /// Time at which the request was with the network, or with the middleware's thread that sends.
-    sent: i64,
-    /// Time at which the response had not arrived; `received` where the middleware reports that.
-    #[serde(default)]
-    absent: i64,
     /// Time at which the middleware received the response, or the client took it.
     received: i64,
 }
@@ -48,7 +42,7 @@ struct Logged {
 /// One answer in the server's log, in nanoseconds.
 #[derive(Deserialize)]
 struct Answered {
-    /// Time at which the middleware received the request.
+    /// Time at which the middleware received the request, or its callback began.
     received: i64,
     /// Time at which the call that sends the response began.
     sent: i64,
@@ -194,27 +188,17 @@ impl<'n> Robot<'n> {
         client.wait_for("done", PATIENCE)
     }
 
-    /// Compares the agent's figures with the client's log.
+    /// Compares the agent's figures with the logs of server and client.
     fn compare(&self, page: &Scrape) -> Result<()> {
         let logged = self.logged(LOG, CALLS + 1)?;
         let (goals, calls): (Vec<Logged>, Vec<Logged>) =
             logged.into_iter().partition(|each: &Logged| each.goal);
         ensure!(calls.len() == CALLS, "{}", calls.len());
-        let (least, most) = if self.host.middleware == Middleware::Zenoh {
-            // Threads of Zenoh send and receive: a request is on its way for longer than the server
-            // takes, and for less than the client waits.
-            let answers: Vec<Answered> = self.logged(ANSWERS, CALLS)?;
-            (
-                sorted(answers.iter().map(|each| each.sent - each.received)),
-                sorted(calls.iter().map(|each| each.received - each.began)),
-            )
-        } else {
-            // A reply may arrive before the call that sends the request returns.
-            (
-                sorted(calls.iter().map(|each| each.absent - each.sent)),
-                sorted(calls.iter().map(|each| each.received - each.sent)),
-            )
-        };
+        // A request is on its way for longer than the server takes, and for less than the client
+        // waits, whatever delays the threads of both.
+        let answers: Vec<Answered> = self.logged(ANSWERS, CALLS)?;
+        let least = sorted(answers.iter().map(|each| each.sent - each.received));
+        let most = sorted(calls.iter().map(|each| each.received - each.began));
         let of_agent = |figure: &str| {
             let name = format!("ros2_service_latency_{figure}");
             count(page, &name, "/add")
@@ -230,7 +214,7 @@ impl<'n> Robot<'n> {
             ("p99", p99, tail(&least), tail(&most), TAIL),
         ];
         for (name, agent, least, most, close) in figures {
-            println!("{name}: agent {agent:.6} s, client {least:.6} to {most:.6} s");
+            println!("{name}: server {least:.6} s, agent {agent:.6} s, client {most:.6} s");
             let possible = least - close..most + close;
             ensure!(
                 possible.contains(&agent),
@@ -238,7 +222,7 @@ impl<'n> Robot<'n> {
             );
         }
         let goal = goals.first().context("no goal")?;
-        let goal = (goal.received - goal.sent) as f64 / 1e9;
+        let goal = (goal.received - goal.began) as f64 / 1e9;
         let labels = [("ros_action", "/fib")];
         let seen = page.sum("ros2_action_goal_duration_p50_seconds", &labels);
         println!("goal: agent {seen:.6} s, client {goal:.6} s");

