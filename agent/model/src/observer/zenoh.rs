@@ -186,10 +186,10 @@ impl Observer {
         }
         self.count(&record);
         if stream.outgoing && stream.is_loopback() {
-            // The receiver's socket is not observed: TCP brings it what was sent.
+            // Nothing is read at the receiver's socket: TCP brings it what was sent.
             self.count(&Record {
                 flags: record.flags & !flag::OUTGOING,
-                socket: 0,
+                socket: sample.receiving_socket,
                 ..record
             });
         }

@@ -22,6 +22,18 @@ impl Zenoh {
         known.or_else(elsewhere).map(|direction| &**direction)
     }
 
+    /// Returns the socket to which a direction of the loopback interface leads, if its session is
+    /// known; else 0.
+    pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
+        let other = self.flows.get(&stream.flow.reversed());
+        let other = other.filter(|_| stream.is_loopback());
+        let owned = other.filter(|other| {
+            let direction = self.directions.get(other);
+            direction.is_some_and(|direction| direction.owner(other).is_some())
+        });
+        owned.map_or(0, |other| other.socket)
+    }
+
     /// Returns the sockets of this host that a session owns, as far as is known.
     pub fn sockets(&self, session: GuidPrefix) -> impl Iterator<Item = u64> + '_ {
         let owned = self.directions.iter().filter(move |(stream, direction)| {

@@ -154,6 +154,7 @@ impl Zenoh {
             payload,
             receiver: session.map(ZenohId::guid_prefix).filter(|_| !is_router),
             is_relayed: is_router,
+            receiving_socket: self.receiving_socket(place.stream),
             began: place.began,
             call: None,
         }

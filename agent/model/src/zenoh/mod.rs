@@ -63,6 +63,9 @@ pub struct ZenohSample<'a> {
     pub receiver: Option<GuidPrefix>,
     /// Whether the receiver is a router.
     pub is_relayed: bool,
+    /// Cookie of the receiver's socket, if it is another socket of this host and `receiver` is known;
+    /// else 0.
+    pub receiving_socket: u64,
     /// Time of its first FRAGMENT.
     pub began: Timestamp,
     /// With a request or reply: gid of the client, and the number of the request.

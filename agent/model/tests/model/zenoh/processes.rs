@@ -201,6 +201,7 @@ fn delivered(observer: &mut Observer, gid: [u8; 16]) -> u64 {
         delivery.direction == Direction::Received && receiver == Some(listener)
     });
     to_listener
+        .inspect(|delivery| assert_eq!(delivery.process_id, Some(900)))
         .map(|delivery| delivery.delivered.messages)
         .sum()
 }
