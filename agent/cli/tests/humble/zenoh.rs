@@ -14,6 +14,7 @@ use std::process::Command;
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
+use ros2probe_api::measurement::Delivered;
 use ros2probe_api::topics::TopicDetails;
 use ros2probe_testing::harness::agent::{Agent, get};
 use ros2probe_testing::harness::network::Namespace;
@@ -82,20 +83,27 @@ fn settled_log(subscription: &mut Process) -> Result<Log> {
 
 /// Returns what arrived at the node, and what was lost on the way, by the agent.
 fn delivered(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Log> {
-    let text = get(agent.host, &format!("http://127.0.0.1:17401/topics{topic}"))?;
-    let details: TopicDetails<'_> = serde_json::from_str(&text).with_context(|| text.clone())?;
-    let arrived = details.deliveries.iter().filter(|delivery| {
-        delivery.direction == "received" && delivery.nodes.iter().any(|other| *other == node)
-    });
     let mut log = Log {
         received: 0,
         missing: 0,
     };
-    for delivery in arrived {
-        log.received += delivery.delivered.messages;
-        log.missing += delivery.delivered.lost_messages;
+    for (_, delivered) in deliveries(agent, topic, node)? {
+        log.received += delivered.messages;
+        log.missing += delivered.lost_messages;
     }
     Ok(log)
+}
+
+/// Returns the receiving process of each delivery to the node, and the fate of the messages.
+fn deliveries(agent: &Agent<'_>, topic: &str, node: &str) -> Result<Vec<(Option<u32>, Delivered)>> {
+    let text = get(agent.host, &format!("http://127.0.0.1:17401/topics{topic}"))?;
+    let details: TopicDetails<'_> = serde_json::from_str(&text).with_context(|| text.clone())?;
+    let arrived = details.deliveries.into_iter().filter(|delivery| {
+        delivery.direction == "received" && delivery.nodes.iter().any(|other| *other == node)
+    });
+    Ok(arrived
+        .map(|delivery| (delivery.process_id, delivery.delivered))
+        .collect())
 }
 
 fn agrees(agent: &Agent<'_>, topic: &str, node: &str, log: Log) -> Result<()> {
@@ -205,6 +213,8 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
         let log = settled_log(process)?;
         println!("{node} logged {log:?}");
         agrees(&agent, topic, node, log)?;
+        let named = deliveries(&agent, topic, node)?[0].0;
+        ensure!(named == Some(process.pid()), "{node}: {named:?}");
         received.push(log.received as f64);
     }
     // On a busy machine Zenoh drops messages, which are on no connection then.
