@@ -82,6 +82,7 @@ pub struct Stream {
     /// When the first segment began to wait.
     waiting_since: Timestamp,
     was_zenoh: bool,
+    is_tls: bool,
     is_zenoh_port: bool,
 }
 
@@ -100,6 +101,7 @@ impl Stream {
             ahead_bytes: 0,
             waiting_since: Timestamp(0),
             was_zenoh: false,
+            is_tls: false,
             is_zenoh_port,
         }
     }
@@ -109,9 +111,9 @@ impl Stream {
         self.first == chunk.sequence_number
     }
 
-    /// Returns whether batches were read in it.
+    /// Returns whether batches were read in it, or it is encrypted on a port of Zenoh.
     pub const fn is_zenoh(&self) -> bool {
-        self.was_zenoh
+        self.was_zenoh || self.is_tls
     }
 
     /// Returns the bytes that it holds.
@@ -312,6 +314,7 @@ impl Stream {
             Position::Beginning(search) => {
                 if search.is_empty() && begins_tls(bytes) {
                     self.position = Position::Other;
+                    self.is_tls = self.is_zenoh_port;
                     return match self.is_zenoh_port {
                         true => Took::Tls,
                         false => Took::NotZenoh,

@@ -181,7 +181,7 @@ fn other_connections_are_left_alone_and_tls_is_named() {
         },
         sequence_number,
         syn: sequence_number == 9,
-        end: false,
+        end: sequence_number == 90_000,
         bytes: bytes.to_vec(),
     };
     let hello = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03";
@@ -194,8 +194,12 @@ fn other_connections_are_left_alone_and_tls_is_named() {
         segment(80, 9, &[]),
         segment(80, 10, request),
         segment(81, 10, request),
+        // The bytes between are not passed on.
+        segment(7447, 90_000, &[]),
+        segment(443, 90_000, &[]),
+        segment(80, 90_000, &[]),
     ]);
-    assert_eq!(reported.tls, 1);
+    assert_eq!((reported.tls, reported.ended), (1, 1));
     assert!(reported.batches.is_empty());
 }
 

@@ -11,7 +11,7 @@ use super::finding::{Area, Finding, Severity};
 use super::host_state::HostState;
 use super::privileges::is_installed;
 use crate::top::text::counted;
-use ros2probe_api::health::{Foxglove, Health, Limit, Zenoh};
+use ros2probe_api::health::{Foxglove, Health, Limit};
 use ros2probe_api::watches::WatchState;
 use ros2probe_daemon::config::{self, Config, StateChoice};
 
@@ -37,7 +37,7 @@ pub fn check(answers: &Answers, place: &str, own_version: &str) -> Vec<Finding> 
     findings.extend(evictions(health));
     findings.push(watches(answers));
     findings.extend(health.foxglove.as_ref().map(foxglove));
-    findings.extend(health.zenoh.iter().flat_map(zenoh));
+    findings.extend(zenoh(health));
     if health.source != "replay" {
         findings.push(kept(health));
     }
@@ -317,8 +317,11 @@ fn watches(answers: &Answers) -> Finding {
 }
 
 /// Findings about connections of Zenoh that cannot be read.
-fn zenoh(facts: &Zenoh) -> Vec<Finding> {
-    let findings = facts.unseen.iter().map(|unseen| {
+fn zenoh(health: &Health) -> Vec<Finding> {
+    let mut abilities = health.abilities.iter();
+    let is_counted = abilities.any(|ability| ability.ability == "inside" && ability.able);
+    let unseen = health.zenoh.iter().flat_map(|zenoh| &zenoh.unseen);
+    let findings = unseen.map(|unseen| {
         let connections = counted(unseen.connections, "connection");
         let which = format!("{connections} of Zenoh {}", unseen.text);
         let finding = |severity, sentence| {
@@ -330,6 +333,11 @@ fn zenoh(facts: &Zenoh) -> Vec<Finding> {
             "shared_memory" => {
                 let sentence =
                     format!("payloads of {which} cannot be read; rates and sizes are right");
+                finding(Severity::Note, sentence)
+            }
+            _ if is_counted => {
+                let sentence =
+                    format!("{which} cannot be read; messages are counted inside the processes");
                 finding(Severity::Note, sentence)
             }
             _ => finding(Severity::Warning, format!("{which} cannot be read"))

@@ -22,11 +22,7 @@ const NAMED: usize = 3;
 #[must_use]
 pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     let participants = &answers.participants.participants;
-    let mut findings = vec![overview(
-        participants,
-        processes,
-        answers.topics.topics.len(),
-    )];
+    let mut findings = vec![overview(answers, processes)];
     findings.extend(alone(participants));
     findings.extend(names(participants));
     findings.extend(restored(participants));
@@ -37,13 +33,27 @@ pub fn check(answers: &Answers, processes: Option<usize>) -> Vec<Finding> {
     findings
 }
 
-fn overview(participants: &[Participant<'_>], processes: Option<usize>, topics: usize) -> Finding {
+fn overview(answers: &Answers, processes: Option<usize>) -> Finding {
+    let (participants, topics) = (
+        &answers.participants.participants,
+        answers.topics.topics.len(),
+    );
     let report = |severity, sentence: String| {
         let finding = Finding::new(AREA, "participants", severity, sentence);
         finding.seen(participants.len().to_string(), "GET /participants")
     };
+    let unreadable = answers.health.zenoh.iter().flat_map(|zenoh| &zenoh.unseen);
+    let unreadable = unreadable.filter(|unseen| unseen.reason != "shared_memory");
+    let unreadable: u64 = unreadable.map(|unseen| unseen.connections).sum();
     if participants.is_empty() {
         return match processes {
+            _ if unreadable > 0 => report(
+                Severity::Note,
+                format!(
+                    "the agent sees no participant: {} of Zenoh cannot be read",
+                    counted(unreadable, "connection")
+                ),
+            ),
             Some(count @ 1..) => report(
                 Severity::Problem,
                 format!(
@@ -372,6 +382,21 @@ mod tests {
             topics: serde_json::from_str(&format!(r#"{{"topics":[{topics}]}}"#)).unwrap(),
             ..Answers::default()
         }
+    }
+
+    #[test]
+    fn that_nothing_is_seen_is_no_problem_where_connections_cannot_be_read() {
+        let unseen = |reason: &str| {
+            let health =
+                format!(r#"{{"zenoh":{{"unseen":[{{"reason":"{reason}","connections":2}}]}}}}"#);
+            let answers = Answers {
+                health: serde_json::from_str(&health).unwrap(),
+                ..Answers::default()
+            };
+            severity(&check(&answers, Some(4)), "participants")
+        };
+        assert_eq!(unseen("tls"), Some(Severity::Note));
+        assert_eq!(unseen("shared_memory"), Some(Severity::Problem));
     }
 
     fn severity(findings: &[Finding], check: &str) -> Option<Severity> {

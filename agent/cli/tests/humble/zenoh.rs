@@ -4,6 +4,7 @@
 //! Needs root and ROS 2 Humble: `make test-ros2`.
 
 mod bag;
+mod encrypted;
 mod hosts;
 mod late;
 mod mixed;

@@ -111,6 +111,8 @@ impl Zenoh {
 
     /// Records that the sender has closed the connection.
     pub(super) fn end(&mut self, stream: &StreamId) {
+        let connection = stream.flow.connection();
+        self.unseen.retain(|(_, other)| *other != connection);
         self.leave(stream);
         let Some(direction) = self.directions.get_mut(stream) else {
             return;
@@ -127,8 +129,6 @@ impl Zenoh {
                 }
             }
         }
-        let connection = stream.flow.connection();
-        self.unseen.retain(|(_, other)| *other != connection);
     }
 
     pub(super) fn note_unseen(&mut self, reason: Unseen, flow: Flow) {

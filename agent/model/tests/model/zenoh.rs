@@ -320,6 +320,17 @@ fn features_that_hide_messages_are_named() {
     assert_eq!(unseen(&facts, Unseen::Tls), 0);
 }
 
+#[test]
+fn an_encrypted_connection_counts_until_it_ends() {
+    let mut observer = observer();
+    let [there, _] = connection(3);
+    for (event, count) in [(StreamEvent::Unseen(Unseen::Tls), 1), (StreamEvent::End, 0)] {
+        report(&mut observer, &there, START, event);
+        let facts = observer.snapshot(Timestamp(START)).zenoh;
+        assert_eq!(facts.map_or(0, |facts| unseen(&facts, Unseen::Tls)), count);
+    }
+}
+
 fn unseen(facts: &ZenohFacts, reason: Unseen) -> u64 {
     let known = facts.unseen().find(|(other, _)| *other == reason);
     known.map_or(0, |(_, connections)| connections)

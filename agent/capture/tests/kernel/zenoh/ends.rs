@@ -56,7 +56,8 @@ fn tls_and_other_versions_are_named_on_a_port_of_zenoh_only() -> Result<()> {
             // The port is in use again at once.
             rst_on_close(&connection[1]);
             drop(connection);
-            observed.seen();
+            let ended: u64 = observed.seen().values().map(|seen| seen.ended).sum();
+            assert!(ended >= 1, "the end of a connection that cannot be read");
         }
     }
     Ok(())

@@ -164,6 +164,15 @@ fn connections_of_zenoh_that_cannot_be_read_are_named_with_what_is_missing() {
             ),
         ]
     );
+    let counted = health.replace(
+        r#""zenoh""#,
+        r#""abilities":[{"ability":"inside","able":true}],"zenoh""#,
+    );
+    let findings = check(&answers(&counted, WATCHED), "here", "1.0.0");
+    let mut zenoh = findings.iter().filter(|finding| finding.check == "zenoh");
+    let first = zenoh.next().unwrap();
+    assert_eq!(first.severity, note);
+    assert!(first.sentence.ends_with("counted inside the processes"));
 }
 
 #[test]
