@@ -9,6 +9,7 @@
 )]
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::env::consts::ARCH;
 use std::process::Command;
 
 use serde_json::Value;
@@ -70,6 +71,8 @@ impl Workspace {
         let manifest = ros2probe_testing::repository("Cargo.toml");
         let output = Command::new(env!("CARGO"))
             .args(["metadata", "--format-version=1", "--locked", "--offline"])
+            // A fresh machine has the packages of its own platform only.
+            .args(["--filter-platform", &format!("{ARCH}-unknown-linux-gnu")])
             .arg("--manifest-path")
             .arg(manifest)
             .output()
