@@ -81,8 +81,8 @@ pub struct Stream {
     ahead_bytes: usize,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
+    /// Whether batches were read in it, or it is encrypted on a port of Zenoh.
     was_zenoh: bool,
-    is_tls: bool,
     is_zenoh_port: bool,
 }
 
@@ -101,7 +101,6 @@ impl Stream {
             ahead_bytes: 0,
             waiting_since: Timestamp(0),
             was_zenoh: false,
-            is_tls: false,
             is_zenoh_port,
         }
     }
@@ -113,7 +112,7 @@ impl Stream {
 
     /// Returns whether batches were read in it, or it is encrypted on a port of Zenoh.
     pub const fn is_zenoh(&self) -> bool {
-        self.was_zenoh || self.is_tls
+        self.was_zenoh
     }
 
     /// Returns the bytes that it holds.
@@ -314,7 +313,7 @@ impl Stream {
             Position::Beginning(search) => {
                 if search.is_empty() && begins_tls(bytes) {
                     self.position = Position::Other;
-                    self.is_tls = self.is_zenoh_port;
+                    self.was_zenoh |= self.is_zenoh_port;
                     return match self.is_zenoh_port {
                         true => Took::Tls,
                         false => Took::NotZenoh,

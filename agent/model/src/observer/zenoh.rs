@@ -70,9 +70,6 @@ impl Observer {
             })
         };
         for change in self.zenoh.link(holder) {
-            if change.before == change.after {
-                continue;
-            }
             if let Some(before) = change.before {
                 self.receivers
                     .sends_no_longer(change.socket, before.guid_prefix());

@@ -15,23 +15,22 @@ impl Zenoh {
     /// other socket.
     pub(super) fn opposite(&self, stream: &StreamId) -> Option<&StreamState> {
         let known = self.directions.get(&stream.reversed());
-        let elsewhere = || {
-            self.directions
-                .get(self.flows.get(&stream.flow.reversed())?)
-        };
-        known.or_else(elsewhere).map(|direction| &**direction)
+        let known = known.map(|direction| &**direction);
+        known.or_else(|| self.elsewhere(stream).map(|(_, direction)| direction))
+    }
+
+    /// Returns the other direction, and the place at which it was seen last.
+    fn elsewhere(&self, stream: &StreamId) -> Option<(&StreamId, &StreamState)> {
+        let place = self.flows.get(&stream.flow.reversed())?;
+        Some((place, self.directions.get(place)?))
     }
 
     /// Returns the socket to which a direction of the loopback interface leads, if its session is
     /// known; else 0.
     pub(super) fn receiving_socket(&self, stream: &StreamId) -> u64 {
-        let other = self.flows.get(&stream.flow.reversed());
-        let other = other.filter(|_| stream.is_loopback());
-        let owned = other.filter(|other| {
-            let direction = self.directions.get(other);
-            direction.is_some_and(|direction| direction.owner(other).is_some())
-        });
-        owned.map_or(0, |other| other.socket)
+        let other = self.elsewhere(stream).filter(|_| stream.is_loopback());
+        let owned = other.filter(|(place, direction)| direction.owner(place).is_some());
+        owned.map_or(0, |(place, _)| place.socket)
     }
 
     /// Returns the sockets of this host that a session owns, as far as is known.

@@ -70,11 +70,14 @@ impl Zenoh {
             let before = direction.owner(stream);
             direction.linked = linked;
             self.revision += 1;
-            changes.push(OwnerChange {
-                socket: stream.socket,
-                before,
-                after: direction.owner(stream),
-            });
+            let after = direction.owner(stream);
+            if before != after {
+                changes.push(OwnerChange {
+                    socket: stream.socket,
+                    before,
+                    after,
+                });
+            }
         }
         changes
     }

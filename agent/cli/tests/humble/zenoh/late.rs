@@ -4,6 +4,7 @@ use std::process::Stdio;
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_testing::harness::network::Namespace;
+use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
 use super::{
@@ -12,15 +13,21 @@ use super::{
 };
 use crate::host::{Host, Middleware};
 
+/// Starts a router, a publisher and its subscription.
+fn robot(host: &Host<'_>) -> Result<[Process; 3]> {
+    let router = host.router("")?;
+    let mut sensor = publisher(host, "sensor", "/imu", &["200", "300", "2000", "RELIABLE"])?;
+    let one = subscription(host, "one", "/imu", &["2000", "RELIABLE"])?;
+    sensor.wait_for("matched", PATIENCE)?;
+    Ok([router, sensor, one])
+}
+
 #[test]
 #[ignore = "needs ROS 2 Humble: make test-ros2"]
 fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
-    let _router = host.router("")?;
-    let mut sensor = publisher(&host, "sensor", "/imu", &["200", "300", "2000", "RELIABLE"])?;
-    let mut one = subscription(&host, "one", "/imu", &["2000", "RELIABLE"])?;
-    sensor.wait_for("matched", PATIENCE)?;
+    let [_router, mut sensor, mut one] = robot(&host)?;
     publish(&mut sensor, 200, 200)?;
     let agent = host.agent(WATCH)?;
     publish(&mut sensor, 1000, 1200)?;
@@ -51,10 +58,7 @@ fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Re
 fn a_ros2_command_shows_who_receives_on_connections_older_than_the_agent() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
-    let _router = host.router("")?;
-    let mut sensor = publisher(&host, "sensor", "/imu", &["200", "300", "2000", "RELIABLE"])?;
-    let mut one = subscription(&host, "one", "/imu", &["2000", "RELIABLE"])?;
-    sensor.wait_for("matched", PATIENCE)?;
+    let [_router, mut sensor, mut one] = robot(&host)?;
     let agent = host.agent(WATCH)?;
     let mut command = host.run("exec ros2 node list --no-daemon", &[], Stdio::inherit())?;
     command.wait_for("/sensor", PATIENCE)?;
