@@ -119,7 +119,8 @@ pub fn local_participant(
 ) -> Result<(LocalParticipant, UdpSocket), DiscoverError> {
     let open = || {
         let address = leaving(target.metatraffic)?;
-        let socket = UdpSocket::bind((address, 0))?;
+        // Fast DDS answers a participant of its own host at 127.0.0.1, whatever address is announced.
+        let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
         socket.set_read_timeout(Some(SLICE))?;
         let port = socket.local_addr()?.port();
         Ok((SocketAddrV4::new(address, port), socket))
