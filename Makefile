@@ -53,6 +53,7 @@ test: ## format, spelling, lints, kernel object, and all tests with real DDS par
 	cargo test --workspace --doc --quiet
 	cargo test --workspace --features ros2probe/tls --test surface --quiet -- web_config:: otlp_tls::
 	cargo nextest run --workspace $$(.ci/prerequisites.sh --left-out)
+	@.ci/prerequisites.sh --ros2-summary
 	@if [ -d "$(CORPUS)" ]; then $(MAKE) --no-print-directory test-corpus; fi
 
 test-fast: ## unit tests, model and surface, without root and namespaces: under 90 s after a build
@@ -62,13 +63,18 @@ test-fast: ## unit tests, model and surface, without root and namespaces: under 
 test-corpus: ## tests against the whole corpus of captures in ROS2PROBE_FIXTURES (../shared/fixtures)
 	ROS2PROBE_FIXTURES=$(CORPUS) cargo nextest run --workspace --run-ignored only --filterset 'test(corpus)'
 
-test-ros2: ## tests against real ROS 2 Humble nodes and the real ros2 command line, installed in /opt/ros/humble (needs root)
-	@.ci/prerequisites.sh test ros2
-	cargo nextest run --workspace --run-ignored only --filterset 'binary(humble) and not test(/^cost::/)'
+test-ros2: ## tests against real nodes and the real ros2 command line of each distribution below /opt/ros, or in ROS2PROBE_ROS2 (needs root)
+	@[ -n "$$(.ci/prerequisites.sh --ros2)" ] || { echo "no ROS 2 below /opt/ros: install a distribution, or set ROS2PROBE_ROS2 to its directory" >&2; exit 1; }
+	@.ci/prerequisites.sh test
+	@for prefix in $$(.ci/prerequisites.sh --ros2); do \
+	    echo "tests with the ROS 2 in $$prefix"; \
+	    ROS2PROBE_ROS2=$$prefix cargo nextest run --workspace --run-ignored only \
+	        --filterset "$$(.ci/prerequisites.sh --ros2-selection $$prefix)" || exit 1; \
+	done
 
 bench-ros2: ## what the agent and `ros2 topic hz` cost nodes of rmw_zenoh; ROUNDS=N (3) (needs root)
-	@.ci/prerequisites.sh test ros2
-	ROUNDS=$(or $(ROUNDS),3) cargo test --release --package ros2probe --test humble -- --ignored --nocapture cost::
+	@.ci/prerequisites.sh test
+	ROUNDS=$(or $(ROUNDS),3) cargo test --release --package ros2probe --test ros2 -- --ignored --nocapture cost::
 
 ebpf: ## rebuild the kernel filter's committed object
 	@.ci/prerequisites.sh ebpf

@@ -4,9 +4,11 @@
 #   prerequisites.sh demo|test|fast|dist|vm|ebpf|fuzz|miri|book|deny...   install the tools of those targets
 #   prerequisites.sh types                    install the type checker of the dashboards
 #   prerequisites.sh page                     install the browser of the page's tests
-#   prerequisites.sh ros2                     install ROS 2 Humble from an archive beside the checkout
 #   prerequisites.sh --nightly                print the nightly toolchain that builds the kernel part
 #   prerequisites.sh --left-out               print the tests that `make test` omits, with the reason
+#   prerequisites.sh --ros2                   print the directory of each installed ROS 2 distribution
+#   prerequisites.sh --ros2-selection PREFIX  print the tests that a distribution can run, as a filter
+#   prerequisites.sh --ros2-summary           print what is left out if no distribution is installed
 #
 # Supports Debian 12 and Ubuntu 22.04 or newer. It starts no service, adds no package source and
 # changes no system setting. If a tool is unavailable, it fails with a line on how to install it.
@@ -146,6 +148,19 @@ rotel() {
     "$place/bin/pip" install --quiet --disable-pip-version-check rotel==0.0.1a15
 }
 
+# Real sessions and routers of Zenoh, and the hash of rmw_zenoh's GIDs.
+zenoh() {
+    local place=$tools/zenoh
+    local versions=("eclipse-zenoh==1.10.2" "xxhash==4.1.0")
+    [ "$(cat "$place/versions" 2>/dev/null)" = "${versions[*]}" ] && return
+    packages python3 python3-venv
+    say "installing ${versions[*]} from PyPI into target/tools/zenoh"
+    rm -rf "$place"
+    python3 -m venv "$place"
+    "$place/bin/pip" install --quiet --disable-pip-version-check "${versions[@]}"
+    echo "${versions[*]}" >"$place/versions"
+}
+
 # Generates requests to the control API; installed in a separate Python environment.
 schemathesis() {
     local place=$tools/schemathesis version=4.32.5
@@ -248,14 +263,51 @@ spelling() {
     "$place/bin/pip" install --quiet --disable-pip-version-check "typos==$version"
 }
 
-# No package source has ROS 2 Humble for Debian 12: an archive with its own script installs it.
-ros2() {
-    [ -e /opt/ros/humble/env.sh ] && return
-    local installer=../shared/ros2/install.sh
-    [ -e "$installer" ] ||
-        die "ROS 2 Humble is missing: neither /opt/ros/humble/env.sh nor $installer exists"
-    say "installing ROS 2 Humble into /opt/ros with $installer"
-    as_root bash "$installer"
+# Prints the directory of each installed ROS 2 distribution: ROS2PROBE_ROS2, or all below /opt/ros.
+distributions() {
+    local prefix
+    for prefix in ${ROS2PROBE_ROS2:-/opt/ros/*}; do
+        if [ -e "$prefix/setup.bash" ]; then echo "$prefix"; fi
+    done
+}
+
+# Prints a line for each test with real ROS 2: its name, and the packages of ROS that it needs.
+ros2_tests() {
+    find agent/cli/tests/ros2 -name '*.rs' -print | sort | xargs awk '
+        match($0, /#\[ignore = "needs ROS 2[^:]*/) {
+            needs = substr($0, RSTART + 23, RLENGTH - 23)
+            sub(/^ with /, " ", needs); gsub(/,/, "", needs)
+            waiting = 1
+            next
+        }
+        waiting && match($0, /fn [a-z0-9_]+/) {
+            name = FILENAME
+            sub(/^agent\/cli\/tests\/ros2\//, "", name); sub(/\.rs$/, "", name); gsub(/\//, "::", name)
+            print name "::" substr($0, RSTART + 3, RLENGTH - 3) needs
+            waiting = 0
+        }'
+}
+
+# Prints each test that `make test-ros2` omits, as this distribution lacks a package that it needs, to
+# standard error. Prints the expression that selects the others to standard output.
+ros2_selection() {
+    local name needs package selection='binary(ros2) and not test(/^cost::/)'
+    while read -r name needs; do
+        for package in $needs; do
+            [ -e "$1/share/$package/package.xml" ] && continue
+            say "left out with $1: $name: needs $package"
+            selection+=" and not test(=$name)"
+            break
+        done
+    done < <(ros2_tests)
+    printf '%s\n' "$selection"
+}
+
+# Names what `make test` cannot prove without ROS 2.
+ros2_summary() {
+    [ -n "$(distributions)" ] && return
+    say "left out: $(ros2_tests | wc -l) tests with real ROS 2 (make test-ros2), because neither /opt/ros/*" \
+        "nor ROS2PROBE_ROS2 has a distribution"
 }
 
 # Prints each test that `make test` omits, with the reason, to standard error. Prints the arguments
@@ -264,6 +316,7 @@ left_out() {
     local version elsewhere="started by another test"
     # `make test` runs these if the corpus exists.
     [ -d "${ROS2PROBE_FIXTURES:-../shared/fixtures}" ] && elsewhere+="|make test-corpus"
+    [ -n "$(distributions)" ] && elsewhere+="|make test-ros2"
     say "omitted tests:"
     find agent wire -name target -prune -o -name '*.rs' -print | sort | xargs awk -v elsewhere="$elsewhere" '
         /#\[ignore = / { sub(/.*#\[ignore = "/, ""); sub(/"\].*/, ""); reason = $0 ~ elsewhere ? "" : $0; next }
@@ -341,11 +394,17 @@ ebpf() {
 
 network_tools=(iproute2 nftables ethtool util-linux procps curl ca-certificates tcpdump)
 
+if [ "${1:-}" = --ros2-selection ]; then
+    ros2_selection "${2:?the directory of a distribution}"
+    exit
+fi
+
 for need; do
     case $need in
     --nightly) nightly ;;
     --left-out) left_out ;;
-    ros2) ros2 ;;
+    --ros2) distributions ;;
+    --ros2-summary) ros2_summary ;;
     demo)
         packages "${network_tools[@]}" gcc libc6-dev
         rust
@@ -356,6 +415,7 @@ for need; do
         prometheus
         schemathesis
         rotel
+        zenoh
         bags
         types
         page

@@ -1,7 +1,7 @@
-//! `rp learn` beside the talker and the listener of ROS 2 Humble: they meet the watchlist, and
+//! `rp learn` beside the talker and the listener of ROS 2: they meet the watchlist, and
 //! without the listener they lack its endpoints and nothing else.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::fs;
 use std::process::{Command, Stdio};
@@ -20,13 +20,13 @@ const VIOLATED: &str = "ros2_watch_expectation_violated";
 const LEARNS: Duration = Duration::from_secs(40);
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
 fn fast_dds_with_shared_memory_meets_what_was_learnt_from_it() -> Result<()> {
     meets_what_was_learnt(Middleware::FastSampled)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp, demo_nodes_cpp: make test-ros2"]
 fn cyclone_dds_meets_what_was_learnt_from_it() -> Result<()> {
     meets_what_was_learnt(Middleware::Cyclone)
 }

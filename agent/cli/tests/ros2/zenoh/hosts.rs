@@ -12,7 +12,7 @@ use crate::host::{Host, Middleware};
 const QOS: [&str; 2] = ["2000", "RELIABLE"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn the_agent_of_each_host_counts_what_its_subscriptions_log() -> Result<()> {
     let link = Link::new()?;
     let robot = Host::new(&link.robot, Middleware::Zenoh)?;

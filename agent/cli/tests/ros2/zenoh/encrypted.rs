@@ -8,6 +8,7 @@ use ros2probe_testing::harness::process::Process;
 
 use super::{PATIENCE, WATCH, publish, settled_log};
 use crate::host::{Host, Middleware};
+use crate::installed;
 
 const UNSEEN: &str = "ros2probe_zenoh_unseen_connections";
 const TOPIC: [(&str, &str); 1] = [("topic", "/imu")];
@@ -38,9 +39,10 @@ impl Robot {
         let settings = format!(
             r#"{identity};connect/endpoints=["{protocol}/localhost:7447"];listen/endpoints=["{protocol}/localhost:0"]"#
         );
-        let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble");
+        let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2");
+        let python = installed::python();
         let line = format!(
-            "export ZENOH_CONFIG_OVERRIDE='{settings}'; exec python3 {directory}/zenoh.py \"$@\""
+            "export ZENOH_CONFIG_OVERRIDE='{settings}'; exec {python} {directory}/zenoh.py \"$@\""
         );
         let publish = "publish sensor /imu 1000 300 2000 RELIABLE";
         let subscribe = "subscribe one /imu 2000 RELIABLE";
@@ -61,7 +63,7 @@ impl Robot {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_tls_are_named_and_their_messages_counted_inside() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -93,7 +95,7 @@ fn connections_over_tls_are_named_and_their_messages_counted_inside() -> Result<
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn connections_over_quic_are_named() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

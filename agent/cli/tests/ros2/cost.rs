@@ -1,5 +1,5 @@
 //! The cost of observing real nodes of rmw_zenoh: no observer, the agent and `ros2 topic hz` in
-//! turns (`make bench-ros2`). Needs root and ROS 2 Humble.
+//! turns (`make bench-ros2`). Needs root and ROS 2.
 
 use std::fs::File;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! `rp` against an installed ROS 2 Humble (`make test-ros2`).
+//! `rp` against an installed ROS 2 (`make test-ros2`).
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,

@@ -19,7 +19,7 @@ const COUNT: usize = 20;
 const QOS: [&str; 2] = ["0", "RELIABLE"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_viewer_receives_point_clouds_byte_for_byte() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

@@ -1,5 +1,5 @@
-//! Compares the output with that of `ros2 topic echo` of ROS 2 Humble byte for byte, for messages
-//! of every installed type and each option (`humble/oracle.py`).
+//! Compares the output with that of `ros2 topic echo` of ROS 2 byte for byte, for messages
+//! of every installed type and each option (`ros2/oracle.py`).
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{BufRead as _, BufReader};
@@ -8,7 +8,6 @@ use std::process::Stdio;
 use std::thread;
 
 use crate::installed;
-use ros2probe::ros2::Dialect;
 use ros2probe::ros2::echo::{Echo, Options};
 use ros2probe_api::samples::Sample;
 use ros2probe_message::yaml::Style;
@@ -21,14 +20,14 @@ const PARTS: usize = 2;
 const SHOWN: usize = 12;
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
-fn every_installed_message_type_prints_as_humble_prints_it() {
+#[ignore = "needs ROS 2: make test-ros2"]
+fn every_installed_message_type_prints_as_ros2_prints_it() {
     assert_prints_equal("rmw_fastrtps_cpp");
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
-fn what_cyclone_dds_serializes_prints_as_humble_prints_it() {
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
+fn what_cyclone_dds_serializes_prints_as_ros2_prints_it() {
     assert_prints_equal("rmw_cyclonedds_cpp");
 }
 
@@ -80,8 +79,8 @@ struct Line {
 
 /// Every `PARTS`-th type.
 fn compare(middleware: &str, part: usize) -> Compared {
-    let oracle = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/humble/oracle.py");
-    let mut child = installed::shell("exec python3 \"$0\" \"$@\"")
+    let oracle = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/ros2/oracle.py");
+    let mut child = installed::shell(&format!("exec {} \"$0\" \"$@\"", installed::python()))
         .arg(oracle)
         .args([part.to_string(), PARTS.to_string()])
         .env("RMW_IMPLEMENTATION", middleware)
@@ -91,7 +90,7 @@ fn compare(middleware: &str, part: usize) -> Compared {
     let library = Library::new(Sources {
         directories: Vec::new(),
         prefixes: vec![installed::prefix()],
-        dialect: Dialect::Humble,
+        dialect: installed::dialect(),
     });
     let mut compared = Compared::default();
     for line in BufReader::new(child.stdout.take().unwrap()).lines() {
@@ -136,7 +135,7 @@ fn compare(middleware: &str, part: usize) -> Compared {
 /// The options of `ros2 topic echo`, as `rp topic echo` understands them.
 fn parse(words: &[String]) -> Options {
     let mut options = Options {
-        dialect: Dialect::Humble,
+        dialect: installed::dialect(),
         ..Options::default()
     };
     let mut words = words.iter();

@@ -11,7 +11,7 @@ use crate::host::{Host, Middleware};
 const QOS: [&str; 2] = ["2000", "RELIABLE"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn an_agent_that_restarts_knows_names_and_counts_for_each_node() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

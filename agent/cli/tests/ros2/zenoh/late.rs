@@ -23,7 +23,7 @@ fn robot(host: &Host<'_>) -> Result<[Process; 3]> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -54,7 +54,7 @@ fn an_agent_that_starts_last_counts_and_learns_the_names_from_the_router() -> Re
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_ros2_command_shows_who_receives_on_connections_older_than_the_agent() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

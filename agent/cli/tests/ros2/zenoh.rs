@@ -1,7 +1,7 @@
 //! Real nodes of rmw_zenoh under the agent's eyes: counts for each receiver equal the log of each
 //! subscription.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 mod bag;
 mod encrypted;
@@ -174,7 +174,7 @@ fn runs_in(agent: &Agent<'_>, node: &str, process: &Process) -> Result<()> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -233,7 +233,7 @@ fn small_messages_at_1_khz_and_point_clouds_count_as_each_subscription_logs() ->
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn messages_that_zenoh_drops_for_a_stopped_subscription_are_its_losses() -> Result<()> {
     let logs = beside_a_stopped_subscription("20", "2720000", [10, 60, 20])?;
     ensure!(logs[0].missing > 0, "nothing was dropped: {logs:?}");
@@ -241,7 +241,7 @@ fn messages_that_zenoh_drops_for_a_stopped_subscription_are_its_losses() -> Resu
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn small_messages_that_wait_for_a_stopped_subscription_arrive_in_large_packets() -> Result<()> {
     let logs = beside_a_stopped_subscription("1000", "300", [1000, 5000, 1000])?;
     ensure!(logs[1].received == 7000, "{logs:?}");
@@ -279,7 +279,7 @@ fn beside_a_stopped_subscription(rate: &str, bytes: &str, counts: [u64; 3]) -> R
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_router_that_is_restarted_takes_no_node_with_it() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

@@ -130,7 +130,7 @@ impl<'n> Host<'n> {
 
     /// Runs a line of the shell in ROS's environment, with these arguments from `$1` on.
     pub fn run(&self, line: &str, arguments: &[&str], errors: Stdio) -> Result<Process> {
-        let line = in_environment(line);
+        let line = installed::in_environment(line);
         let words = ["-c", &line, "bash"]
             .into_iter()
             .chain(arguments.iter().copied());
@@ -166,7 +166,7 @@ impl<'n> Host<'n> {
             .args(arguments)
             .args(["--socket", &self.socket()])
             .env_remove("ROS_DOMAIN_ID")
-            .env("ROS_DISTRO", "humble")
+            .env("ROS_DISTRO", installed::distro())
             .output()?;
         ensure!(output.status.success(), "{output:?}");
         Ok(String::from_utf8(output.stdout)?)
@@ -174,13 +174,9 @@ impl<'n> Host<'n> {
 
     /// Runs a script of this directory with Python.
     pub fn python(&self, script: &str, arguments: &[&str]) -> Result<Process> {
-        let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble");
-        let line = format!("exec python3 {directory}/{script} \"$@\"");
+        let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2");
+        let python = installed::python();
+        let line = format!("exec {python} {directory}/{script} \"$@\"");
         self.run(&line, arguments, Stdio::inherit())
     }
-}
-
-/// Returns a line of the shell behind the one that sets ROS's environment.
-pub fn in_environment(line: &str) -> String {
-    format!(". {}/env.sh && {line}", installed::prefix().display())
 }

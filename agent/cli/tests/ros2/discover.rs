@@ -1,7 +1,7 @@
 //! `rp discover --router` with a real router and real nodes of rmw_zenoh: it prints what `ros2`
 //! prints, sends what its dry run says, and leaves no trace.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -13,8 +13,9 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
-use crate::host::{Host, Middleware, RP, in_environment};
+use crate::host::{Host, Middleware, RP};
 use crate::installed;
+use crate::installed::in_environment;
 
 const PATIENCE: Duration = Duration::from_secs(30);
 const PORT: &str = "7447";
@@ -33,7 +34,7 @@ const OF_TALKER: &str =
 const OF_ALL: [&str; 2] = ["/rosout", "/parameter_events"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn a_router_tells_what_ros2_prints_and_no_node_appears() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -85,7 +86,7 @@ fn a_router_tells_what_ros2_prints_and_no_node_appears() -> Result<()> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn routers_of_other_configurations_answer_or_are_named() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;

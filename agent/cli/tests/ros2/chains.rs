@@ -1,8 +1,8 @@
-//! A pipeline of real nodes of ROS 2 Humble: a sensor, a filter that sleeps, a controller, and a
+//! A pipeline of real nodes of ROS 2: a sensor, a filter that sleeps, a controller, and a
 //! node that stamps again. The hops agree with the nodes' logs, live and in a capture of the same
 //! run.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::collections::HashMap;
 use std::fs;
@@ -48,19 +48,19 @@ struct Logged {
 type Log = HashMap<[i64; 2], Logged>;
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
 fn hops_over_cyclone_dds_take_as_long_as_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::Cyclone)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn hops_over_fast_dds_and_udp_take_as_long_as_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastUdp)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn hops_over_shared_memory_with_the_uprobe_take_as_long_as_the_nodes_log() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastExact("uprobe"))
 }

@@ -12,6 +12,7 @@ use ros2probe_testing::harness::wait_until;
 
 use super::{PATIENCE, publisher, subscription};
 use crate::host::{Host, Middleware, RP};
+use crate::installed;
 
 /// Name of the publisher, topic, messages in a second, bytes, messages.
 const STREAMS: [(&str, &str, &str, &str, usize); 2] = [
@@ -22,7 +23,7 @@ const STREAMS: [(&str, &str, &str, &str, usize); 2] = [
 const RELIABLE: [&str; 2] = ["0", "RELIABLE"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_bag_has_each_message_byte_for_byte_and_ros2_plays_them() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Zenoh)?;
@@ -118,7 +119,8 @@ fn record(host: &Host<'_>, bag: &str) -> Result<Process> {
     let socket = host.socket();
     words.extend(["--socket", &socket]);
     let mut enter = host.network.on_network();
-    enter.extend(["env", "-u", "ROS_DOMAIN_ID", "ROS_DISTRO=humble"].map(str::to_owned));
+    enter.extend(["env", "-u", "ROS_DOMAIN_ID"].map(str::to_owned));
+    enter.push(format!("ROS_DISTRO={}", installed::distro()));
     let recorder = Process::start_with(&enter, RP, words, File::create(&errors)?.into())?;
     wait_until("it records both topics", || {
         let said = fs::read_to_string(&errors)?;
@@ -131,8 +133,9 @@ fn record(host: &Host<'_>, bag: &str) -> Result<Process> {
 
 /// Returns a line with topic and hash for each message that rosbag2 reads.
 fn hashes(host: &Host<'_>, bag: &str) -> Result<String> {
-    let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/humble");
-    let line = format!("exec python3 {directory}/zenoh.py bag \"$1\" >\"$2\"");
+    let directory = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/ros2");
+    let python = installed::python();
+    let line = format!("exec {python} {directory}/zenoh.py bag \"$1\" >\"$2\"");
     let output = host.path("bag.txt");
     let mut reader = host.run(&line, &[bag, &output], Stdio::inherit())?;
     ensure!(reader.wait(PATIENCE)?.success(), "rosbag2 reads the bag");

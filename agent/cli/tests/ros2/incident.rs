@@ -35,7 +35,7 @@ fn echo(host: &Host<'_>, name: &str, reliability: &str) -> Result<Process> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp, ros2bag, rosbag2_storage_mcap: make test-ros2"]
 fn a_finding_writes_a_bag_of_the_seconds_around_it_that_ros2_plays() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Cyclone)?;

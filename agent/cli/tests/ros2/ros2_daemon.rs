@@ -1,7 +1,7 @@
-//! The `ros2` command line of ROS 2 Humble with the agent as its daemon, beside real nodes: it prints
+//! The `ros2` command line of ROS 2 with the agent as its daemon, beside real nodes: it prints
 //! what it prints with its own daemon, and sends nothing on the network.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -14,8 +14,8 @@ use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::wait_until;
 
-use crate::host::{Host, Middleware, in_environment};
-use crate::installed;
+use crate::host::{Host, Middleware};
+use crate::installed::{self, in_environment};
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// The kernel keeps the address of a closed connection of the real daemon for a minute at most. The
@@ -73,19 +73,19 @@ const FREE_OF_ZENOH: &[&str] = &[
 ];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp, lifecycle: make test-ros2"]
 fn with_fast_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
     answers_as_the_real_daemon(Middleware::FastSampled)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp, demo_nodes_cpp, lifecycle: make test-ros2"]
 fn with_cyclone_dds_ros2_prints_the_same_and_sends_nothing() -> Result<()> {
     answers_as_the_real_daemon(Middleware::Cyclone)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp, demo_nodes_cpp, lifecycle: make test-ros2"]
 fn with_zenoh_ros2_prints_the_same_and_opens_no_session() -> Result<()> {
     answers_as_the_real_daemon(Middleware::Zenoh)
 }

@@ -1,7 +1,7 @@
-//! Real processes of ROS 2 Humble, counted from inside: as many messages as the nodes themselves
+//! Real processes of ROS 2, counted from inside: as many messages as the nodes themselves
 //! count, over each middleware, and within a process.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::process::Stdio;
 use std::time::Duration;
@@ -25,19 +25,19 @@ const CALLBACKS: [(&str, &str); 2] = [("/talker", "timer"), ("/listener", "/chat
 const MESSAGES: u64 = 3000;
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn messages_over_fast_dds_are_as_many_as_the_nodes_count() -> Result<()> {
     agrees_with_the_nodes(Middleware::FastSampled)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
 fn messages_over_cyclone_dds_are_as_many_as_the_nodes_count() -> Result<()> {
     agrees_with_the_nodes(Middleware::Cyclone)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn messages_over_zenoh_are_as_many_as_the_nodes_count() -> Result<()> {
     agrees_with_the_nodes(Middleware::Zenoh)
 }
@@ -85,7 +85,7 @@ fn agrees_with_the_nodes(middleware: Middleware) -> Result<()> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp, intra_process_demo: make test-ros2"]
 fn receptions_within_a_process_are_as_many_as_the_demo_prints() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::FastSampled)?;
@@ -116,7 +116,7 @@ fn receptions_within_a_process_are_as_many_as_the_demo_prints() -> Result<()> {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp, demo_nodes_cpp: make test-ros2"]
 fn callbacks_have_their_timer_s_period_and_their_node() -> Result<()> {
     let network = Namespace::alone()?;
     let host = Host::new(&network, Middleware::Cyclone)?;

@@ -15,7 +15,7 @@ const TOPIC: &str = "/imu";
 const RATE: [&str; 4] = ["200", "300", "2000", "BEST_EFFORT"];
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp, rmw_cyclonedds_cpp: make test-ros2"]
 fn nodes_of_dds_and_zenoh_are_in_one_graph_and_nothing_is_mixed_up() -> Result<()> {
     let network = Namespace::alone()?;
     let zenoh = Host::new(&network, Middleware::Zenoh)?;

@@ -1,7 +1,7 @@
-//! Real services and an action of ROS 2 Humble: the agent's times agree with the logs of both ends, a
+//! Real services and an action of ROS 2: the agent's times agree with the logs of both ends, a
 //! hanging call is found, and a lost reply is no answer.
 //!
-//! Needs root and ROS 2 Humble: `make test-ros2`.
+//! Needs root and ROS 2: `make test-ros2`.
 
 use std::fs;
 use std::time::Duration;
@@ -49,31 +49,31 @@ struct Answered {
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_cyclonedds_cpp: make test-ros2"]
 fn calls_over_cyclone_dds_take_as_long_as_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::Cyclone)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn calls_over_fast_dds_and_udp_take_as_long_as_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::FastUdp)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn calls_over_shared_memory_with_the_uprobe_take_as_long_as_the_client_logs() -> Result<()> {
     agrees_with_the_client(EXACT)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_zenoh_cpp: make test-ros2"]
 fn calls_over_zenoh_take_as_long_as_the_client_logs() -> Result<()> {
     agrees_with_the_client(Middleware::Zenoh)
 }
 
 #[test]
-#[ignore = "needs ROS 2 Humble: make test-ros2"]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
 fn calls_over_sampled_shared_memory_are_reported_as_not_seen() -> Result<()> {
     let network = Namespace::alone()?;
     let robot = Robot::start(&network, Middleware::FastSampled)?;

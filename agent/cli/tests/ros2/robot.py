@@ -1,7 +1,7 @@
-"""Two nodes of a robot with six topics, each in a process of its own, and what they log.
+"""Two nodes of a robot with seven topics, each in a process of its own, and what they log.
 
-    robot.py publish LOG     announces its topics, publishes when a line comes on standard input
-    robot.py subscribe LOG   receives them
+    robot.py publish LOG [SECONDS]   announces its topics, publishes when a line comes on standard input
+    robot.py subscribe LOG           receives them
 
 Both print `ready`, `matched` and, when all is published, `done`. A log has one line of JSON for each
 message: its topic, the number that its publisher gave it (from 0, one below the sequence number of
@@ -24,9 +24,8 @@ from sensor_msgs.msg import Image, Imu, PointCloud2
 from std_msgs.msg import Header, Int64
 from tf2_msgs.msg import TFMessage
 
-SECONDS = 10
 # All of the fastest topic: Fast DDS repairs after up to 3 s, and what is overwritten by then is lost.
-DEPTH = 2000
+DEPTH = 2500
 # Zenoh drops messages of a congested connection, unless the publisher keeps all.
 IS_ZENOH = os.environ["RMW_IMPLEMENTATION"] == "rmw_zenoh_cpp"
 HISTORY = HistoryPolicy.KEEP_ALL if IS_ZENOH else HistoryPolicy.KEEP_LAST
@@ -42,7 +41,8 @@ def header():
 # Name: type, rate in hertz, message.
 TOPICS = {
     "/beat": (Int64, 1, Int64()),
-    "/imu": (Imu, 200, Imu(header=header())),
+    "/mode": (Int64, 0.02, Int64()),
+    "/imu": (Imu, 250, Imu(header=header())),
     "/tf": (TFMessage, 100, TFMessage(transforms=[TransformStamped(header=header())])),
     "/odom": (Odometry, 50, Odometry(header=header())),
     "/cam": (Image, 10, Image(header=header(), data=bytes(150_000))),
@@ -98,7 +98,7 @@ def spin(node):
         pass
 
 
-def publish(log):
+def publish(log, seconds=10):
     node = rclpy.create_node("driver")
     publishers = {
         name: (node.create_publisher(kind, name, QOS), Template(kind, message))
@@ -120,7 +120,7 @@ def publish(log):
         publisher.publish(template.numbered(number))
         log.write(name, number)
         rate = TOPICS[name][1]
-        if number + 1 < SECONDS * rate:
+        if number + 1 < int(seconds) * rate:
             heapq.heappush(due, (start + (number + 1) / rate, name, number + 1))
     say("done")
     sys.stdin.readline()
@@ -141,4 +141,4 @@ def subscribe(log):
 
 if __name__ == "__main__":
     rclpy.init()
-    {"publish": publish, "subscribe": subscribe}[sys.argv[1]](Log(sys.argv[2]))
+    {"publish": publish, "subscribe": subscribe}[sys.argv[1]](Log(sys.argv[2]), *sys.argv[3:])
