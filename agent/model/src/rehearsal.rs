@@ -42,13 +42,16 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
     let mut judgement = Judgement::default();
     let mut violated = Vec::new();
     let first = seconds.iter().position(|second| second.messages > 0);
-    let mut since = 0;
-    let mut published = false;
+    let (mut since, mut observed) = (0, 0);
+    let (mut published, mut subscribed) = (false, false);
     for (place, second) in seconds.iter().enumerate() {
         if !published && second.publishers > 0 {
-            since = place;
+            (since, observed) = (place, place);
         }
-        published = second.publishers > 0;
+        if !subscribed && second.subscriptions > 0 {
+            observed = place;
+        }
+        (published, subscribed) = (second.publishers > 0, second.subscriptions > 0);
         // The second of the first message is incomplete, as in `rate::Window`.
         let begin = first.map_or(place, |first| (first + 1).min(place + 1));
         let recent = |length: u64| recent(seconds, begin, place + 1, length);
@@ -61,6 +64,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 subscriptions: second.subscriptions.into(),
                 last_message: second.silence.map(|silence| now - duration(silence)),
                 since: instant(since),
+                observed: instant(observed),
                 recent: &recent,
             },
         );
