@@ -2,8 +2,9 @@
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
 //! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
-//! window of at least three expected messages (1 to 10 s). One message of tolerance at the window's
-//! edges keeps a healthy periodic topic stable. Silence has its own time and no hysteresis.
+//! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
+//! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
+//! its own time and no hysteresis.
 //!
 //! Windows and silence begin when the agent can see the messages, at the earliest: after its own
 //! start, the first publisher or subscriber, and a time in which the source saw nothing. A topic

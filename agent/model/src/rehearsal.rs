@@ -11,6 +11,7 @@ use crate::rate::Slot;
 use crate::watch::Expectations;
 
 pub use crate::expectation::{GRACE, window};
+pub use crate::rate::SECONDS;
 
 /// Time at which a rehearsal begins; any time that leaves room for a silence before it.
 const BEGIN: u64 = 1_000_000;
@@ -138,6 +139,23 @@ mod tests {
         assert!(violations(&expecting(), &seconds).is_empty());
         seconds[31].messages = 3;
         assert_eq!(violations(&expecting(), &seconds), ["min_rate_hz"]);
+    }
+
+    #[test]
+    fn a_window_finds_half_a_rate_that_varies_in_single_seconds() {
+        // 40 Hz on a busy robot, in pairs of slow seconds.
+        let busy = |part: u32| -> Vec<Second> {
+            let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
+            counts.take(80).map(|count| steady(count / part)).collect()
+        };
+        let expecting = |window_s| Expectations {
+            min_rate_hz: Some(30.0),
+            window_s,
+            ..Expectations::default()
+        };
+        assert_eq!(violations(&expecting(None), &busy(1)), ["min_rate_hz"]);
+        assert!(violations(&expecting(Some(5)), &busy(1)).is_empty());
+        assert_eq!(violations(&expecting(Some(5)), &busy(2)), ["min_rate_hz"]);
     }
 
     #[test]
