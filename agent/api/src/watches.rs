@@ -75,6 +75,11 @@ pub struct Expectations {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub max_rate_hz: Option<f64>,
+    /// Window of both rates, in seconds. Without it, the agent chooses one from 1 to 10 s in which
+    /// three messages are due.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
+    pub window_s: Option<u32>,
     /// Largest share of lost messages, from 0 to 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]
@@ -184,6 +189,10 @@ pub struct WatchRequest {
     /// Largest rate, in messages per second.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1_000_000))]
     pub max_rate_hz: Option<f64>,
+    /// Window of both rates, in seconds. Without it, the agent chooses one from 1 to 10 s in which
+    /// three messages are due.
+    #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 10))]
+    pub window_s: Option<u32>,
     /// Largest share of lost messages, from 0 to 1.
     #[cfg_attr(feature = "openapi", schema(minimum = 0, maximum = 1))]
     pub max_loss_ratio: Option<f64>,

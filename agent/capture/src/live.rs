@@ -101,6 +101,8 @@ pub struct LiveSource {
     wanted_waits: bool,
     /// When the programs' times of participants were last read for a lease.
     heard: u64,
+    /// How often the host hook had been attached to a recreated control group.
+    attached_anew: u64,
     refused_updates: u64,
     clock: Timestamp,
     clocks: Clocks,
@@ -181,6 +183,7 @@ impl LiveSource {
             wanted_asked: 0,
             wanted_waits: false,
             heard: 0,
+            attached_anew: 0,
             refused_updates: 0,
             clock: clocks.now,
             clocks,
@@ -325,6 +328,7 @@ impl LiveSource {
         }
         self.apply_wanted(clocks.monotonic, observer);
         self.clock = Timestamp(clocks.now.0.saturating_sub(settle));
+        self.report_view(held_up, observer);
         // Any message renews a lease. If this process did not read for long, its rings may have
         // been too small for the announcements.
         let clock = self.clock;
@@ -337,6 +341,21 @@ impl LiveSource {
             }
         }
         Ok(())
+    }
+
+    /// Reports that the traffic is seen from now on, after a time in which it was not, or not all:
+    /// this process or the machine was stopped, or the control group was removed.
+    fn report_view(&mut self, held_up: bool, observer: &mut Observer) {
+        let attached_anew = self.attached_anew();
+        let is_new = std::mem::replace(&mut self.attached_anew, attached_anew) != attached_anew;
+        let sees_nothing = self.wires.is_empty()
+            && self
+                .host
+                .as_ref()
+                .is_some_and(|host| host.detached().is_some());
+        if held_up || is_new || sees_nothing {
+            observer.input(Input::ViewBegan(self.clock));
+        }
     }
 
     /// Passes the model's requests for shared memory to its readers, ten times a second.

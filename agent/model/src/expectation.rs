@@ -2,8 +2,13 @@
 //!
 //! Evaluation takes place once per second of the source's clock. A topic becomes violated after
 //! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
-//! window of at least three expected messages (1 to 10 s). One message of tolerance at the window's
-//! edges keeps a healthy periodic topic stable. Silence has its own time and no hysteresis.
+//! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
+//! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
+//! its own time and no hysteresis.
+//!
+//! Windows and silence begin when the agent can see the messages, at the earliest: after its own
+//! start, the first publisher or subscriber, and a time in which the source saw nothing. A topic
+//! that was silent before such a time stays silent until its next message.
 //!
 //! Numbers of publishers and subscribers are evaluated from `GRACE` after the topic has its first
 //! publisher on, because a robot needs time to start. A writer without a reader mostly sends
@@ -13,6 +18,7 @@
 use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 use super::rate::{SECONDS, Slot};
 use crate::watch::Expectations;
@@ -68,6 +74,8 @@ pub struct Evidence<'a> {
     pub last_message: Option<Timestamp>,
     /// Time since which the topic has a writer and is watched.
     pub since: Timestamp,
+    /// Time since which messages are expected and would be seen; at least `since`.
+    pub observed: Timestamp,
     /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
 }
@@ -82,6 +90,14 @@ pub struct Judgement {
     broken: u8,
     bad: u8,
     good: u8,
+}
+
+impl Evidence<'_> {
+    /// Returns the number of whole seconds in which messages would have been seen.
+    fn observed_seconds(&self) -> u64 {
+        let first = self.observed.0.div_ceil(SECOND);
+        self.now.whole_seconds().saturating_sub(first)
+    }
 }
 
 impl WatchState {
@@ -145,7 +161,8 @@ impl Judgement {
         evidence: &Evidence<'_>,
     ) -> Option<Option<WatchState>> {
         let before = (!self.fresh).then_some(self.state);
-        let broken = broken(expectations, evidence);
+        let is_silent = self.state == WatchState::Silent;
+        let broken = broken(expectations, evidence, is_silent);
         let quiet = broken & MAX_SILENCE != 0 || evidence.last_message.is_none();
         let broken = without_consequences(broken, quiet, evidence);
         let silent = broken & MAX_SILENCE != 0;
@@ -188,16 +205,22 @@ impl Judgement {
     clippy::cast_precision_loss,
     reason = "counts of ten seconds are far below 2^52"
 )]
-fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
+fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool) -> u8 {
     let mut broken = 0;
+    let rates = |rate: f64| {
+        let window = expectations
+            .window_s
+            .map_or_else(|| window(rate), u64::from);
+        (evidence.recent)(window.min(evidence.observed_seconds()))
+    };
     if let Some(minimum) = expectations.min_rate_hz {
-        let (slot, seconds) = (evidence.recent)(window(minimum));
+        let (slot, seconds) = rates(minimum);
         if seconds > 0 && (slot.messages + 1) as f64 <= minimum * seconds as f64 {
             broken |= MIN_RATE;
         }
     }
     if let Some(maximum) = expectations.max_rate_hz {
-        let (slot, seconds) = (evidence.recent)(window(maximum));
+        let (slot, seconds) = rates(maximum);
         if seconds > 0 && slot.messages as f64 >= maximum * seconds as f64 + 1.0 {
             broken |= MAX_RATE;
         }
@@ -216,10 +239,12 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
         }
     }
     if let Some(maximum) = expectations.max_silence {
-        let last = evidence
-            .last_message
-            .map_or(evidence.since, |last| last.max(evidence.since));
-        if evidence.now - last > maximum {
+        let last = evidence.last_message.unwrap_or_default();
+        let begin = match is_silent {
+            true => last,
+            false => last.max(evidence.observed),
+        };
+        if evidence.now - begin > maximum {
             broken |= MAX_SILENCE;
         }
     }
@@ -259,7 +284,6 @@ pub fn window(rate: f64) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ros2probe_wire::time::SECOND;
 
     struct Bench {
         judgement: Judgement,
@@ -268,6 +292,7 @@ mod tests {
         last_message: Option<Timestamp>,
         subscriptions: usize,
         publishers: usize,
+        observed: Timestamp,
     }
 
     impl Bench {
@@ -279,6 +304,7 @@ mod tests {
                 last_message: None,
                 subscriptions: 1,
                 publishers: 1,
+                observed: Timestamp(1000 * SECOND),
             }
         }
 
@@ -301,6 +327,7 @@ mod tests {
                     subscriptions: self.subscriptions,
                     last_message: self.last_message,
                     since: Timestamp(1000 * SECOND),
+                    observed: self.observed,
                     recent: &recent,
                 },
             );
@@ -379,6 +406,40 @@ mod tests {
             .into();
         let (ok, silent) = (WatchState::Ok, WatchState::Silent);
         assert_eq!(states, [ok, ok, silent, ok]);
+    }
+
+    #[test]
+    fn silence_counts_from_the_time_at_which_the_agent_sees_again() {
+        let expectations = Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        };
+        let mut bench = Bench::new(expectations);
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(bench.second(rate(5)), ok);
+        // Five seconds are not seen.
+        bench.now += 5 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        assert_eq!(states, [ok, ok, silent]);
+        // What was silent before stays silent.
+        bench.now += 5 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        assert_eq!([0, 1].map(|count| bench.second(rate(count))), [silent, ok]);
+    }
+
+    #[test]
+    fn a_rate_counts_from_the_time_at_which_the_agent_sees_again() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(0.5),
+            ..Expectations::default()
+        });
+        // Messages of the window before the view began are unknown.
+        bench.now += 20 * SECOND;
+        bench.observed = Timestamp(bench.now);
+        let states = [(); 7].map(|()| bench.second(rate(0)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, ok, bad, bad, bad, bad, bad]);
     }
 
     #[test]

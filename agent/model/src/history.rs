@@ -11,7 +11,7 @@ use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::histogram::Histogram;
-use super::measurement::Measurement;
+use super::measurement::{EarlierCounts, Measurement};
 use super::names::DdsName;
 use super::rate::SECONDS as WINDOW;
 use super::size::Size;
@@ -97,6 +97,8 @@ struct PreviousTotals {
     messages: u64,
     bytes: u64,
     lost: u64,
+    /// Parts of them that belong to earlier seconds.
+    earlier: EarlierCounts,
     latency: Histogram,
     interarrival: Histogram,
 }
@@ -244,6 +246,7 @@ impl History {
             messages: counted.messages,
             bytes: counted.bytes,
             lost: counted.lost,
+            earlier: counted.earlier,
             latency: counted.source_latency,
             interarrival: counted.interarrival,
         };
@@ -251,6 +254,7 @@ impl History {
             messages: 0,
             bytes: 0,
             lost: 0,
+            earlier: EarlierCounts::default(),
             latency: Histogram::default(),
             interarrival: Histogram::default(),
         };
@@ -391,10 +395,14 @@ impl Names {
 
 impl PreviousTotals {
     /// Returns the counts between `before` and this state. A count that decreased belongs to a
-    /// topic that was removed in between, so all of it is new.
+    /// topic that was removed in between, so all of it is new. What belongs to earlier seconds is
+    /// left out.
     fn since(&self, topic: u32, before: &Self) -> Row {
         let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
-        let count = |now, before| u32::try_from(more(now, before)).unwrap_or(u32::MAX);
+        let fresh = |all: (u64, u64), earlier: (u64, u64)| {
+            more(all.0, all.1).saturating_sub(more(earlier.0, earlier.1))
+        };
+        let count = |all, earlier| u32::try_from(fresh(all, earlier)).unwrap_or(u32::MAX);
         let percentiles = |now: &Histogram, before: &Histogram| {
             let difference = now.since(before);
             let Some((minimum, maximum)) = now.range().filter(|_| difference.count() > 0) else {
@@ -406,11 +414,20 @@ impl PreviousTotals {
             clippy::cast_precision_loss,
             reason = "bytes of one second, for a chart"
         )]
-        let bytes = more(self.bytes, before.bytes) as f32;
+        let bytes = fresh(
+            (self.bytes, before.bytes),
+            (self.earlier.bytes, before.earlier.bytes),
+        ) as f32;
         Row {
             topic,
-            messages: count(self.messages, before.messages),
-            lost: count(self.lost, before.lost),
+            messages: count(
+                (self.messages, before.messages),
+                (self.earlier.messages, before.earlier.messages),
+            ),
+            lost: count(
+                (self.lost, before.lost),
+                (self.earlier.lost, before.earlier.lost),
+            ),
             bytes,
             latency: percentiles(&self.latency, &before.latency),
             interarrival: percentiles(&self.interarrival, &before.interarrival),
@@ -487,6 +504,33 @@ mod tests {
         assert_eq!(seen[2].1.unwrap().rate_hz, Some(5.0));
         assert_eq!(seen[2].1.unwrap().bandwidth, Some(500.0));
         assert!(past.topic(DomainId(1), "rt/points").is_none());
+    }
+
+    #[test]
+    fn what_was_sent_before_a_late_announcement_flattens_no_chart() {
+        let (mut history, points) = (
+            History::new(Duration::from_secs(600), 10),
+            name("rt/points"),
+        );
+        take(&mut history, 100, &[(&points, counted(0, 0, &[]))]);
+        // A writer is announced that has sent 702 messages.
+        let promoted = |messages: u64| Measurement {
+            earlier: EarlierCounts {
+                messages: 702,
+                bytes: 70_200,
+                lost: 4,
+            },
+            ..counted(702 + messages, 4, &[])
+        };
+        take(&mut history, 101, &[(&points, promoted(25))]);
+        take(&mut history, 102, &[(&points, promoted(75))]);
+        let past = history.past();
+        let seen = past.topic(DomainId(0), "rt/points").unwrap();
+        let seen: Vec<_> = seen.map(|(_, reading)| reading.unwrap()).collect();
+        let rows = seen.iter().map(|it| (it.row.messages, it.row.lost));
+        assert_eq!(rows.collect::<Vec<_>>(), [(0, 0), (25, 0), (50, 0)]);
+        assert_eq!(seen[2].row.bytes, 5000.0);
+        assert_eq!(seen[2].rate_hz, Some(37.5));
     }
 
     #[test]

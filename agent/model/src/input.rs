@@ -27,6 +27,8 @@ pub enum Input<'a> {
     /// The wall clock was set forward by this many nanoseconds (backward if negative), without
     /// elapsed time.
     ClockSet(i64),
+    /// The source sees the traffic from this time on. It saw none, or not all, for a time before.
+    ViewBegan(Timestamp),
     /// A datagram that was captured in full.
     Datagram {
         /// Its addresses and time.

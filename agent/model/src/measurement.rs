@@ -43,9 +43,24 @@ pub struct Measurement {
     pub implausible_latency: u64,
     /// Jumps of the sequence number that a single record suggests but does not prove.
     pub sequence_jumps: u64,
+    /// Part of `messages`, `bytes` and `lost` that belongs to an earlier time than the second in which
+    /// it was added: figures per second leave it out.
+    pub earlier: EarlierCounts,
     /// Present if some samples were read from shared memory. Messages are then counted by the span
     /// of their numbers, and times are those of the samples that were read.
     pub sampled: Option<SampledFacts>,
+}
+
+/// Counts that were added late: those from before a writer's announcement, and samples in shared
+/// memory that were sent while it was not polled.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct EarlierCounts {
+    /// Messages.
+    pub messages: u64,
+    /// Their payload bytes.
+    pub bytes: u64,
+    /// Samples settled as lost.
+    pub lost: u64,
 }
 
 /// Coverage of shared-memory sampling.
@@ -126,6 +141,9 @@ impl Measurement {
         self.negative_latency += other.negative_latency;
         self.implausible_latency += other.implausible_latency;
         self.sequence_jumps += other.sequence_jumps;
+        self.earlier.messages += other.earlier.messages;
+        self.earlier.bytes += other.earlier.bytes;
+        self.earlier.lost += other.earlier.lost;
         if let Some(other) = &other.sampled {
             let sampled = self.sampled.get_or_insert_default();
             sampled.seen += other.seen;

@@ -119,6 +119,8 @@ pub struct Observer {
     journal: Journal,
     /// Time up to which all decisions are made.
     clock: Timestamp,
+    /// Time from which on the source sees the traffic; silence before it is unknown.
+    view_began: Timestamp,
     wall_clock: WallClock,
 }
 
@@ -160,6 +162,7 @@ impl Observer {
             records: 0,
             journal: Journal::default(),
             clock: Timestamp(0),
+            view_began: Timestamp(0),
             wall_clock: WallClock::default(),
         }
     }
@@ -169,6 +172,7 @@ impl Observer {
         match input {
             Input::Time(now) => self.advance(now),
             Input::ClockSet(step) => self.wall_clock.set(step),
+            Input::ViewBegan(at) => self.view_began = self.wall_clock.model_time(at),
             Input::Datagram {
                 envelope,
                 payload,
@@ -272,6 +276,7 @@ impl Observer {
             records: _,
             journal,
             clock: _,
+            view_began: _,
             wall_clock: _,
         } = self;
         let mut sizes = discovery.sizes();
@@ -337,6 +342,8 @@ impl Observer {
 
     /// Restores saved state, valid for at most one lease from `now` on.
     fn restore(&mut self, memory: &Memory, now: Timestamp) {
+        // Watches that are applied next begin at this time.
+        self.advance(now);
         let captured = now;
         let now = self.wall_clock.model_time(now);
         self.discovery.restore(memory, now);

@@ -372,6 +372,7 @@ impl Profiler {
             known.opened = opened;
             if known.topic.is_none() {
                 known.opened = opened.max(now);
+                known.writer.begin_window(now);
                 // The other budget accounts for its unfinished samples from now on.
                 known.writer.transfer(
                     &mut self.shared.unknown_writers_budget,

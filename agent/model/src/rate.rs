@@ -4,6 +4,7 @@
 //! its start. Exact counters are elsewhere; this module forgets after [`SECONDS`].
 
 use ros2probe_wire::Timestamp;
+use ros2probe_wire::time::SECOND;
 
 /// Length of the window in seconds, one slot each.
 pub const SECONDS: u64 = 10;
@@ -34,7 +35,39 @@ pub struct Slot {
     pub delay: f64,
 }
 
+/// Numbers of messages and of their bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sum {
+    /// Messages.
+    pub messages: u64,
+    /// Payload bytes.
+    pub bytes: u64,
+}
+
+impl Sum {
+    /// Returns the part that is sent from `since` to `until`, if all is sent evenly until `now`.
+    fn part(self, since: Timestamp, until: Timestamp, now: Timestamp) -> Self {
+        let span = u128::from(now.0.saturating_sub(since.0));
+        let elapsed = u128::from(until.0.saturating_sub(since.0)).min(span);
+        let share = |count: u64, part: u128, whole: u128| {
+            let part = (u128::from(count) * part).checked_div(whole);
+            part.map_or(0, |part| u64::try_from(part).unwrap_or(count))
+        };
+        let messages = share(self.messages, elapsed, span);
+        Self {
+            messages,
+            bytes: share(self.bytes, messages.into(), self.messages.into()),
+        }
+    }
+}
+
 impl Slot {
+    /// Adds what was sent until now, except what is counted already.
+    const fn send(&mut self, sent: Sum, counted: Sum) {
+        self.messages += sent.messages - counted.messages;
+        self.bytes = self.bytes.saturating_add(sent.bytes - counted.bytes);
+    }
+
     /// Adds all of `other`.
     pub fn add(&mut self, other: &Self) {
         self.messages += other.messages;
@@ -46,14 +79,46 @@ impl Slot {
 }
 
 impl Window {
-    /// Returns the counts of the second that contains `now`.
-    pub fn current(&mut self, now: Timestamp) -> &mut Slot {
-        self.turn(now);
-        let slot = usize::try_from(self.second % SLOTS as u64).unwrap_or(0);
+    /// Returns the counts of the second that contains `at`, or of the oldest second if `at` is
+    /// earlier.
+    pub fn second(&mut self, at: Timestamp) -> &mut Slot {
+        self.turn(at);
+        let oldest = self.second.saturating_sub(SECONDS);
+        let second = at.whole_seconds().clamp(oldest, self.second);
+        let slot = usize::try_from(second % SLOTS as u64).unwrap_or(0);
         // The modulus keeps the index in range; the alternative only satisfies the compiler.
         let slot = if slot < SLOTS { slot } else { 0 };
         #[expect(clippy::indexing_slicing, reason = "slot < SLOTS was just established")]
         &mut self.slots[slot]
+    }
+
+    /// Begins to count at `now`: what was counted before contributes to no rate.
+    pub fn begin(&mut self, now: Timestamp) {
+        *self = Self::default();
+        self.turn(now);
+    }
+
+    /// Adds what was sent evenly after `since`, the last message at `now`. Returns the part that
+    /// belongs to seconds before the last one.
+    pub fn spread(&mut self, sent: Sum, since: Timestamp, now: Timestamp) -> Sum {
+        self.turn(now);
+        let current = now.whole_seconds();
+        let first = since.whole_seconds();
+        let first = first.max(current.saturating_sub(SECONDS)).min(current);
+        let mut counted = sent.part(since, Timestamp(first.saturating_mul(SECOND)), now);
+        let mut earlier = counted;
+        for second in first..current {
+            let end = Timestamp((second + 1).saturating_mul(SECOND));
+            let until = sent.part(since, end, now);
+            self.second(Timestamp(second.saturating_mul(SECOND)))
+                .send(until, counted);
+            counted = until;
+            if second + 1 < current {
+                earlier = until;
+            }
+        }
+        self.second(now).send(sent, counted);
+        earlier
     }
 
     /// Returns the sum over the last `seconds` whole seconds, and their number, which is lower if
@@ -104,14 +169,12 @@ impl Window {
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::time::SECOND;
-
     use super::*;
 
     fn fill(window: &mut Window, start_ms: u64, step_ms: u64, count: u64) -> Timestamp {
         let mut at = start_ms;
         for _ in 0..count {
-            let slot = window.current(Timestamp(at * 1_000_000));
+            let slot = window.second(Timestamp(at * 1_000_000));
             slot.messages += 1;
             slot.bytes += 100;
             at += step_ms;
@@ -136,6 +199,63 @@ mod tests {
     }
 
     #[test]
+    fn what_comes_late_counts_in_the_second_of_its_time() {
+        let mut window = Window::default();
+        let now = fill(&mut window, 100_000, 100, 50);
+        for late in [102_500, 102_600, 50_000] {
+            window.second(Timestamp(late * 1_000_000)).messages += 1;
+        }
+        let (sum, seconds) = window.sum(now, 2);
+        assert_eq!((sum.messages, seconds), (20, 2));
+        let (sum, seconds) = window.sum(now, 3);
+        assert_eq!((sum.messages, seconds), (32, 3));
+    }
+
+    #[test]
+    fn messages_of_a_long_time_are_no_spike_in_one_second() {
+        let mut window = Window::default();
+        let at = |milliseconds: u64| Timestamp(milliseconds * 1_000_000);
+        window.second(at(100_000)).messages += 1;
+        // 50 Hz, of which nothing is seen for 14 s.
+        let sent = |messages| Sum {
+            messages,
+            bytes: 100 * messages,
+        };
+        let earlier = window.spread(sent(702), at(100_000), at(114_040));
+        let (sum, seconds) = window.sum(at(115_000), SECONDS);
+        assert!((451..=453).contains(&sum.messages), "{sum:?}");
+        assert!(sum.bytes.abs_diff(100 * sum.messages) <= 100, "{sum:?}");
+        assert_eq!(seconds, SECONDS);
+        assert!((649..=651).contains(&earlier.messages), "{earlier:?}");
+        // All of it is counted once.
+        let (last, _) = window.sum(at(115_000), 2);
+        assert_eq!(earlier.messages + last.messages, 702);
+        // The first message of a writer.
+        let mut first = Window::default();
+        assert_eq!(
+            first.spread(sent(1), Timestamp(0), at(114_040)),
+            Sum::default()
+        );
+        assert_eq!(first.sum(at(116_000), SECONDS), (Slot::default(), 1));
+        for (since, now) in [(114_040, 114_060), (114_060, 114_060), (114_080, 114_060)] {
+            let earlier = window.spread(sent(3), at(since), at(now));
+            assert_eq!(earlier, Sum::default());
+        }
+        assert_eq!(window.sum(at(115_000), 2).0.messages, last.messages + 9);
+    }
+
+    #[test]
+    fn a_window_that_begins_anew_forgets_what_was_counted() {
+        let mut window = Window::default();
+        let now = fill(&mut window, 100_000, 10, 1000);
+        window.begin(now);
+        assert_eq!(window.sum(Timestamp(now.0 + SECOND), SECONDS).1, 0);
+        let later = fill(&mut window, 110_000, 20, 150);
+        let (sum, seconds) = window.sum(later, SECONDS);
+        assert_eq!((sum.messages, seconds), (100, 2));
+    }
+
+    #[test]
     fn silence_empties_the_window() {
         let mut window = Window::default();
         let now = fill(&mut window, 100_000, 10, 1000);
@@ -149,7 +269,7 @@ mod tests {
                 .messages,
             0
         );
-        window.current(Timestamp(now.0 + 30 * SECOND)).messages += 1;
+        window.second(Timestamp(now.0 + 30 * SECOND)).messages += 1;
         assert_eq!(
             window
                 .sum(Timestamp(now.0 + 31 * SECOND), SECONDS)

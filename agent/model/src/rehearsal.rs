@@ -11,6 +11,7 @@ use crate::rate::Slot;
 use crate::watch::Expectations;
 
 pub use crate::expectation::{GRACE, window};
+pub use crate::rate::SECONDS;
 
 /// Time at which a rehearsal begins; any time that leaves room for a silence before it.
 const BEGIN: u64 = 1_000_000;
@@ -42,13 +43,16 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
     let mut judgement = Judgement::default();
     let mut violated = Vec::new();
     let first = seconds.iter().position(|second| second.messages > 0);
-    let mut since = 0;
-    let mut published = false;
+    let (mut since, mut observed) = (0, 0);
+    let (mut published, mut subscribed) = (false, false);
     for (place, second) in seconds.iter().enumerate() {
         if !published && second.publishers > 0 {
-            since = place;
+            (since, observed) = (place, place);
         }
-        published = second.publishers > 0;
+        if !subscribed && second.subscriptions > 0 {
+            observed = place;
+        }
+        (published, subscribed) = (second.publishers > 0, second.subscriptions > 0);
         // The second of the first message is incomplete, as in `rate::Window`.
         let begin = first.map_or(place, |first| (first + 1).min(place + 1));
         let recent = |length: u64| recent(seconds, begin, place + 1, length);
@@ -61,6 +65,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 subscriptions: second.subscriptions.into(),
                 last_message: second.silence.map(|silence| now - duration(silence)),
                 since: instant(since),
+                observed: instant(observed),
                 recent: &recent,
             },
         );
@@ -134,6 +139,23 @@ mod tests {
         assert!(violations(&expecting(), &seconds).is_empty());
         seconds[31].messages = 3;
         assert_eq!(violations(&expecting(), &seconds), ["min_rate_hz"]);
+    }
+
+    #[test]
+    fn a_window_finds_half_a_rate_that_varies_in_single_seconds() {
+        // 40 Hz on a busy robot, in pairs of slow seconds.
+        let busy = |part: u32| -> Vec<Second> {
+            let counts = [24, 26, 46, 44, 46, 46, 40, 48].into_iter().cycle();
+            counts.take(80).map(|count| steady(count / part)).collect()
+        };
+        let expecting = |window_s| Expectations {
+            min_rate_hz: Some(30.0),
+            window_s,
+            ..Expectations::default()
+        };
+        assert_eq!(violations(&expecting(None), &busy(1)), ["min_rate_hz"]);
+        assert!(violations(&expecting(Some(5)), &busy(1)).is_empty());
+        assert_eq!(violations(&expecting(Some(5)), &busy(2)), ["min_rate_hz"]);
     }
 
     #[test]

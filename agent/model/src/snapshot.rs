@@ -20,7 +20,7 @@ use super::discovery::Addresses;
 pub use super::expectation::WatchState;
 use super::inside::facts::{InsideFacts, TopicInside};
 pub use super::inside::source::Source;
-pub use super::measurement::{Breakdown, Delivered, Measurement, SampledFacts};
+pub use super::measurement::{Breakdown, Delivered, EarlierCounts, Measurement, SampledFacts};
 use super::names::{DdsName, NodeName, TopicName, TypeName};
 pub use super::route::Direction;
 pub use super::sockets::SocketFacts;

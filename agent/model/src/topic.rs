@@ -61,6 +61,8 @@ pub struct Topic {
     pub retired_totals: Option<Box<Totals>>,
     /// Time at which a reader last appeared.
     pub reader_appeared: Timestamp,
+    /// Time at which its first reader appeared, since it last had none.
+    pub subscribed: Timestamp,
     /// Time since which it is both published and watched.
     pub published: Timestamp,
     /// Time at which its last endpoint vanished.
@@ -178,6 +180,7 @@ impl Topics {
                 retired: _,
                 retired_totals: _,
                 reader_appeared: _,
+                subscribed: _,
                 published: _,
                 vanished: _,
                 is_held: _,
@@ -247,7 +250,12 @@ impl Topics {
             match role {
                 Role::Writer if topic.writers.len() == 1 => topic.published = now,
                 Role::Writer => {}
-                Role::Reader => topic.reader_appeared = now,
+                Role::Reader => {
+                    topic.reader_appeared = now;
+                    if topic.readers.len() == 1 && !naming.is_buffer {
+                        topic.subscribed = now;
+                    }
+                }
             }
         }
         (id, is_new)
@@ -449,6 +457,7 @@ impl Topics {
                 retired: None,
                 retired_totals: None,
                 reader_appeared: Timestamp(0),
+                subscribed: Timestamp(0),
                 published: Timestamp(0),
                 vanished: None,
                 is_held: false,

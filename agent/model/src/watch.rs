@@ -46,6 +46,8 @@ pub struct Expectations {
     pub min_rate_hz: Option<f64>,
     /// Largest rate, in messages per second.
     pub max_rate_hz: Option<f64>,
+    /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
+    pub window_s: Option<u32>,
     /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture.
@@ -65,6 +67,8 @@ pub struct ExpectationValues {
     pub min_rate_hz: Option<f64>,
     /// Largest rate, in messages per second.
     pub max_rate_hz: Option<f64>,
+    /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
+    pub window_s: Option<u32>,
     /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture, in milliseconds.
@@ -148,6 +152,7 @@ impl Expectations {
     /// Returns each key and whether it is set.
     #[must_use]
     pub const fn keys(&self) -> [(&'static str, bool); 7] {
+        // `window_s` belongs to the rates and expects nothing.
         [
             ("min_rate_hz", self.min_rate_hz.is_some()),
             ("max_rate_hz", self.max_rate_hz.is_some()),
@@ -170,6 +175,7 @@ impl Expectations {
         ExpectationValues {
             min_rate_hz: self.min_rate_hz,
             max_rate_hz: self.max_rate_hz,
+            window_s: self.window_s,
             max_loss_ratio: self.max_loss_ratio,
             max_latency_ms: self.max_latency.map(|latency| nanoseconds(latency) / 1e6),
             max_silence_s: self.max_silence.map(|silence| nanoseconds(silence) / 1e9),
@@ -187,6 +193,7 @@ impl TryFrom<ExpectationValues> for Expectations {
         let ExpectationValues {
             min_rate_hz,
             max_rate_hz,
+            window_s,
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
@@ -196,6 +203,7 @@ impl TryFrom<ExpectationValues> for Expectations {
         let values = [
             min_rate_hz,
             max_rate_hz,
+            window_s.map(f64::from),
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
@@ -216,9 +224,13 @@ impl TryFrom<ExpectationValues> for Expectations {
                 "max_rate_hz is {high}, below min_rate_hz, which is {low}"
             ));
         }
+        if window_s.is_some() && min_rate_hz.or(max_rate_hz).is_none() {
+            return Err(WINDOW_WITHOUT_RATE.to_owned());
+        }
         Ok(Self {
             min_rate_hz,
             max_rate_hz,
+            window_s,
             max_loss_ratio,
             max_latency: max_latency_ms.map(|value| Duration::from_secs_f64(value / 1e3)),
             max_silence: max_silence_s.map(Duration::from_secs_f64),
@@ -235,10 +247,15 @@ pub const MAX_GLOBS: usize = 256;
 /// Largest total length of the globs in a watchlist, in bytes.
 pub const MAX_GLOB_BYTES: usize = 16 << 10;
 
+/// Mistake of an entry with a window but no rate.
+pub const WINDOW_WITHOUT_RATE: &str = "window_s needs min_rate_hz or max_rate_hz";
+
 /// Valid ranges of expectations, as in the configuration's schema.
-const RANGES: [(&str, f64, f64); 7] = [
+const RANGES: [(&str, f64, f64); 8] = [
     ("min_rate_hz", 0.0, 1_000_000.0),
     ("max_rate_hz", 0.0, 1_000_000.0),
+    // The longest window is `rate::SECONDS`.
+    ("window_s", 1.0, 10.0),
     ("max_loss_ratio", 0.0, 1.0),
     ("max_latency_ms", 0.0, 3_600_000.0),
     ("max_silence_s", 0.001, 604_800.0),

@@ -17,7 +17,7 @@ use super::histogram::Histogram;
 use super::in_order::Progress;
 use super::journal::{Journal, Missing};
 use super::loss::Loss;
-use super::measurement::Measurement;
+use super::measurement::{EarlierCounts, Measurement};
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception};
 use super::sampled::Sampled;
@@ -111,6 +111,7 @@ struct Tally {
     duplicates: u64,
     incomplete: u64,
     irrelevant: u64,
+    earlier: EarlierCounts,
     window: Window,
 }
 
@@ -158,6 +159,18 @@ impl Writer {
     /// Updates the properties from discovery.
     pub const fn learn(&mut self, traits: Traits) {
         self.traits = traits;
+    }
+
+    /// Begins the figures per second at `now`, when the kernel captures all samples of the writer.
+    /// What was counted before stays in the totals.
+    pub fn begin_window(&mut self, now: Timestamp) {
+        let tally = &mut self.tally;
+        tally.earlier = EarlierCounts {
+            messages: tally.messages,
+            bytes: tally.bytes,
+            lost: tally.lost,
+        };
+        tally.window.begin(now);
     }
 
     /// Moves the memory of unfinished samples from one budget to another.
@@ -406,6 +419,7 @@ impl Writer {
             negative_latency: self.negative_latency,
             implausible_latency: self.implausible_latency,
             sequence_jumps: self.reception.sequence().jumps(),
+            earlier: self.tally.earlier,
             sampled: self.sampled.as_ref().map(|sampled| sampled.facts()),
         }
     }
@@ -494,7 +508,7 @@ impl Writer {
         self.tally.messages += 1;
         self.tally.bytes += bytes;
         self.tally.recovered += u64::from(recovered);
-        let slot = self.tally.window.current(now);
+        let slot = self.tally.window.second(now);
         slot.messages += 1;
         slot.bytes += bytes;
         if let Some(previous) = self.last_message {
@@ -546,7 +560,7 @@ impl Settling<'_> {
         });
         let count = last - first + 1;
         self.tally.lost += count;
-        self.tally.window.current(self.at).lost += count;
+        self.tally.window.second(self.at).lost += count;
         self.journal.lose(Loss {
             at: self.at,
             writer: self.writer,

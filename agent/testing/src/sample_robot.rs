@@ -21,10 +21,10 @@ use ros2probe_model::histogram::Histogram;
 use ros2probe_model::services::latency::Latencies;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
-    DeliveryFacts, Direction, EndpointFacts, GoalCounts, LatencyFacts, Measurement, NodeFacts,
-    ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts, Source,
-    Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts, WatchFacts,
-    WatchState, WatchedTopicFacts,
+    DeliveryFacts, Direction, EarlierCounts, EndpointFacts, GoalCounts, LatencyFacts, Measurement,
+    NodeFacts, ParticipantFacts, ProcessFacts, SampledFacts, ServiceFacts, Snapshot, SocketFacts,
+    Source, Subscriber, TableFacts, TopicFacts, Transport, TransportCount, UnknownWriterFacts,
+    WatchFacts, WatchState, WatchedTopicFacts,
 };
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_model::watch::Watch;
@@ -500,6 +500,7 @@ fn measurement() -> Measurement {
         negative_latency: 0,
         implausible_latency: 0,
         sequence_jumps: 0,
+        earlier: EarlierCounts::default(),
         sampled: Some(SampledFacts {
             seen: 123_000,
             span: 123_456,

@@ -292,12 +292,14 @@ impl Measurement<'_> {
         Ok(appeared.and_then(|()| match passes {
             false => Ok(()),
             // Whether unseen messages would pass the filter is unknown.
-            true if sample.sampled && self.sieve.is_none() => {
+            true if self.sieve.is_none() => {
                 let origin = Origin {
                     writer: &sample.writer,
                     number: sample.sequence_number,
+                    source_timestamp: sample.source_timestamp_ns,
+                    is_sampled: sample.sampled,
                 };
-                self.rates.sampled(&sample.topic, arrival, origin)
+                self.rates.arrived_from(&sample.topic, arrival, origin)
             }
             true => self.rates.arrived(&sample.topic, arrival),
         }))

@@ -123,7 +123,8 @@ fn an_outlier_moves_no_threshold_and_a_changing_rate_is_left_out() {
         });
     }
     let values = robot.lesson().values;
-    assert_eq!(values.min_rate_hz, Some(8.0));
+    // The slow second violates 8 Hz in no window of 5 s.
+    assert_eq!((values.min_rate_hz, values.window_s), (Some(8.0), Some(5)));
     assert_eq!(values.max_latency_ms, Some(6.0));
 
     for second in 0..60 {
@@ -136,9 +137,54 @@ fn an_outlier_moves_no_threshold_and_a_changing_rate_is_left_out() {
     assert_eq!(lesson.values.min_rate_hz, Some(8.0));
     let why = left_out(&lesson, "max_rate_hz");
     assert!(
-        why.starts_with("the rate varies: 3 to 40 Hz in windows of 1 s"),
+        why.starts_with("the rate varies: 8.6 to 40 Hz in windows of 5 s"),
         "{why}"
     );
+}
+
+/// Messages per second of 40 Hz odometry on a busy robot, from 24 to 46, in runs of slow seconds.
+fn busy(second: u32) -> u32 {
+    let noise = f64::from(second.wrapping_mul(2_654_435_761) >> 16 & 0xff) / 255.0;
+    let slow = if second % 13 < 3 { 12.0 } else { 0.0 };
+    (40.0 - slow + 6.0 * noise).round().clamp(24.0, 46.0) as u32
+}
+
+#[test]
+fn a_busy_robot_at_half_its_rate_is_found_and_at_its_full_rate_never_reported() {
+    let seconds = |from: u32, count: u32, part: u32| -> Vec<Second> {
+        let second = |second: u32| Second {
+            messages: busy(second) / part,
+            silence: Some(0.1),
+            publishers: 1,
+            subscriptions: 1,
+            ..Second::default()
+        };
+        (from..from + count).map(second).collect()
+    };
+    let learnt = seconds(0, 120, 1);
+    let counts = || learnt.iter().map(|second| second.messages);
+    assert_eq!((counts().min(), counts().max()), (Some(28), Some(46)));
+    let lesson = thresholds::lesson("/odom", &Observation::of(learnt.clone()));
+    let values = lesson.values;
+    let window = values.window_s.unwrap();
+    let low = values.min_rate_hz.unwrap();
+    assert!(window > 1 && low > 24.0, "{values:?}");
+    let text = format!("{:?}", lesson.remarks);
+    assert!(
+        text.contains(&format!("in windows of {window} s")),
+        "{text}"
+    );
+    assert!(text.contains("window_s"), "{text}");
+    let expectations = values.try_into().unwrap();
+    // A day of the same robot.
+    let day = rehearsal::violations(&expectations, &seconds(120, 86_400, 1));
+    assert_eq!(day, Vec::<&str>::new());
+    // From full to half the rate: within the window, and two evaluations in a row.
+    let within = 2 + window as usize;
+    let mut halved = learnt;
+    halved.extend(seconds(120, within as u32, 2));
+    let violated = rehearsal::violations(&expectations, &halved);
+    assert!(violated.contains(&"min_rate_hz"), "{values:?} {violated:?}");
 }
 
 #[test]

@@ -19,6 +19,11 @@ pub const RATE_MARGIN: f64 = 0.2;
 pub const RATE_DEVIATIONS: f64 = 4.0;
 /// Widest band of a rate, as parts of its median. A topic at half its rate stays outside.
 const RATE_LIMITS: (f64, f64) = (0.6, 1.6);
+/// Least distance of the lowest rate from half the median, in messages of a window: half the rate
+/// then violates it, in spite of the agent's tolerance of one message.
+const TOLERANCE: f64 = 1.0;
+/// Windows in seconds for rates that vary too much in the agent's default window.
+const WINDOWS: [u64; 4] = [2, 3, 5, rehearsal::SECONDS];
 /// Slowest rate with a band: three messages are due in the agent's longest window of 10 s.
 const SLOWEST: f64 = 0.3;
 /// Least number of seconds and of messages to learn from.
@@ -80,6 +85,15 @@ pub fn lesson(topic: &str, observation: &Observation) -> Lesson {
     }
 }
 
+/// Rates of all windows of one length.
+struct Windows {
+    /// Length in seconds.
+    seconds: u64,
+    /// Whether the agent chooses this length by itself.
+    is_default: bool,
+    rates: Summary,
+}
+
 /// Expectations under construction.
 struct Draft<'a> {
     observation: &'a Observation,
@@ -119,7 +133,7 @@ impl<'a> Draft<'a> {
         &self,
         candidates: [f64; 2],
         limits: RangeInclusive<f64>,
-        expecting: fn(f64) -> ExpectationValues,
+        expecting: impl Fn(f64) -> ExpectationValues,
     ) -> Option<f64> {
         let mut candidates = candidates.into_iter();
         candidates.find(|it| limits.contains(it) && !self.violates(expecting(*it)))
@@ -151,39 +165,70 @@ impl<'a> Draft<'a> {
             let why = format!("{messages} messages in {seconds} s are too seldom for a rate");
             return self.leave_out(KEYS, why);
         }
-        let window = rehearsal::window(lowest);
-        let rates = Summary::of(self.rates(window)).filter(|rates| rates.median > 0.0);
-        let Some(rates) = rates else {
+        let default = rehearsal::window(lowest);
+        let wider = WINDOWS.into_iter().filter(|seconds| *seconds > default);
+        let lengths = std::iter::once(default).chain(wider);
+        let windows: Vec<Windows> = lengths
+            .filter_map(|seconds| self.windows(seconds, default))
+            .collect();
+        let Some(shortest) = windows.first() else {
             return self.leave_out(KEYS, "no message arrived for most of the time");
         };
-        self.band(&rates, window);
+        // The shortest window that finds half the rate and that the topic never violates.
+        let usual = |it: &&Windows| it.is_above(it.lows()[0]) && self.accepts_low(it, it.lows()[0]);
+        let widest = |it: &&Windows| self.accepts_low(it, it.lows()[1]);
+        let chosen = windows.iter().find(usual);
+        let chosen = chosen.or_else(|| windows.iter().find(widest));
+        self.band(chosen.unwrap_or(shortest));
     }
 
     /// Chooses the lowest and the highest rate.
-    fn band(&mut self, rates: &Summary, window: u64) {
-        let median = rates.median;
-        let half = (RATE_MARGIN * median).max(RATE_DEVIATIONS * rates.deviation);
-        let lows = [median - half, rates.minimum * 0.95].map(rounded_down);
-        let highs = [median + half, rates.maximum * 1.05].map(rounded_up);
-        let (lowest, highest) = (RATE_LIMITS.0 * median, RATE_LIMITS.1 * median);
-        let low = self.first(lows, lowest..=f64::INFINITY, |rate| ExpectationValues {
-            min_rate_hz: Some(rate),
-            ..ExpectationValues::default()
-        });
-        let high = self.first(highs, 0.0..=highest, |rate| ExpectationValues {
-            max_rate_hz: Some(rate),
-            ..ExpectationValues::default()
+    fn band(&mut self, windows: &Windows) {
+        let Windows { seconds, rates, .. } = windows;
+        let [usual, widest] = windows.lows();
+        let lows = match windows.is_above(usual) {
+            true => [usual, widest],
+            false => [widest, usual],
+        };
+        let low = lows.into_iter().find(|low| self.accepts_low(windows, *low));
+        let [usual, widest] = windows.highs();
+        let highs = match windows.is_below(usual) {
+            true => [usual, widest],
+            false => [widest, usual],
+        };
+        let high = self.first(highs, 0.0..=RATE_LIMITS.1 * rates.median, |rate| {
+            windows.expecting(None, Some(rate))
         });
         let seen = format!(
-            "{} to {} Hz in windows of {window} s",
+            "{} to {} Hz in windows of {seconds} s",
             short(rates.minimum),
             short(rates.maximum)
         );
         let varies = format!("the rate varies: {seen}");
-        let seen = format!("median {} Hz, {seen}", short(median));
+        let seen = format!("median {} Hz, {seen}", short(rates.median));
         self.set("min_rate_hz", low, seen, &varies);
         self.set("max_rate_hz", high, String::new(), &varies);
-        (self.values.min_rate_hz, self.values.max_rate_hz) = (low, high);
+        self.values = windows.expecting(low, high);
+        if let Some(window) = self.values.window_s {
+            let why = "the rate varies in shorter windows".to_owned();
+            self.set("window_s", Some(f64::from(window)), why, "");
+        }
+    }
+
+    /// Returns whether this lowest rate finds half the rate, and the topic does not violate it.
+    fn accepts_low(&self, windows: &Windows, rate: f64) -> bool {
+        let limits = windows.least()..=f64::INFINITY;
+        limits.contains(&rate) && !self.violates(windows.expecting(Some(rate), None))
+    }
+
+    /// Returns the rates in windows of so many seconds. `None` if most have no message.
+    fn windows(&self, seconds: u64, default: u64) -> Option<Windows> {
+        let rates = Summary::of(self.rates(seconds)).filter(|rates| rates.median > 0.0)?;
+        Some(Windows {
+            seconds,
+            is_default: seconds == default,
+            rates,
+        })
     }
 
     /// Rates of all windows of so many seconds with a publisher.
@@ -395,7 +440,8 @@ impl<'a> Draft<'a> {
         let Ok(expectations) = Expectations::try_from(self.values) else {
             return;
         };
-        for violated in rehearsal::violations(&expectations, self.seconds) {
+        let violations = rehearsal::violations(&expectations, self.seconds);
+        for violated in violations {
             let values = &mut self.values;
             match violated {
                 "min_rate_hz" => values.min_rate_hz = None,
@@ -413,12 +459,68 @@ impl<'a> Draft<'a> {
                 }
             }
         }
+        let values = &mut self.values;
+        if values.min_rate_hz.or(values.max_rate_hz).is_none() {
+            values.window_s = None;
+            let is_window = |remark: &Remark| matches!(remark, Remark::Set("window_s", ..));
+            self.remarks.retain(|remark| !is_window(remark));
+        }
     }
 
     fn set(&mut self, key: &'static str, value: Option<f64>, seen: String, why: &str) {
         match value {
             Some(value) => self.remarks.push(Remark::Set(key, value, seen)),
             None => self.leave_out(key, why),
+        }
+    }
+}
+
+impl Windows {
+    /// Returns the usual lowest rate, and the widest one: just below the lowest that was seen.
+    fn lows(&self) -> [f64; 2] {
+        let lows = [self.rates.median - self.half(), self.rates.minimum * 0.95];
+        lows.map(rounded_down)
+    }
+
+    /// Returns the usual highest rate, and the widest one: just above the highest that was seen.
+    fn highs(&self) -> [f64; 2] {
+        let highs = [self.rates.median + self.half(), self.rates.maximum * 1.05];
+        highs.map(rounded_up)
+    }
+
+    /// Returns half the width of the usual band.
+    fn half(&self) -> f64 {
+        let rates = &self.rates;
+        (RATE_MARGIN * rates.median).max(RATE_DEVIATIONS * rates.deviation)
+    }
+
+    /// Returns the smallest lowest rate that half the rate violates.
+    fn least(&self) -> f64 {
+        let median = self.rates.median;
+        let half = 0.5 * median + TOLERANCE / number(self.seconds);
+        half.max(RATE_LIMITS.0 * median)
+    }
+
+    /// Returns whether no window violates this lowest rate.
+    fn is_above(&self, rate: f64) -> bool {
+        let seconds = number(self.seconds);
+        rate * seconds < self.rates.minimum * seconds + TOLERANCE
+    }
+
+    /// Returns whether no window violates this highest rate.
+    fn is_below(&self, rate: f64) -> bool {
+        let seconds = number(self.seconds);
+        rate * seconds + TOLERANCE > self.rates.maximum * seconds
+    }
+
+    /// Returns the expectation of these rates in windows of this length.
+    fn expecting(&self, low: Option<f64>, high: Option<f64>) -> ExpectationValues {
+        let window = u32::try_from(self.seconds).ok();
+        ExpectationValues {
+            min_rate_hz: low,
+            max_rate_hz: high,
+            window_s: window.filter(|_| !self.is_default && low.or(high).is_some()),
+            ..ExpectationValues::default()
         }
     }
 }

@@ -89,6 +89,7 @@ fn head(source: &Source<'_>) -> String {
 #
 # min_rate_hz, max_rate_hz: median of the rates in windows of at least three messages (1 to 10 s),
 #   with a margin of {rate} % or {RATE_DEVIATIONS} deviations (1.4826 times the MAD), whichever is larger
+# window_s: a longer window, in which a rate that varies from second to second is steady
 # max_loss_ratio: three times the 95th percentile of windows of 10 s, at least {loss} % and one message
 # max_latency_ms: median of one-second means with {LATENCY_DEVIATIONS} deviations or 5 ms, at least twice
 #   the 95th percentile

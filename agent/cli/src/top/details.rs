@@ -2,6 +2,7 @@
 //! writer and subscriber.
 
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 
 use ros2probe_api::Open;
 use ros2probe_api::diagnosis::{Diagnosis, Finding};
@@ -82,6 +83,10 @@ fn expectation(watch: &Watching<'_>) -> Styled {
         (Some(least), None) => expected.push(format!("at least {} Hz", bound(least))),
         (None, Some(most)) => expected.push(format!("at most {} Hz", bound(most))),
         (None, None) => {}
+    }
+    if let (Some(rate), Some(window)) = (expected.last_mut(), expectations.window_s) {
+        // Writing into a string cannot fail.
+        let _ = write!(rate, " in {window} s");
     }
     let most = [
         ("loss", expectations.max_loss_ratio.map(ratio)),

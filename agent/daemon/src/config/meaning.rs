@@ -242,9 +242,17 @@ impl Reader {
                 format!("is {high}, below min_rate_hz, which is {low}"),
             );
         }
+        let has_rate = entry.min_rate_hz.or(entry.max_rate_hz).is_some();
+        if entry.window_s.is_some() && !has_rate {
+            self.wrong(
+                &format!("{key}.window_s"),
+                "needs min_rate_hz or max_rate_hz",
+            );
+        }
         let values = ExpectationValues {
             min_rate_hz: entry.min_rate_hz,
             max_rate_hz: entry.max_rate_hz,
+            window_s: entry.window_s,
             max_loss_ratio: entry.max_loss_ratio,
             max_latency_ms: entry.max_latency_ms,
             max_silence_s: entry.max_silence_s,

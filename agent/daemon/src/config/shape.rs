@@ -108,6 +108,10 @@ pub(super) struct WatchEntryShape {
     /// Maximum rate, in messages per second.
     #[schemars(range(min = 0.0, max = 1_000_000.0))]
     pub(super) max_rate_hz: Option<f64>,
+    /// Window of `min_rate_hz` and `max_rate_hz`, in whole seconds, for a rate that varies from
+    /// second to second; default: the shortest one with at least three expected messages.
+    #[schemars(range(min = 1, max = 10))]
+    pub(super) window_s: Option<u32>,
     /// Maximum fraction of lost messages, 0 to 1.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub(super) max_loss_ratio: Option<f64>,

@@ -288,6 +288,10 @@ impl Run {
         if self.apply_lists() {
             if let Some(watchlist) = self.watches.take_changed() {
                 self.subscriptions.retain(watchlist.watches());
+                if let Source::Live(live) = &self.source {
+                    // Its expectations begin now, not at the last round.
+                    self.observer.input(Input::Time(live.clock()));
+                }
                 self.observer.input(Input::Watchlist(watchlist));
             }
             if let Some(sample_requests) = self.subscriptions.take_changed() {

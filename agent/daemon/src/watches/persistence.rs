@@ -68,6 +68,8 @@ struct Line {
     retain: Retain,
     min_rate_hz: Option<f64>,
     max_rate_hz: Option<f64>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    window_s: Option<u32>,
     max_loss_ratio: Option<f64>,
     max_latency_ms: Option<f64>,
     max_silence_s: Option<f64>,
@@ -143,6 +145,7 @@ impl TryFrom<Line> for Watch {
         let values = ExpectationValues {
             min_rate_hz: line.min_rate_hz,
             max_rate_hz: line.max_rate_hz,
+            window_s: line.window_s,
             max_loss_ratio: line.max_loss_ratio,
             max_latency_ms: line.max_latency_ms,
             max_silence_s: line.max_silence_s,
@@ -167,6 +170,7 @@ impl From<&Watch> for Line {
         let ExpectationValues {
             min_rate_hz,
             max_rate_hz,
+            window_s,
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,
@@ -181,6 +185,7 @@ impl From<&Watch> for Line {
             retain: watch.retain,
             min_rate_hz,
             max_rate_hz,
+            window_s,
             max_loss_ratio,
             max_latency_ms,
             max_silence_s,

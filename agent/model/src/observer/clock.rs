@@ -182,6 +182,7 @@ impl Observer {
                 subscriptions: topic.readers.len().max(subscriptions),
                 last_message: last_message.max(retired).max(seen_inside),
                 since: topic.published,
+                observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,
             };
             let mut judgements = topic.judgements.clone();

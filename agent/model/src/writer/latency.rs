@@ -32,7 +32,7 @@ impl Writer {
             negative |= delay < 0;
             if delay >= 0 && is_plausible {
                 self.source_latency.observe(seconds(delay));
-                let slot = self.tally.window.current(now);
+                let slot = self.tally.window.second(now);
                 slot.delayed += 1;
                 slot.delay += seconds(delay);
             }

@@ -6,6 +6,7 @@ use ros2probe_wire::{Record, Timestamp};
 use super::{Counted, MeasurementContext, Writer, reach, record_time, seconds};
 use crate::dispatch::MissedReason;
 use crate::journal::{Journal, Missing};
+use crate::rate::Sum;
 use crate::sampled::{Completeness, Sampled, SampledUpdate};
 use crate::samples::Budget;
 
@@ -57,10 +58,12 @@ impl Writer {
             sampled.touch(now);
         }
         let reach = reach(record);
+        let since = self.reception.sequence().last_advance();
         let sequence = self.reception.sequence_mut();
         let announced = match record.body() {
             Body::Sample(sample) => {
                 let update = self.sampled_update(sample, reach, context.budget)?;
+                self.count_span(sample, &update, since);
                 return self.sampled_sample(
                     sample,
                     &update,
@@ -78,9 +81,35 @@ impl Writer {
             }
             Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
         };
-        self.tally.messages += announced;
-        self.tally.window.current(now).messages += announced;
+        let announced = Sum {
+            messages: announced,
+            bytes: 0,
+        };
+        self.spread(announced, since, now);
         None
+    }
+
+    /// Counts the samples up to a seen one. Unseen ones are assumed to have its size.
+    fn count_span(&mut self, sample: Sample<'_>, update: &SampledUpdate, since: Timestamp) {
+        let disposals = u64::from(!sample.is_message() && update.samples > 0);
+        let messages = update.samples - disposals;
+        let size = u64::from(sample.size());
+        let bytes = (update.alike - disposals).saturating_mul(size);
+        let now = record_time(sample.record());
+        self.spread(Sum { messages, bytes }, since, now);
+        if messages > 0 {
+            self.last_message = self.last_message.max(Some(now));
+        }
+    }
+
+    /// Counts what was sent after `since`, each message in the second of its time.
+    fn spread(&mut self, sent: Sum, since: Timestamp, now: Timestamp) {
+        let tally = &mut self.tally;
+        tally.messages += sent.messages;
+        tally.bytes = tally.bytes.saturating_add(sent.bytes);
+        let earlier = tally.window.spread(sent, since, now);
+        tally.earlier.messages += earlier.messages;
+        tally.earlier.bytes = tally.earlier.bytes.saturating_add(earlier.bytes);
     }
 
     /// Applies a sample, or a part of one, to the sampled view.
@@ -143,19 +172,7 @@ impl Writer {
         (now, wall_clock): (Timestamp, Timestamp),
     ) -> Option<Counted> {
         let (number, is_message) = (sample.sequence_number(), sample.is_message());
-        // Unseen samples are assumed to have the size of the next one that is seen.
-        let disposals = u64::from(!is_message && update.samples > 0);
-        let messages = update.samples - disposals;
         let bytes = u64::from(sample.size());
-        let alike_bytes = (update.alike - disposals).saturating_mul(bytes);
-        self.tally.messages += messages;
-        self.tally.bytes = self.tally.bytes.saturating_add(alike_bytes);
-        let slot = self.tally.window.current(now);
-        slot.messages += messages;
-        slot.bytes = slot.bytes.saturating_add(alike_bytes);
-        if messages > 0 {
-            self.last_message = self.last_message.max(Some(now));
-        }
         let sampled = self.sampled.as_mut()?;
         let stamp = sampled.stamp(number, sample.header_stamp());
         if let Some(interval) = update.interval {

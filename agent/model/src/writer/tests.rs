@@ -372,6 +372,39 @@ fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss(
 }
 
 #[test]
+fn what_shared_memory_sent_while_it_was_not_polled_is_no_spike_of_the_rate() {
+    let mut bench = Bench::new(RELIABLE);
+    let mut number = 1;
+    let send = |bench: &mut Bench, number: &mut u64, count: u64, is_polled: bool| {
+        for _ in 0..count {
+            if is_polled {
+                bench.put(in_shared_memory(data(*number)));
+            }
+            *number += 1;
+            bench.wait(20);
+        }
+    };
+    send(&mut bench, &mut number, 10, true);
+    // 50 Hz: 14 s pass until the topic is wanted.
+    send(&mut bench, &mut number, 700, false);
+    for second in 0..15 {
+        send(&mut bench, &mut number, 50, true);
+        let facts = bench.facts();
+        assert!(
+            (facts.rate_hz - 50.0).abs() < 0.5,
+            "{second}: {}",
+            facts.rate_hz
+        );
+        assert!((facts.bandwidth - 5000.0).abs() < 50.0, "{second}");
+        // All but the last second of that time is earlier.
+        assert!((600..=690).contains(&facts.earlier.messages), "{facts:?}");
+    }
+    let facts = bench.facts();
+    assert_eq!((facts.messages, facts.bytes), (1460, 146_000));
+    assert!((facts.interarrival.sum() - 0.02 * facts.interarrival.count() as f64).abs() < 1e-6);
+}
+
+#[test]
 fn one_fragment_that_was_seen_is_a_message_of_its_sample_s_size() {
     let mut bench = Bench::new(RELIABLE);
     bench.put(in_shared_memory(fragment(1, 4)));

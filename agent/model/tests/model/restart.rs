@@ -3,16 +3,18 @@
 
 use std::net::{Ipv4Addr, SocketAddrV4};
 use std::sync::Arc;
+use std::time::Duration;
 
 use proptest::prelude::*;
 use ros2probe_model::discovery::Memory;
+use ros2probe_model::event::EventKind;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::Snapshot;
-use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_model::watch::{Expectations, Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
-use ros2probe_wire::time::SECOND;
+use ros2probe_wire::time::{MILLISECOND, SECOND};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
@@ -180,6 +182,95 @@ fn a_restored_participant_heard_within_its_lease_stays_and_another_expires() {
     assert_eq!(snapshot.nodes.len(), 1);
     assert_eq!(snapshot.nodes[0].name, "/mapper");
     assert!(snapshot.unknown_writers.is_empty());
+}
+
+/// The states of `/points` in the order of the daemon's start: restored state, watches, time.
+fn states_after_restart(expectations: Expectations, messages: impl Fn(u64) -> bool) -> Vec<String> {
+    let mut before = agent(Settings::default());
+    robot(&mut before);
+    let mut states = Vec::new();
+    for delay in [0, 650, 935, 999] {
+        let at = START + 60 * SECOND + delay * MILLISECOND;
+        let mut after = Observer::new(Settings::default());
+        after.input(Input::Restored {
+            memory: &before.memory(),
+            now: Timestamp(at),
+        });
+        let watch = Watch {
+            expectations,
+            ..Watch::named("/points").unwrap()
+        };
+        let watchlist = Watchlist::new(vec![watch]).unwrap();
+        after.input(Input::Watchlist(Arc::new(watchlist)));
+        let reader = forge::endpoint(
+            Guid::new(BOB, EntityId([0, 0, 0x14, 0x04])),
+            "rt/points",
+            "std_msgs::msg::dds_::String_",
+            true,
+        );
+        put(
+            &mut after,
+            at,
+            Message::from(BOB).data(SEDP_READERS, 9, &reader),
+        );
+        for step in 1..150 {
+            let now = at + step * 100 * MILLISECOND;
+            for prefix in [ALICE, BOB] {
+                put(&mut after, now, spdp(prefix));
+            }
+            if messages(step) {
+                let sample = Message::from(ALICE).data(WRITER, 100 + step, &[0, 1, 0, 0]);
+                put(&mut after, now, sample);
+            }
+            after.input(Input::Time(Timestamp(now)));
+            for event in after.drain().events.events {
+                if let EventKind::Expectation { to, violations, .. } = event.kind {
+                    let elapsed = (event.at.0 - at) / SECOND;
+                    states.push(format!("{} {violations:?} {elapsed}", to.label()));
+                }
+            }
+        }
+    }
+    states
+}
+
+#[test]
+fn a_restart_on_a_running_robot_reports_no_silence_of_the_time_before() {
+    let silence = Expectations {
+        max_silence: Some(Duration::from_millis(6250)),
+        ..Expectations::default()
+    };
+    // A message each 4.9 s, the first one 3 s after the restart.
+    let slow = states_after_restart(silence, |step| step % 49 == 30);
+    assert_eq!(slow, Vec::<String>::new());
+    // A publisher that stopped is silent as soon as the agent can know.
+    let stopped = states_after_restart(silence, |_| false);
+    let silent: Vec<_> = stopped
+        .iter()
+        .filter(|it| it.starts_with("silent"))
+        .collect();
+    assert_eq!(silent.len(), 4, "{stopped:?}");
+    assert!(
+        silent
+            .iter()
+            .all(|it| it.ends_with(" 6") || it.ends_with(" 7"))
+    );
+}
+
+#[test]
+fn a_restart_gives_the_robot_time_to_announce_its_subscribers() {
+    let three = Expectations {
+        subscribers: Some(3),
+        ..Expectations::default()
+    };
+    let states = states_after_restart(three, |_| true);
+    assert_eq!(states.len(), 4, "{states:?}");
+    assert!(
+        states
+            .iter()
+            .all(|it| it.ends_with(" 10") || it.ends_with(" 11")),
+        "{states:?}"
+    );
 }
 
 #[test]

@@ -7,6 +7,7 @@
 pub mod bandwidth;
 pub mod delay;
 pub mod hz;
+mod numbers;
 pub mod table;
 pub mod window;
 
@@ -17,6 +18,7 @@ use std::mem;
 use self::bandwidth::{Bandwidth, Sizes};
 use self::delay::{Age, Ages};
 use self::hz::{Intervals, Rate};
+use self::numbers::{Message, Numbers, Place};
 use self::table::table;
 use super::{Dialect, Refused};
 use ros2probe_daemon::subscriptions::begins_with_header;
@@ -31,8 +33,6 @@ const CLEAR: &str = "\x1b[H\x1b[2J\n";
 const LONGEST_JUMP: i64 = 3600 * SECOND;
 /// Most messages that wait for the clock, which ticks ten times a second.
 const WAITING: usize = 65_536;
-/// Largest gap of sequence numbers within one measurement; a larger one restarts it.
-const MAX_UNSEEN: u64 = 10_000;
 
 /// Measured quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,8 +56,8 @@ pub struct Rates {
     places: HashMap<String, usize>,
     /// Messages after the last tick of the clock, with the indices of their topics.
     waiting: Vec<(Arrival, usize)>,
-    /// Number and time of the newest message of each sampled writer.
-    last_sampled: HashMap<String, (u64, i64)>,
+    /// Sequence numbers of each writer.
+    numbers: HashMap<String, Numbers>,
     /// Topics that were reported as sampled.
     sampled_reported: HashSet<String>,
     /// Time of the next periodic report.
@@ -110,6 +110,10 @@ pub struct Origin<'a> {
     pub writer: &'a str,
     /// Sequence number, from 1.
     pub number: u64,
+    /// The writer's timestamp, in nanoseconds since the epoch.
+    pub source_timestamp: Option<i64>,
+    /// Whether it was sampled in shared memory, so that others may have been missed.
+    pub is_sampled: bool,
 }
 
 #[derive(Debug)]
@@ -155,7 +159,7 @@ impl Rates {
             topics: Vec::new(),
             places: HashMap::new(),
             waiting: Vec::new(),
-            last_sampled: HashMap::new(),
+            numbers: HashMap::new(),
             sampled_reported: HashSet::new(),
             next: None,
             output: Output::default(),
@@ -282,43 +286,71 @@ impl Rates {
         self.tick(now);
     }
 
-    /// As [`Self::arrived`], for a sampled topic. Messages with sequence numbers between this one
-    /// and the writer's last one also count, at interpolated times.
+    /// As [`Self::arrived`], with the message's number. A sampled message counts at the time of the
+    /// writer's timestamp, except for a delay. Messages between it and the writer's last one also
+    /// count, at interpolated times.
     ///
     /// # Errors
     ///
     /// As [`Self::arrived`].
-    pub fn sampled(&mut self, name: &str, arrival: Arrival, origin: Origin<'_>) -> Result<(), End> {
+    pub fn arrived_from(
+        &mut self,
+        name: &str,
+        mut arrival: Arrival,
+        origin: Origin<'_>,
+    ) -> Result<(), End> {
         let Some(place) = self.places.get(name).copied() else {
             return Ok(());
         };
-        let newest = (origin.number, arrival.time);
-        let last = self.last_sampled.insert(origin.writer.to_owned(), newest);
-        let (number, mut time) = last.unwrap_or(newest);
-        let between = origin.number.saturating_sub(number).saturating_sub(1);
-        let topic = self.topics.get_mut(place);
-        if let Some(watched) = topic.filter(|_| (1..=MAX_UNSEEN).contains(&between)) {
-            let is_new = !mem::replace(&mut watched.sampled, true);
-            if is_new && !self.sampled_reported.contains(name) {
-                let _ = writeln!(
-                    self.output.err,
-                    "rp: {name} is sampled in shared memory; unseen messages are counted from \
-                     sequence numbers and their times estimated"
-                );
+        let message = Message {
+            number: origin.number,
+            captured: arrival.time,
+            sent: origin.source_timestamp,
+            is_sampled: origin.is_sampled,
+        };
+        let found = match self.numbers.get_mut(origin.writer) {
+            Some(numbers) => numbers.place(message),
+            None => {
+                let (numbers, found) = Numbers::new(message);
+                self.numbers.insert(origin.writer.to_owned(), numbers);
+                found
             }
-            let steps = i64::try_from(between + 1).unwrap_or(i64::MAX);
-            let step = arrival.time.saturating_sub(time) / steps;
-            for _ in 0..between {
-                time = time.saturating_add(step);
-                let unseen = Arrival {
-                    time,
-                    header_stamp: None,
-                    ..arrival
-                };
-                self.waiting.push((unseen, place));
-            }
+        };
+        if self.quantity != Quantity::Delay {
+            arrival.time = message.time();
+        }
+        match found {
+            Place::Counts => {}
+            Place::Counted => return Ok(()),
+            Place::After { unseen, since } => self.unseen(name, place, arrival, unseen, since),
         }
         self.arrived(name, arrival)
+    }
+
+    /// Counts messages that were sent between `since` and this one.
+    fn unseen(&mut self, name: &str, place: usize, arrival: Arrival, count: u64, since: i64) {
+        let Some(watched) = self.topics.get_mut(place) else {
+            return;
+        };
+        let is_new = !mem::replace(&mut watched.sampled, true);
+        if is_new && !self.sampled_reported.contains(name) {
+            let _ = writeln!(
+                self.output.err,
+                "rp: {name} is sampled in shared memory; unseen messages are counted from sequence \
+                 numbers and their times estimated"
+            );
+        }
+        let steps = i64::try_from(count + 1).unwrap_or(i64::MAX);
+        let elapsed = arrival.time.saturating_sub(since);
+        for step in 1..steps {
+            let part = i128::from(elapsed) * i128::from(step) / i128::from(steps);
+            let unseen = Arrival {
+                time: since.saturating_add(i64::try_from(part).unwrap_or(0)),
+                header_stamp: None,
+                ..arrival
+            };
+            self.waiting.push((unseen, place));
+        }
     }
 
     /// Marks these topics as already reported to be sampled.

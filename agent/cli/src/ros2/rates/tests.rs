@@ -310,8 +310,10 @@ fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
         let origin = Origin {
             writer: "01",
             number,
+            source_timestamp: Some(at(time)),
+            is_sampled: true,
         };
-        rates.sampled("/imu", arrival, origin).unwrap();
+        rates.arrived_from("/imu", arrival, origin).unwrap();
         rates.clock(at(time));
     }
     let output = rates.take();
@@ -325,6 +327,50 @@ fn what_is_not_seen_in_shared_memory_counts_by_its_numbers() {
             .count(),
         1
     );
+}
+
+#[test]
+fn a_sampled_rate_is_right_from_the_first_line_although_polls_are_late() {
+    for dialect in [Dialect::Humble, Dialect::Kilted] {
+        let mut rates = Rates::of(Quantity::Rate, dialect, 10_000, named(&["/imu"]));
+        rates.opened(&present(&[("/imu", IMU)])).unwrap();
+        rates.clock(at(0));
+        let see = |rates: &mut Rates, number: u64, sent: Option<i64>, read: i64| {
+            let arrival = Arrival {
+                time: at(read),
+                size: 100,
+                header_stamp: None,
+            };
+            let origin = Origin {
+                writer: "01",
+                number,
+                source_timestamp: sent.map(at),
+                is_sampled: true,
+            };
+            rates.arrived_from("/imu", arrival, origin).unwrap();
+            rates.clock(at(read));
+        };
+        // 200 Hz. The first poll finds old messages, and later ones are late by up to 0.4 s.
+        for number in [1, 20, 80] {
+            see(&mut rates, number, None, 400);
+        }
+        let numbers = (81..2_480).filter(|number| number % 7 < 3);
+        let mut read = 400;
+        for number in numbers {
+            let sent = 5 * i64::try_from(number).unwrap();
+            let delay = [1, 3, 400, 20][usize::try_from(number / 90 % 4).unwrap()];
+            read = read.max(sent + delay);
+            see(&mut rates, number, Some(sent), read);
+        }
+        let text = rates.take().out;
+        let lines = text.lines().filter(|line| line.starts_with("average"));
+        let lines: Vec<_> = lines.collect();
+        assert!(lines.len() >= 10, "{text}");
+        assert!(
+            lines.iter().all(|line| *line == "average rate: 200.000"),
+            "{text}"
+        );
+    }
 }
 
 #[test]

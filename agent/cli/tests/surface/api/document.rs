@@ -92,6 +92,7 @@ fn assert_expectations_are_documented(document: &Value) {
         }
     }
     for (key, place) in [
+        ("window_s", (&mut low.window_s, &mut high.window_s)),
         ("publishers", (&mut low.publishers, &mut high.publishers)),
         ("subscribers", (&mut low.subscribers, &mut high.subscribers)),
     ] {
@@ -115,6 +116,10 @@ fn assert_expectations_are_documented(document: &Value) {
     assert!(beyond(|wrong| wrong.max_silence_s = Some(0.0)));
     assert!(beyond(|wrong| wrong.max_silence_s = Some(f64::NAN)));
     assert!(beyond(|wrong| wrong.publishers = Some(0)));
+    assert!(beyond(
+        |wrong| (wrong.min_rate_hz, wrong.window_s) = (Some(1.0), Some(11))
+    ));
+    assert!(beyond(|wrong| wrong.window_s = Some(5)));
     assert!(beyond(|wrong| wrong.subscribers = Some(10_001)));
     assert!(beyond(
         |wrong| (wrong.min_rate_hz, wrong.max_rate_hz) = (Some(2.0), Some(1.0))
@@ -257,8 +262,12 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
         let properties = &document["components"]["schemas"][schema]["properties"];
         for (name, schema) in properties.as_object().unwrap() {
             let ask = |value: Value| {
-                let body = serde_json::json!({ name.as_str(): value }).to_string();
-                status(agent, method, path, &body)
+                let mut body = serde_json::json!({ name.as_str(): value });
+                if name == "window_s" {
+                    // A window needs a rate.
+                    body["min_rate_hz"] = 1.into();
+                }
+                status(agent, method, path, &body.to_string())
             };
             let what = format!("{path} {name}");
             for (bound, step) in [("maximum", 1.0), ("minimum", -1.0)] {

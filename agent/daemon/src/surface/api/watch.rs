@@ -231,6 +231,7 @@ fn watch(topic: String, domain: Domain, settings: WatchRequest) -> Result<Watch,
     let values = ExpectationValues {
         min_rate_hz: settings.min_rate_hz,
         max_rate_hz: settings.max_rate_hz,
+        window_s: settings.window_s,
         max_loss_ratio: settings.max_loss_ratio,
         max_latency_ms: settings.max_latency_ms,
         max_silence_s: settings.max_silence_s,
@@ -365,6 +366,7 @@ pub(super) fn expectations(expectations: &watch::Expectations) -> Expectations {
     Expectations {
         min_rate_hz: values.min_rate_hz,
         max_rate_hz: values.max_rate_hz,
+        window_s: values.window_s,
         max_loss_ratio: values.max_loss_ratio,
         max_latency_ms: values.max_latency_ms,
         max_silence_s: values.max_silence_s,

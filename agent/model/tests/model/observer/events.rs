@@ -9,7 +9,8 @@ use ros2probe_model::input::Input;
 use ros2probe_model::snapshot::WatchState;
 use ros2probe_model::watch::{Expectations, Watch, Watchlist};
 use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
-use ros2probe_wire::DomainId;
+use ros2probe_wire::time::SECOND;
+use ros2probe_wire::{DomainId, Timestamp};
 
 use super::{ALICE, BOB, READER, WRITER, World, alice, bob};
 
@@ -172,6 +173,87 @@ fn a_changed_expectation_is_one_event_and_another_watch_changes_nothing() {
     world.wait(2_000);
     let gone = (Some(WatchState::Ok), WatchState::NotPublished, Vec::new());
     assert_eq!(states(&mut world), [gone]);
+}
+
+#[test]
+fn what_the_source_could_not_see_is_no_silence() {
+    let mut world = World::new(&[]);
+    let watch = Watch {
+        expectations: Expectations {
+            max_silence: Some(Duration::from_secs(3)),
+            min_rate_hz: Some(5.0),
+            ..Expectations::default()
+        },
+        ..Watch::named("/chatter").unwrap()
+    };
+    world.observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
+    world.spdp(ALICE, 1000);
+    world.sedp(alice(READER), "rt/chatter");
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.stream(alice(WRITER), 1..=500);
+    let state = |world: &World| world.snapshot().watches[0].topics[0].state;
+    assert_eq!(state(&world), WatchState::Ok);
+    world.events();
+    // The agent was stopped for a minute.
+    world.now += 60 * SECOND;
+    let now = Timestamp(world.now);
+    world.observer.input(Input::ViewBegan(now));
+    world.wait(500);
+    world.stream(alice(WRITER), 6_500..=7_000);
+    let states = |world: &mut World| -> Vec<_> {
+        let reported = world.events().into_iter();
+        let states = reported.filter_map(|(_, kind)| match kind {
+            EventKind::Expectation { to, .. } => Some(to),
+            _ => None,
+        });
+        states.collect()
+    };
+    assert_eq!(states(&mut world), []);
+    // A publisher that stopped meanwhile is silent 3 s later.
+    world.now += 60 * SECOND;
+    let now = Timestamp(world.now);
+    world.observer.input(Input::ViewBegan(now));
+    world.wait(2_900);
+    assert_eq!(states(&mut world), [WatchState::Violated]);
+    world.wait(1_200);
+    assert_eq!(states(&mut world), [WatchState::Silent]);
+}
+
+#[test]
+fn a_subscriber_that_comes_back_is_given_time_for_its_first_message() {
+    let mut world = World::new(&[]);
+    let watch = Watch {
+        expectations: Expectations {
+            max_silence: Some(Duration::from_secs(3)),
+            min_rate_hz: Some(1.0),
+            ..Expectations::default()
+        },
+        ..Watch::named("/chatter").unwrap()
+    };
+    world.observer.input(Input::Watchlist(Arc::new(
+        Watchlist::new(vec![watch]).unwrap(),
+    )));
+    world.spdp(ALICE, 1000);
+    world.sedp(alice(WRITER), "rt/chatter");
+    world.sample(alice(WRITER), 1);
+    // Without a subscriber, the publisher sends nothing.
+    world.wait(20_950);
+    world.sedp(alice(READER), "rt/chatter");
+    world.events();
+    world.wait(900);
+    world.stream(alice(WRITER), 2..=500);
+    let violated = world.events().into_iter().any(|(_, kind)| {
+        matches!(
+            kind,
+            EventKind::Expectation {
+                to: WatchState::Silent | WatchState::Violated,
+                ..
+            }
+        )
+    });
+    assert!(!violated);
 }
 
 #[test]

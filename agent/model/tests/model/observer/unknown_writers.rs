@@ -1,13 +1,16 @@
 //! Writers that send but are never announced.
 
+use std::time::Duration;
+
+use ros2probe_model::history::History;
 use ros2probe_model::input::Input;
 use ros2probe_model::snapshot::SocketFacts;
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{Guid, GuidPrefix};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
 
-use super::{ALICE, BOB, WRITER, World, alice};
+use super::{ALICE, BOB, READER, WRITER, World, alice};
 
 #[test]
 fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
@@ -30,6 +33,46 @@ fn a_writer_whose_announcement_was_missed_is_shown_and_moves_to_its_topic() {
     world.stream(alice(WRITER), 401..=500);
     assert_eq!(world.measurement("/chatter").messages, 500);
     assert!(world.observer.drain().interest.is_empty());
+}
+
+#[test]
+fn what_was_sent_before_the_announcement_is_no_spike_of_the_rate() {
+    let mut world = World::new(&["/chatter"]);
+    world.spdp(ALICE, 100);
+    world.sedp(alice(READER), "rt/chatter");
+    let mut history = History::new(Duration::from_secs(60), 10);
+    let mut rates = Vec::new();
+    for second in 0..20 {
+        if second == 14 {
+            world.sedp(alice(WRITER), "rt/chatter");
+        }
+        for number in 1..=50 {
+            world.sample(alice(WRITER), 50 * second + number);
+            world.wait(20);
+        }
+        let now = Timestamp(world.now);
+        history.take(now, world.observer.measured(now));
+        rates.push(world.measurement("/chatter").rate_hz);
+    }
+    assert_eq!(world.measurement("/chatter").messages, 1000);
+    // The second of the announcement is incomplete.
+    assert_eq!(rates[..15], [0.0; 15]);
+    assert_eq!(rates[15..], [50.0; 5]);
+    let past = history.past();
+    let seconds: Vec<_> = past.topic(DomainId(0), "rt/chatter").unwrap().collect();
+    let rows = seconds.iter().map(|(_, reading)| reading.unwrap());
+    for (second, reading) in rows.enumerate() {
+        let row = reading.row;
+        let expected = if second < 14 { 0 } else { 50 };
+        assert_eq!((row.messages, row.lost), (expected, 0), "{second}");
+        assert_eq!(row.bytes, 8.0 * f64::from(expected) as f32);
+        assert!(
+            reading.rate_hz.is_none_or(|rate| rate <= 50.0),
+            "{reading:?}"
+        );
+        let interval = row.interarrival().map_or(0.02, |[median, _]| median);
+        assert!((interval - 0.02).abs() < 0.004, "{interval}");
+    }
 }
 
 #[test]
