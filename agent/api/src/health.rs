@@ -43,6 +43,8 @@ pub struct Health {
     pub contended_datagrams: u64,
     /// Writers whose announcement was missed; the names of their topics are unknown.
     pub unknown_writers: usize,
+    /// Command that requests the announcements of unknown writers; null without any.
+    pub unknown_writers_remedy: Option<String>,
     /// Topics that match a watch but are not measured because `limits.topics` is reached.
     pub topics_rejected: u64,
     /// Why the agent captures at a source that shows less than another one would; null otherwise.

@@ -18,6 +18,9 @@ pub struct Names<'a> {
     pub participants: usize,
     /// Active writers whose announcement was missed; their domain is unknown.
     pub unknown_writers: usize,
+    /// Command that requests the announcements of unknown writers, or of participants without a
+    /// known topic; null if none of them is known.
+    pub remedy: Option<Cow<'a, str>>,
     /// Nodes, sorted by domain and name.
     pub nodes: Vec<NodeName<'a>>,
     /// ROS topics, sorted by domain and name. With `hidden=true` they include the topics of actions

@@ -34,6 +34,7 @@ pub mod host_examination;
 pub mod limit_facts;
 mod logging;
 mod memory;
+pub mod missed_announcements;
 pub mod privilege;
 pub mod recording;
 pub mod replay_agent;

@@ -12,7 +12,7 @@
 pub mod causality;
 mod evidence;
 pub mod expected;
-mod graph;
+pub(crate) mod graph;
 pub mod path;
 mod rates;
 pub mod recorded;
@@ -35,7 +35,7 @@ use crate::topic::{Topic, Topics};
 use crate::trace::share::Share;
 use crate::wall_clock::WallClock;
 use crate::writer::Counted;
-use causality::{CausalPublication, Causality};
+use causality::{CausalPublication, Causality, Origin};
 use evidence::Evidence;
 use expected::{ExpectedChain, ExpectedChains};
 use graph::Graph;
@@ -172,15 +172,16 @@ impl Chains {
         }
     }
 
-    /// Processes a publication within a callback. `share` returns the traced share of its input.
+    /// Processes a publication within a callback. `origin` returns the facts about its input if it
+    /// begins a chain.
     pub fn publication(
         &mut self,
         publication: &CausalPublication,
         now: Timestamp,
-        share: impl FnOnce() -> Option<Share>,
+        origin: impl FnOnce() -> Origin,
     ) {
         self.causality
-            .add(publication, now, share, &mut self.tracer);
+            .add(publication, now, origin, &mut self.tracer);
     }
 
     /// Removes and returns the spans completed since the last call.
@@ -189,13 +190,14 @@ impl Chains {
     }
 
     /// Evaluates messages that are old enough, and the findings. `share` returns the traced share
-    /// of a topic. Returns the topics whose measurement the configured chains newly need or no
+    /// of a topic, `is_local` whether a participant runs on this host. Returns the topics whose measurement the configured chains newly need or no
     /// longer need.
     pub fn advance(
         &mut self,
         (discovery, topics, profiler): (&Discovery, &Topics, &Profiler),
         (now, wall_clock): (Timestamp, WallClock),
         share: impl Fn(&Topic) -> Option<Share>,
+        is_local: impl Fn(&GuidPrefix) -> bool,
     ) -> BTreeSet<(DomainId, DdsName)> {
         for due in self.messages.due(now) {
             self.conclude(due);
@@ -207,7 +209,7 @@ impl Chains {
         let mut changed = BTreeSet::new();
         if self.built != built {
             self.built = built;
-            self.graph = Graph::of(discovery, topics, share);
+            self.graph = Graph::of(discovery, topics, share, is_local);
             changed = self.expected.route(discovery, topics);
         }
         self.find((topics, profiler), (now, wall_clock));

@@ -47,7 +47,7 @@ use super::services::Services;
 use super::size::Size;
 use super::snapshot::Snapshot;
 use super::topic::{TopicId, Topics, Watched};
-use super::trace::{Tracer, WriterDescription};
+use super::trace::{LOOPBACK, Tracer, WriterDescription};
 use super::transport::{lacks_names, may_share_memory};
 use super::wall_clock::WallClock;
 use crate::watch::Watchlist;
@@ -415,6 +415,9 @@ impl Observer {
         let evidence = Priority {
             watched: false,
             local: match record.flags & flag::STREAM {
+                0 if self.settings.directed && shows_departure(record) => {
+                    self.receivers.found_here(sender)
+                }
                 0 => self.receivers.learn(record),
                 // A router's socket sends samples of many sessions.
                 _ => self.receivers.is_local(&sender),
@@ -481,9 +484,11 @@ impl Observer {
             discovery,
             topics,
             watchlist,
+            receivers,
             ..
         } = self;
-        tracer.record(record, || {
+        let is_local = receivers.is_local(&record.writer().prefix);
+        tracer.record(record, is_local, || {
             let endpoint = discovery.endpoints().get(&record.writer())?;
             let naming = naming(endpoint)?;
             let topic = topics.get(topics.find(endpoint.domain_id, &naming)?)?;
@@ -584,6 +589,13 @@ impl Observer {
             self.topics.leave(id, guid, now);
         }
     }
+}
+
+/// Returns whether the record shows that its sender is on this host, without a socket.
+const fn shows_departure(record: &Record) -> bool {
+    let on_wire = record.flags & flag::HOST == 0;
+    let leaves = record.flags & flag::OUTGOING != 0 || record.interface == LOOPBACK;
+    record.flags & flag::SHM != 0 || on_wire && leaves
 }
 
 pub(super) fn naming(endpoint: &Endpoint) -> Option<Naming> {

@@ -42,6 +42,8 @@ pub struct Receivers {
     /// Participants for which a socket of this host sends; at most as old as the last
     /// [`Self::tidy`].
     local: HashSet<GuidPrefix>,
+    /// Participants whose messages left this host, by a socket that is not seen or in shared memory.
+    here: HashSet<GuidPrefix>,
     addresses: AnnouncedAddresses,
     closed: HashSet<u64>,
     closings: VecDeque<u64>,
@@ -97,6 +99,7 @@ impl Receivers {
             users: HashMap::new(),
             processes: HashMap::new(),
             local: HashSet::new(),
+            here: HashSet::new(),
             addresses: AnnouncedAddresses::new(
                 participants.saturating_mul(MAX_ADDRESSES / 2),
                 MAX_ADDRESSES,
@@ -208,10 +211,20 @@ impl Receivers {
             .copied()
     }
 
-    /// Returns whether a socket of this host sends for this participant.
+    /// Returns whether this participant sends from this host.
     #[must_use]
     pub fn is_local(&self, prefix: &GuidPrefix) -> bool {
-        self.local.contains(prefix)
+        self.local.contains(prefix) || self.here.contains(prefix)
+    }
+
+    /// Records that a message of this participant left this host, by a socket that is not seen or
+    /// in shared memory. Returns whether there was room.
+    pub fn found_here(&mut self, prefix: GuidPrefix) -> bool {
+        let is_kept = self.here.len() < self.limit * MAX_CANDIDATES;
+        if is_kept {
+            self.here.insert(prefix);
+        }
+        is_kept || self.here.contains(&prefix)
     }
 
     /// Learns the owner of a socket from a record. Returns whether a socket of this host sent it,
@@ -319,6 +332,7 @@ impl Receivers {
             users,
             processes,
             local,
+            here,
             addresses,
             closed,
             closings,
@@ -343,6 +357,7 @@ impl Receivers {
             Size::new("receivers.users", users.len(), *limit),
             Size::new("receivers.processes", processes.len(), *limit),
             Size::new("receivers.local", local.len(), *limit * MAX_CANDIDATES),
+            Size::new("receivers.here", here.len(), *limit * MAX_CANDIDATES),
             Size::new("receivers.owners", of_one.unwrap_or(0), MAX_CANDIDATES),
             Size::new("receivers.closed", closed.len(), CLOSED),
             Size::new("receivers.closings", closings.len(), CLOSED),
@@ -354,6 +369,7 @@ impl Receivers {
     pub fn tidy(&mut self, discovery: &Discovery) {
         let is_there = |prefix: &GuidPrefix| discovery.knows(*prefix);
         self.addresses.retain(is_there);
+        self.here.retain(is_there);
         for users in self.users.values_mut() {
             users.senders.0.retain(is_there);
             users.addressed.0.retain(is_there);

@@ -12,11 +12,15 @@ use ros2probe_wire::DomainId;
 use super::glob;
 use super::names::DdsName;
 use super::naming::Naming;
+use super::snapshot::TopicFacts;
 use super::topic_kind::TopicKind;
 use crate::watch::{PatternError, check_pattern};
 
 /// Largest compiled size of a regular expression in bytes. Matching may use the same amount again.
 const REGEX_BYTES: usize = 256 << 10;
+
+/// Domain and DDS name, which identify a topic.
+pub type TopicKey = (DomainId, DdsName);
 
 /// How much of each sample a subscription receives.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -34,8 +38,8 @@ pub enum Choice {
     All,
     /// One topic by its ROS name, even if hidden, or by its DDS name.
     Name(String),
-    /// Topics by their DDS names, of which there may be thousands.
-    Names(BTreeSet<DdsName>),
+    /// Topics by their domains and DDS names, of which there may be thousands.
+    Topics(BTreeSet<TopicKey>),
     /// `*` within a token, `**` across tokens; covers hidden topics if it names a hidden token.
     Glob(String),
     /// Every topic with a match in its name.
@@ -72,6 +76,33 @@ pub struct Selection {
     pub exclude: Vec<Choice>,
     /// Whether [`Choice::All`], globs and regular expressions include hidden topics.
     pub hidden: bool,
+}
+
+/// Facts about a topic on which a selection depends.
+#[derive(Clone, Copy, Debug)]
+pub struct Candidate<'a> {
+    /// Domain.
+    pub domain_id: DomainId,
+    /// Role of the topic in ROS.
+    pub kind: TopicKind,
+    /// ROS name, or the DDS name if it follows no ROS convention.
+    pub name: &'a str,
+    /// DDS name.
+    pub dds_name: &'a DdsName,
+    /// Hidden by ROS convention.
+    pub hidden: bool,
+}
+
+impl<'a> From<&'a TopicFacts> for Candidate<'a> {
+    fn from(topic: &'a TopicFacts) -> Self {
+        Self {
+            domain_id: topic.domain_id,
+            kind: topic.kind,
+            name: &topic.name,
+            dds_name: &topic.dds_name,
+            hidden: topic.hidden,
+        }
+    }
 }
 
 /// A subscription of samples.
@@ -128,10 +159,17 @@ impl Choice {
         Ok(Self::Regex(regex))
     }
 
-    fn covers(&self, name: &str, dds_name: &str, is_ros: bool, hidden: bool) -> bool {
+    fn covers(&self, topic: &Candidate<'_>, hidden: bool) -> bool {
+        let (is_ros, dds_name) = (topic.kind.is_ros_topic(), topic.dds_name);
+        // The ROS name of a request topic is the service's, which a topic may have as well.
+        let name = if is_ros {
+            topic.name
+        } else {
+            dds_name.as_str()
+        };
         match self {
-            Self::Name(wanted) => wanted == name || wanted == dds_name,
-            Self::Names(wanted) => wanted.contains(dds_name),
+            Self::Name(wanted) => wanted == name || *wanted == **dds_name,
+            Self::Topics(wanted) => wanted.contains(&(topic.domain_id, dds_name.clone())),
             _ if !is_ros => false,
             Self::All => hidden,
             Self::Glob(glob) => (hidden || glob.contains("/_")) && glob::covers(glob, name),
@@ -175,11 +213,11 @@ impl Selection {
         }
     }
 
-    /// Selects topics by their DDS names.
+    /// Selects topics by their domains and DDS names.
     #[must_use]
-    pub fn of_names(names: impl IntoIterator<Item = DdsName>) -> Self {
+    pub fn of_topics(topics: impl IntoIterator<Item = TopicKey>) -> Self {
         Self {
-            include: vec![Choice::Names(names.into_iter().collect())],
+            include: vec![Choice::Topics(topics.into_iter().collect())],
             ..Self::default()
         }
     }
@@ -205,13 +243,10 @@ impl Selection {
     /// Returns whether the topic is selected. Service requests and replies, and topics without a
     /// ROS name, are selected only by their exact names.
     #[must_use]
-    pub fn covers(&self, kind: TopicKind, name: &str, dds_name: &str, hidden: bool) -> bool {
-        let is_ros = kind.is_ros_topic();
-        // The ROS name of a request topic is the service's, which a topic may have as well.
-        let name = if is_ros { name } else { dds_name };
-        let shown = self.hidden || !hidden;
-        let covers = |choice: &Choice| choice.covers(name, dds_name, is_ros, shown);
-        let named = |choice: &Choice| choice.covers(name, dds_name, is_ros, true);
+    pub fn covers(&self, topic: &Candidate<'_>) -> bool {
+        let shown = self.hidden || !topic.hidden;
+        let covers = |choice: &Choice| choice.covers(topic, shown);
+        let named = |choice: &Choice| choice.covers(topic, true);
         self.include.iter().any(covers) && !self.exclude.iter().any(named)
     }
 }
@@ -220,10 +255,14 @@ impl SampleRequest {
     /// Returns whether the request covers this topic.
     #[must_use]
     pub fn covers(&self, domain_id: DomainId, naming: &Naming) -> bool {
-        self.domain_id.is_none_or(|wanted| wanted == domain_id)
-            && self
-                .selection
-                .covers(naming.kind, &naming.name, &naming.dds_name, naming.hidden)
+        let topic = Candidate {
+            domain_id,
+            kind: naming.kind,
+            name: &naming.name,
+            dds_name: &naming.dds_name,
+            hidden: naming.hidden,
+        };
+        self.domain_id.is_none_or(|wanted| wanted == domain_id) && self.selection.covers(&topic)
     }
 }
 
@@ -309,9 +348,13 @@ mod tests {
             };
             assert!(!covers(&everything, dds_name), "{dds_name}");
             assert!(covers(&Selection::named([dds_name]).unwrap(), dds_name));
-            let names = || ["rt/points", dds_name].map(DdsName::from);
-            assert!(covers(&Selection::of_names(names()), dds_name));
-            assert!(!covers(&Selection::of_names(names()), "rt/add"));
+            let of_domain = |domain_id| {
+                let names = ["rt/points", dds_name].map(DdsName::from);
+                Selection::of_topics(names.map(|name| (DomainId(domain_id), name)))
+            };
+            assert!(covers(&of_domain(3), dds_name));
+            assert!(!covers(&of_domain(3), "rt/add"));
+            assert!(!covers(&of_domain(4), dds_name));
         }
         assert!(!covers(
             &Selection::named(["/add"]).unwrap(),

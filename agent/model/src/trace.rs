@@ -43,13 +43,14 @@ const ACKNACK_TIMEOUT: Duration = Duration::from_secs(10);
 /// time.
 const LOCAL_COPY_DELAY: Duration = Duration::from_millis(500);
 /// Index of the loopback interface in every network namespace.
-const LOOPBACK: u32 = 1;
+pub(super) const LOOPBACK: u32 = 1;
 
 /// The stage that a span covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SpanStage {
     /// The message leaves this host, or is on the wire if the direction is unknown: from the first
-    /// to the last fragment. On a gateway with a wire source, forwarded messages leave, too.
+    /// to the last fragment. On a gateway with a wire source, forwarded messages leave, too. In
+    /// shared memory, the time at which the agent sees the message.
     Send,
     /// The message arrives from another host: from the first to the last fragment.
     Receive,
@@ -158,6 +159,17 @@ struct Unacknowledged {
     readers: Vec<Guid>,
 }
 
+/// Where a sample was seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    /// Where it leaves its writer's host, or in that host's shared memory.
+    Departure,
+    /// At a receiver on its writer's host.
+    LocalCopy,
+    /// At a receiver; its writer is not known to run on this host.
+    Arrival,
+}
+
 impl Tracer {
     /// Creates a tracer without writers. In a capture file the direction is unknown: `directed` is
     /// then false, and all messages count as sent.
@@ -197,11 +209,13 @@ impl Tracer {
         }
     }
 
-    /// Processes a record. `about` returns the description and traced share of a new writer, or
+    /// Processes a record. `is_local` states whether the writer is known to run on this host, so
+    /// that no message of it arrives from another one. `about` returns the description and traced share of a new writer, or
     /// `None` if they are not known yet.
     pub fn record(
         &mut self,
         record: &Record,
+        is_local: bool,
         about: impl FnOnce() -> Option<(WriterDescription, Option<Share>)>,
     ) {
         const UNDELIVERED: u16 = flag::SOCKET_FULL | flag::NOT_REASSEMBLED;
@@ -225,7 +239,13 @@ impl Tracer {
             Body::Sample(sample)
                 if record.flags & UNDELIVERED == 0 && sample.status_info() == StatusInfo::ALIVE =>
             {
-                traced.sample(sample, self.directed, &mut self.shared);
+                let place = match self.directed {
+                    true => Place::of(record, is_local),
+                    false => Some(Place::Departure),
+                };
+                if let Some(place) = place {
+                    traced.sample(sample, place, &mut self.shared);
+                }
             }
             _ => {}
         }
@@ -352,25 +372,24 @@ impl WriterTrace {
         }
     }
 
-    fn sample(&mut self, sample: Sample<'_>, directed: bool, shared: &mut Shared) {
+    fn sample(&mut self, sample: Sample<'_>, place: Place, shared: &mut Shared) {
         let (record, number) = (sample.record(), sample.sequence_number());
         let trace_id = numbered(self.identity, number);
         if !self.share.takes(trace_id) {
             return;
         }
-        let on_wire = record.flags & flag::HOST == 0;
-        let leaves = record.flags & flag::OUTGOING != 0
-            || !directed
-            || on_wire && record.interface == LOOPBACK;
-        if leaves && !self.is_local {
+        if place != Place::Arrival && !self.is_local {
             self.forget_arrivals(shared);
         }
         // Copies that arrive do not belong to the departure.
-        if leaves != self.is_local || self.done.contains(&number) {
+        let is_copy = place == Place::LocalCopy || self.is_local && place == Place::Arrival;
+        if is_copy || self.done.contains(&number) {
             return;
         }
         let known = |message: &Message| message.sequence_number == number;
         let index = match self.under_way.iter().position(known) {
+            // The wire shows its fragments.
+            Some(_) if record.flags & flag::SHM != 0 => return,
             Some(index) => index,
             None => match self.begin(self.message(sample, trace_id), shared) {
                 Some(index) => index,
@@ -516,6 +535,22 @@ impl WriterTrace {
         let open = self.under_way.len() + self.waiting.len();
         shared.open = shared.open.saturating_sub(open);
         self.samples.clear(&mut shared.budget);
+    }
+}
+
+impl Place {
+    /// Returns the place; `None` for a message that a router of this host passes on.
+    const fn of(record: &Record, is_local: bool) -> Option<Self> {
+        let on_wire = record.flags & flag::HOST == 0;
+        let leaves = record.flags & (flag::OUTGOING | flag::SHM) != 0
+            || on_wire && record.interface == LOOPBACK;
+        let by_router = record.flags & flag::STREAM != 0 && !on_wire && !is_local;
+        match (leaves, is_local) {
+            (true, _) if by_router => None,
+            (true, _) => Some(Self::Departure),
+            (false, true) => Some(Self::LocalCopy),
+            (false, false) => Some(Self::Arrival),
+        }
     }
 }
 

@@ -4,7 +4,8 @@ import { test } from 'node:test';
 globalThis.document = /** @type {any} */ ({ addEventListener() {}, baseURI: 'http://x/' });
 globalThis.window = /** @type {any} */ ({ addEventListener() {} });
 globalThis.location = /** @type {any} */ ({ hash: '' });
-const { grouped } = await import('../views/overview.js');
+const { grouped, Incomplete } = await import('../views/overview.js');
+const { state } = await import('../store.js');
 
 test('endpoints of a topic without a counterpart are one finding, others stay', () => {
   const finding = (/** @type {string} */ kind, /** @type {number|null} */ topic) => ({ kind, topic });
@@ -14,4 +15,15 @@ test('endpoints of a topic without a counterpart are one finding, others stay', 
   const [firsts, more] = grouped(/** @type {any} */ (list));
   assert.deepEqual(firsts, [list[0], list[1], list[3], list[4], list[6]]);
   assert.deepEqual([...more], [[list[1], 2]]);
+});
+
+test('a page without topics says that writers send whose announcement was missed', () => {
+  state.findings = [];
+  assert.equal(Incomplete({ missing: 'this lacks them' }), undefined);
+  state.findings = [/** @type {any} */ ({ kind: 'unknown_writers', severity: 'warning',
+    text: 'Writers are active', remedy: 'sudo rp discover --all' })];
+  const shown = JSON.stringify(Incomplete({ missing: 'this lacks them' }));
+  for (const part of ['Writers are active', 'this lacks them', 'sudo rp discover --all']) {
+    assert.ok(shown.includes(part), `${part}: ${shown}`);
+  }
 });

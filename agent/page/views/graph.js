@@ -10,6 +10,7 @@ import { Camera } from '../camera.js';
 import { chainsThrough, graphWords, marked, NO_CHAIN, section, throughGraph, wayOf }
   from '../chains.js';
 import { ChainField, ChainLinks, useChains } from './chains.js';
+import { Incomplete } from './overview.js';
 
 /** Delay between a change of the structure and its layout. */
 const SETTLE_MS = 500;
@@ -151,7 +152,7 @@ export function Graph({ query }) {
     <${Failed} problem=${asked.problem} what="No services and actions" />
     ${failed && html`<p class="problem">${failed}</p>`}
     ${!graph.vertices.length && html`<p class="empty">${focus
-      ? 'The selected node or topic does not exist now.' : 'No node has been announced yet.'}</p>`}
+      ? 'The selected node or topic does not exist now.' : 'No node is known.'}</p><${Incomplete} missing="the graph lacks them" />`}
     ${picture && graph.vertices.length > 0 && html`<div class="graph">
       <${Drawing} graph=${graph} picture=${picture} chosen=${chosen} choose=${choose}
         toggle=${toggle} own=${drawing} marks=${marks} />

@@ -11,6 +11,7 @@ import { sorted, Table } from '../table.js';
 import { Failed, Filter, html, Mark, matches, Name, NodeLink } from '../ui.js';
 import { InChains } from './chains.js';
 import { Findings } from './overview.js';
+import { Incomplete } from './overview.js';
 
 const EVERY_MS = 2000;
 
@@ -129,7 +130,8 @@ export function Nodes({ query }) {
       keyOf=${(/** @type {any} */ node) => node.id}
       onSort=${(/** @type {string} */ next) => change({ sort: next })} />
     ${!rows.length && html`<p class="empty">${state.nodes.size ? 'No node matches.'
-      : 'No node has been announced yet.'}</p>`}`;
+      : 'No node is known.'}</p>`}
+    <${Incomplete} missing="their nodes may be missing here" />`;
 }
 
 /** @param {{name: string, query: Record<string, string>}} props */

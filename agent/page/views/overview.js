@@ -99,6 +99,7 @@ function Totals() {
   const [rates, sizes, losses] = state.totalSeries.map((series) => series.points);
   const shown = [...state.topics.values()].filter((topic) => !topic.hidden && !topic.vanished);
   const nodes = [...state.nodes.values()].filter((node) => !node.hidden);
+  const unknown = state.agent?.unknown_writers ?? 0;
   return html`<section aria-labelledby="totals"><h2 id="totals">Now</h2><div class="figures">
     <${Figure} label="messages a second" value=${rate(messages).replace('Hz', '/s')} points=${rates} />
     <${Figure} label="bytes a second" value=${bandwidth(bytes)} points=${sizes} />
@@ -107,7 +108,20 @@ function Totals() {
     <${Figure} label="topics" value=${count(shown.length)} href=${address('topics')} />
     <${Figure} label="topics measured" value=${count(measured)}
       href=${address('topics', null, { only: 'measured' })} />
-  </div></section>`;
+    ${unknown > 0 && html`<${Figure} label="writers without a known topic"
+      value=${count(unknown)} href=${address('agent')} />`}
+  </div><${Incomplete} missing="the other figures leave them out" /></section>`;
+}
+
+/**
+ * What is missing because the agent started late: writers that send on unknown topics.
+ * @param {{missing: string}} props what a view leaves out
+ */
+export function Incomplete({ missing }) {
+  const finding = state.findings.find((each) => each.kind === 'unknown_writers');
+  return finding && html`<p class="incomplete"><${Mark} severity="warning" />
+    ${' '}${finding.text}: ${missing}. <span class="remedy">Remedy: <${Name}
+    text=${finding.remedy ?? ''} /></span></p>`;
 }
 
 function Busiest() {

@@ -6,6 +6,7 @@ import { address } from '../router.js';
 import { replaceAddress, state, useLive } from '../store.js';
 import { sorted, Table } from '../table.js';
 import { Act, Badges, FLAGS, Filter, html, matches, Name, Spark, TopicLink, worst } from '../ui.js';
+import { Incomplete } from './overview.js';
 
 const SEVERITY = /** @type {Record<string, number>} */ ({ error: 0, warning: 1, note: 2, good: 3 });
 
@@ -114,5 +115,6 @@ export function Topics({ query }) {
       keyOf=${(/** @type {any} */ topic) => topic.id}
       onSort=${(/** @type {string} */ next) => change({ sort: next })} />
     ${!rows.length && html`<p class="empty">${state.topics.size
-      ? 'No topic matches.' : 'No topic has been announced yet.'}</p>`}`;
+      ? 'No topic matches.' : 'No topic is known.'}</p>`}
+    <${Incomplete} missing="they are not in the table" />`;
 }

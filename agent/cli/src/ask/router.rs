@@ -2,8 +2,10 @@
 //! graph that the router announces.
 
 use std::io::{Write, stdout};
+use std::path::Path;
 
 use anyhow::{Result, bail};
+use ros2probe_daemon::agent::configuration;
 use ros2probe_daemon::discover::zenoh::address::RouterAddress;
 use ros2probe_daemon::discover::zenoh::graph::{DomainGraph, EndpointKind};
 use ros2probe_daemon::discover::zenoh::session::Step;
@@ -12,6 +14,8 @@ use ros2probe_daemon::privilege::{Role, give_up};
 
 use crate::cli::Discover;
 
+/// Mount point of the control groups of version 2.
+const CGROUP_ROOT: &str = "/sys/fs/cgroup";
 /// Kinds of endpoints in the order of the report: one, several.
 const KINDS: [(EndpointKind, &str, &str); 4] = [
     (EndpointKind::Publisher, "publisher", "publishers"),
@@ -22,6 +26,7 @@ const KINDS: [(EndpointKind, &str, &str); 4] = [
 
 /// Requests the graph from the router at this address.
 pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()> {
+    let unseen = unseen();
     // A connection needs no capability.
     give_up(Role::Export)?;
     let mut out = stdout().lock();
@@ -34,6 +39,9 @@ pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()
         let (what, bytes, note) = (message.what, message.bytes, message.note);
         writeln!(out, "  {what}, {bytes} bytes{note}")?;
     }
+    if let Some(note) = unseen {
+        writeln!(out, "{note}")?;
+    }
     if options.dry_run {
         return Ok(());
     }
@@ -42,6 +50,33 @@ pub(super) fn discover(address: &RouterAddress, options: &Discover) -> Result<()
     let (stream, peer) = connect(address)?;
     let answer = converse(stream, peer, options.domain)?;
     report(&answer, &mut out)
+}
+
+/// Returns why an agent with the configuration of this host does not see the answer. `None` if it
+/// does, or if the configuration cannot be read.
+fn unseen() -> Option<String> {
+    let (config, _) = configuration(None).ok()?;
+    let own = std::fs::read_to_string("/proc/self/cgroup").ok()?;
+    outside(config.capture.cgroup.as_deref()?, &own)
+}
+
+/// Returns the note if `own`, the text of `/proc/self/cgroup`, names no group within `observed`.
+fn outside(observed: &Path, own: &str) -> Option<String> {
+    let own = own.lines().find_map(|line| line.strip_prefix("0::/"))?;
+    let root = Path::new(CGROUP_ROOT);
+    if root.join(own).starts_with(observed) {
+        return None;
+    }
+    let name = observed.file_name().unwrap_or_default().to_string_lossy();
+    let remedy = match name.ends_with(".slice") {
+        true => format!("`sudo systemd-run --slice={name} --pipe --wait rp discover --router`"),
+        false => "start this command in that control group".to_owned(),
+    };
+    Some(format!(
+        "the agent observes only {} (capture.cgroup), and this command runs in /{own}: the agent \
+         may keep nothing of the answer; {remedy}",
+        observed.display()
+    ))
 }
 
 fn report(answer: &Answer, out: &mut impl Write) -> Result<()> {
@@ -99,5 +134,40 @@ fn number(count: usize, one: &str, several: &str) -> String {
     match count {
         1 => format!("1 {one}"),
         _ => format!("{count} {several}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_outside_the_observed_control_group_is_reported_with_the_remedy() {
+        let observed = Path::new("/sys/fs/cgroup/robot.slice");
+        for inside in [
+            "0::/robot.slice\n",
+            "1:name=x:/\n0::/robot.slice/nav.service\n",
+        ] {
+            assert_eq!(outside(observed, inside), None, "{inside}");
+        }
+        let note = outside(observed, "0::/user.slice/user-0.slice/session-1.scope\n").unwrap();
+        assert!(
+            note.contains("/sys/fs/cgroup/robot.slice (capture.cgroup)"),
+            "{note}"
+        );
+        assert!(
+            note.contains("runs in /user.slice/user-0.slice/session-1.scope:"),
+            "{note}"
+        );
+        let remedy = "`sudo systemd-run --slice=robot.slice --pipe --wait rp discover --router`";
+        assert!(note.ends_with(remedy), "{note}");
+        // A name that only begins alike is another group.
+        assert!(outside(observed, "0::/robot.slice2\n").is_some());
+        let container = Path::new("/sys/fs/cgroup/docker/0123");
+        let note = outside(container, "0::/\n").unwrap();
+        assert!(
+            note.ends_with("start this command in that control group"),
+            "{note}"
+        );
     }
 }

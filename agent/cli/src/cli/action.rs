@@ -7,10 +7,11 @@ use anyhow::Result;
 use clap::{Args, Subcommand};
 use ros2probe::client::Target;
 use ros2probe::ros2::{action, topic};
+use ros2probe_api::names::Names;
 use ros2probe_api::nodes::Named;
 
 use super::events::ActionEcho;
-use super::shared::{Graph, print_or_fail, print_text};
+use super::shared::{Graph, print_found, print_or_fail, print_text};
 
 /// `rp action VERB`.
 #[derive(Args, Debug)]
@@ -93,7 +94,8 @@ impl Action {
 
 impl List {
     fn ask(self) -> Result<ExitCode> {
-        let actions = actions(&self.target)?.into_iter();
+        let names = Graph::reach(&self.target)?.names()?;
+        let actions = action::of_topics(&names.topics);
         print_text(&action::list(actions, self.show_types, self.count_actions))
     }
 }
@@ -109,23 +111,23 @@ impl Info {
 
 impl Type {
     fn ask(self) -> Result<ExitCode> {
-        let actions = actions(&self.target)?;
-        let kind = topic::type_of(&self.action_name, actions.iter().map(typed));
-        print_or_fail(kind.as_deref())
+        let found = Graph::reach(&self.target)?.find(|names| {
+            let actions: Vec<_> = action::of_topics(&names.topics).collect();
+            topic::type_of(&self.action_name, actions.iter().map(typed))
+        })?;
+        print_or_fail(found.as_deref())
     }
 }
 
 impl Find {
     fn ask(self) -> Result<ExitCode> {
-        let actions = actions(&self.target)?;
-        let typed = actions.iter().map(typed);
-        print_text(&topic::find(&self.action_type, typed, self.count_actions))
+        let graph = Graph::reach(&self.target)?;
+        let found = |names: &Names<'_>, count| {
+            let actions: Vec<_> = action::of_topics(&names.topics).collect();
+            topic::find(&self.action_type, actions.iter().map(typed), count)
+        };
+        print_found(&graph, self.count_actions, found)
     }
-}
-
-fn actions(target: &Target) -> Result<Vec<Named<'static>>> {
-    let names = Graph::reach(target)?.names()?;
-    Ok(action::of_topics(&names.topics).collect())
 }
 
 fn typed<'a>(action: &'a Named<'a>) -> (&'a str, &'a [Cow<'a, str>]) {

@@ -10,7 +10,7 @@ use ros2probe::ros2::{service, topic};
 use ros2probe_api::names::{Names, ServiceName};
 
 use super::events::ServiceEcho;
-use super::shared::{Graph, Spinning, answer, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
 
 /// `rp service VERB`.
 #[derive(Args, Debug)]
@@ -116,30 +116,31 @@ impl List {
 
 impl Type {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let names = Graph::reach(&self.target)?.names()?;
-        let services = shown(&names, hidden).map(typed);
-        print_or_fail(topic::type_of(&self.service_name, services).as_deref())
+        let found = Graph::reach(&self.target)?
+            .find(|names| topic::type_of(&self.service_name, shown(names, hidden).map(typed)))?;
+        print_or_fail(found.as_deref())
     }
 }
 
 impl Find {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let names = Graph::reach(&self.target)?.names()?;
-        let services = shown(&names, hidden || self.include_hidden_services).map(typed);
-        print_text(&topic::find(
-            &self.service_type,
-            services,
-            self.count_services,
-        ))
+        let hidden = hidden || self.include_hidden_services;
+        let graph = Graph::reach(&self.target)?;
+        let found = |names: &Names<'_>, count| {
+            topic::find(&self.service_type, shown(names, hidden).map(typed), count)
+        };
+        print_found(&graph, self.count_services, found)
     }
 }
 
 impl Info {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
         let graph = Graph::reach(&self.target)?;
-        let names = graph.names()?;
-        let services = shown(&names, hidden);
-        let mut text = service::info(&self.service_name, services, self.target.dialect());
+        let dialect = self.target.dialect();
+        let info =
+            |names: &Names<'_>| service::info(&self.service_name, shown(names, hidden), dialect);
+        let found = graph.find(|names| info(names).ok())?;
+        let mut text = found.map_or_else(|| info(&Names::default()), Ok);
         if self.verbose
             && let Ok(text) = &mut text
         {

@@ -14,6 +14,7 @@ use ros2probe_api::path::encoded;
 use ros2probe_api::problem::Code;
 use ros2probe_api::services::ServiceList;
 use ros2probe_api::topics::Topic;
+use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
 use serde::de::DeserializeOwned;
 
 use super::{Output, UserError};
@@ -86,6 +87,20 @@ impl Graph {
         names_of(&self.agent, self.domain_id)
     }
 
+    /// All names, and the answer about some of them. The reason for missing names is printed only
+    /// without an answer: names that are missing change nothing about those that are known.
+    pub(crate) fn find<T>(
+        &self,
+        answer: impl FnOnce(&Names<'static>) -> Option<T>,
+    ) -> Result<Option<T>> {
+        let names = fetch(&self.agent, self.domain_id)?;
+        let answer = answer(&names);
+        if answer.is_none() {
+            explain(&names, &self.agent, self.domain_id);
+        }
+        Ok(answer)
+    }
+
     /// The topic of this name. `None` if it does not exist.
     pub(crate) fn topic(&self, name: &str) -> Result<Option<Topic<'static>>> {
         self.thing("topics", name, Code::NoSuchTopic)
@@ -112,7 +127,10 @@ impl Graph {
         let path = format!("/{noun}/{name}?domain_id={domain_id}{hidden}");
         match self.agent.get_visible(&path) {
             Ok(found) => Ok(Some(found)),
-            Err(error @ ClientError::Refused(_)) if error.is(code) => Ok(None),
+            Err(error @ ClientError::Refused(_)) if error.is(code) => {
+                explain_late(&fetch(&self.agent, self.domain_id)?, &self.agent);
+                Ok(None)
+            }
             Err(error) => Err(error.into()),
         }
     }
@@ -124,8 +142,17 @@ static EXPLAINED: Once = Once::new();
 /// All names in a domain, including hidden ones. The reason for missing names is printed once on
 /// stderr.
 pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
-    let names: Names<'_> =
-        agent.get_visible(&format!("/names?domain_id={domain_id}&hidden=true"))?;
+    let names = fetch(agent, domain_id)?;
+    explain(&names, agent, domain_id);
+    Ok(names)
+}
+
+fn fetch(agent: &Agent, domain_id: u32) -> Result<Names<'static>> {
+    Ok(agent.get_visible(&format!("/names?domain_id={domain_id}&hidden=true"))?)
+}
+
+/// Prints why names are missing, if any may be.
+fn explain(names: &Names<'_>, agent: &Agent, domain_id: u32) {
     let others = names.domains.iter().filter(|other| **other != domain_id);
     let others: Vec<String> = others.map(u32::to_string).collect();
     if names.is_empty() && !others.is_empty() {
@@ -134,10 +161,14 @@ pub(crate) fn names_of(agent: &Agent, domain_id: u32) -> Result<Names<'static>> 
             others.join(", ")
         );
     }
-    if let Some(text) = late(&names, agent.is_replay()) {
+    explain_late(names, agent);
+}
+
+/// Prints that announcements were missed, if any were.
+fn explain_late(names: &Names<'_>, agent: &Agent) {
+    if let Some(text) = late(names, agent.is_replay()) {
         EXPLAINED.call_once(|| eprintln!("rp: {text}"));
     }
-    Ok(names)
 }
 
 /// Note about announcements that were made before the agent or the capture started. Endpoints are
@@ -146,8 +177,10 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
     let Names {
         participants,
         unknown_writers,
+        remedy,
         ..
     } = names;
+    let remedy = remedy.as_deref().unwrap_or(DISCOVER);
     let what = match (names.topics.is_empty(), unknown_writers) {
         (true, _) if *participants == 1 => {
             let what =
@@ -155,28 +188,34 @@ fn late(names: &Names<'_>, is_replay: bool) -> Option<String> {
             return Some(if is_replay {
                 format!("{what} announces none")
             } else {
-                format!(
-                    "{what} announces them when a second one starts; `rp discover --all` requests \
-                     them"
-                )
+                format!("{what} announces them when a second one starts; `{remedy}` requests them")
             });
         }
         (true, _) if *participants > 1 => {
             format!("{participants} participants are known, but none of their topics")
         }
         (_, 0) => return None,
-        (_, 1) => {
-            "1 writer is active whose announcement was missed; its topic is unknown".to_owned()
-        }
-        (_, many) => format!(
-            "{many} writers are active whose announcement was missed; their topics are unknown"
-        ),
+        (_, many) => sentence(*many),
     };
     Some(if is_replay {
         format!("{what}: the capture lacks their announcements")
     } else {
-        format!("{what}: the agent started after them; `rp discover` requests their announcements")
+        format!("{what}: {}", explanation(remedy))
     })
+}
+
+/// Prints the names of one type, or their number with `count`. `found` returns the text of either.
+pub(crate) fn print_found(
+    graph: &Graph,
+    count: bool,
+    found: impl Fn(&Names<'_>, bool) -> String,
+) -> Result<ExitCode> {
+    let text = graph.find(|names| {
+        let is_any = !found(names, false).is_empty();
+        is_any.then(|| found(names, count))
+    })?;
+    let none = || found(&Names::default(), count);
+    print_text(&text.unwrap_or_else(none))
 }
 
 /// Prints a text and returns success.

@@ -12,7 +12,7 @@ use ros2probe_api::names::{Names, TopicName};
 use super::echo::Echo;
 use super::interrupt::INTERRUPTED;
 use super::rates::{Bandwidth, Delay, Hz};
-use super::shared::{Graph, Spinning, answer, print_or_fail, print_text};
+use super::shared::{Graph, Spinning, answer, print_found, print_or_fail, print_text};
 
 /// `rp topic VERB`.
 #[derive(Args, Debug)]
@@ -152,17 +152,20 @@ impl Info {
 
 impl Type {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let names = Graph::reach(&self.target)?.names()?;
-        let topics = shown(&names, hidden).map(typed);
-        print_or_fail(topic::type_of(&self.topic_name, topics).as_deref())
+        let found = Graph::reach(&self.target)?
+            .find(|names| topic::type_of(&self.topic_name, shown(names, hidden).map(typed)))?;
+        print_or_fail(found.as_deref())
     }
 }
 
 impl Find {
     fn ask(self, hidden: bool) -> Result<ExitCode> {
-        let names = Graph::reach(&self.target)?.names()?;
-        let topics = shown(&names, hidden || self.include_hidden_topics).map(typed);
-        print_text(&topic::find(&self.topic_type, topics, self.count_topics))
+        let hidden = hidden || self.include_hidden_topics;
+        let graph = Graph::reach(&self.target)?;
+        let found = |names: &Names<'_>, count| {
+            topic::find(&self.topic_type, shown(names, hidden).map(typed), count)
+        };
+        print_found(&graph, self.count_topics, found)
     }
 }
 

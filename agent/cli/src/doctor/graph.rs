@@ -9,6 +9,7 @@ use crate::top::text::counted;
 use ros2probe_api::health::Health;
 use ros2probe_api::participants::Participant;
 use ros2probe_api::topics::Topic;
+use ros2probe_daemon::missed_announcements::{self, DISCOVER, is_zenoh};
 
 const AREA: Area = Area::Graph;
 /// Adds remedies to a finding.
@@ -122,7 +123,8 @@ fn alone(participants: &[Participant<'_>]) -> Option<Finding> {
     );
     let finding = Finding::new(AREA, "alone", Severity::Note, sentence);
     let finding = finding.seen(domains.len().to_string(), "GET /participants");
-    Some(finding.remedy("sudo rp discover --all    # requests them: a few packets"))
+    let remedy = remedy_of(alone.into_iter());
+    Some(finding.remedy(format!("{remedy}    # requests them: a few packets")))
 }
 
 /// Finding for participants that started before the agent and whose names are unknown.
@@ -132,7 +134,8 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
         let is_nameless = has_nothing || each.enclave.is_some() && each.nodes.is_empty();
         !each.secured && is_nameless && !is_alone(each, participants)
     };
-    let count = participants.iter().filter(is_nameless).count();
+    let nameless = participants.iter().filter(is_nameless);
+    let count = nameless.clone().count();
     if count == 0 {
         return None;
     }
@@ -142,9 +145,16 @@ fn names(participants: &[Participant<'_>]) -> Option<Finding> {
     );
     let finding = Finding::new(AREA, "names", Severity::Warning, sentence);
     let finding = finding.seen(count.to_string(), "GET /participants");
-    Some(finding.remedy(
-        "sudo rp discover --all --dry-run    # then without --dry-run: a few packets to each",
-    ))
+    let remedy = remedy_of(nameless);
+    Some(finding.remedy(format!(
+        "{remedy}    # a few packets; with --dry-run it only prints them"
+    )))
+}
+
+/// Returns the command that requests the announcements of these participants.
+fn remedy_of<'a>(participants: impl Iterator<Item = &'a Participant<'a>>) -> &'static str {
+    let of_zenoh = participants.map(|participant| is_zenoh(&participant.vendor));
+    missed_announcements::command(of_zenoh).unwrap_or(DISCOVER)
 }
 
 fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
@@ -163,18 +173,14 @@ fn restored(participants: &[Participant<'_>]) -> Option<Finding> {
 fn unknown_writers(answers: &Answers) -> Option<Finding> {
     let writers = &answers.participants.unknown_writers;
     let first = writers.first()?;
-    let sentence = match writers.len() {
-        1 => "1 writer is active whose announcement was missed; its topic is unknown".to_owned(),
-        count => format!(
-            "{count} writers are active whose announcement was missed; their topics are unknown"
-        ),
-    };
+    let sentence = missed_announcements::sentence(writers.len());
     let finding = Finding::new(AREA, "unknown_writers", Severity::Warning, sentence);
     let finding = finding.seen(
         format!("{}: {}", writers.len(), first.guid),
         "GET /participants",
     );
-    Some(finding.remedy("sudo rp discover --all    # requests the announcements"))
+    let remedy = missed_announcements::remedy_for(writers)?;
+    Some(finding.remedy(format!("{remedy}    # requests the announcements")))
 }
 
 fn secured(participants: &[Participant<'_>]) -> Option<Finding> {

@@ -2,6 +2,7 @@
 //! must never look healthy.
 
 use ros2probe_api::health::Health;
+use ros2probe_daemon::missed_announcements::{DISCOVER, explanation, sentence};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
@@ -189,10 +190,9 @@ fn warnings(app: &App, now: Instant) -> Vec<Styled> {
         ));
     }
     if health.unknown_writers > 0 {
-        let writers = counted(health.unknown_writers as u64, "writer");
-        warn(format!(
-            "{writers} without a known topic: `rp discover` requests their announcements"
-        ));
+        let remedy = health.unknown_writers_remedy.as_deref();
+        let (what, remedy) = (sentence(health.unknown_writers), remedy.unwrap_or(DISCOVER));
+        warn(format!("{what}: {}", explanation(&safe(remedy))));
     }
     if health.topics_rejected > 0 {
         let topics = counted(health.topics_rejected, "watched topic");

@@ -3,6 +3,7 @@
 
 mod begin_and_end;
 mod captures;
+mod late;
 
 use std::collections::BTreeMap;
 use std::io::{BufRead as _, BufReader};

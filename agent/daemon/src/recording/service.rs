@@ -23,7 +23,7 @@ use crate::limit_facts::{LimitFigures, Slot, Slots};
 use crate::recording::RecordingFigures;
 use crate::snapshot_cell::SnapshotCell;
 use crate::subscriptions::{
-    ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
+    Candidate, ChoiceError, Depth, NextItem, Overflow, Refused, Request, Selection, Subscription,
     Subscriptions,
 };
 use ros2probe_api::recording_report::Report;
@@ -260,9 +260,7 @@ impl Recordings {
         let state = self.latest.state();
         let selection = subscription.selection();
         let covered = state.known().topics.iter().filter(|topic| {
-            let (kind, hidden) = (topic.kind, topic.hidden);
-            topic.domain_id == DomainId(domain_id)
-                && selection.covers(kind, &topic.name, &topic.dds_name, hidden)
+            topic.domain_id == DomainId(domain_id) && selection.covers(&Candidate::from(*topic))
         });
         let covered = covered.take(self.caps.caps().topics);
         recorder.declare(covered.filter_map(|topic| {

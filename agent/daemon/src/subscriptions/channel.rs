@@ -12,9 +12,8 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
-use super::{Choice, Depth, Item, Overflow, Request, Selection};
+use super::{Choice, Depth, Item, Overflow, Request, Selection, TopicKey};
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
-use ros2probe_model::names::DdsName;
 use ros2probe_model::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
@@ -134,17 +133,17 @@ impl Channel {
         Arc::clone(&self.wanted().selection)
     }
 
-    /// Replaces the selection by names. The retained samples of those in `fresh` are due.
-    pub(super) fn select(&self, names: BTreeSet<DdsName>, mut fresh: BTreeSet<DdsName>) {
+    /// Replaces the selection by topics. The retained samples of those in `fresh` are due.
+    pub(super) fn select(&self, topics: BTreeSet<TopicKey>, mut fresh: BTreeSet<TopicKey>) {
         let mut wanted = self.wanted();
         let due = wanted.fresh.take();
         for choice in due.iter().flat_map(|due| &due.include) {
-            if let Choice::Names(due) = choice {
-                fresh.extend(due.intersection(&names).cloned());
+            if let Choice::Topics(due) = choice {
+                fresh.extend(due.intersection(&topics).cloned());
             }
         }
-        wanted.fresh = Some(Arc::new(Selection::of_names(fresh)));
-        wanted.selection = Arc::new(Selection::of_names(names));
+        wanted.fresh = Some(Arc::new(Selection::of_topics(fresh)));
+        wanted.selection = Arc::new(Selection::of_topics(topics));
     }
 
     pub(super) fn request(&self) -> SampleRequest {

@@ -27,12 +27,11 @@ use crate::snapshot_cell::SnapshotCell;
 use channel::Channel;
 use retained::Retained;
 use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome};
-use ros2probe_model::names::DdsName;
 use ros2probe_model::selection::SampleRequest;
 
 pub use ros2probe_model::dispatch::{Missed, MissedReason, Topic};
 pub use ros2probe_model::header::begins_with_header;
-pub use ros2probe_model::selection::{Choice, ChoiceError, Depth, Selection};
+pub use ros2probe_model::selection::{Candidate, Choice, ChoiceError, Depth, Selection, TopicKey};
 
 /// Most regular expressions in all subscriptions together.
 const MAX_REGEXES: usize = 16;
@@ -430,10 +429,10 @@ impl Subscription {
         self.channel.selection()
     }
 
-    /// Replaces the selection by exact names. The retained samples of those in `fresh` follow.
-    pub fn select(&self, names: BTreeSet<DdsName>, fresh: BTreeSet<DdsName>) {
+    /// Replaces the selection by these topics. The retained samples of those in `fresh` follow.
+    pub fn select(&self, topics: BTreeSet<TopicKey>, fresh: BTreeSet<TopicKey>) {
         let changing = self.all.changing();
-        self.channel.select(names, fresh);
+        self.channel.select(topics, fresh);
         self.all.change(self.all.channels.load().to_vec());
         drop(changing);
         self.all.latest.bell().ring();

@@ -76,8 +76,17 @@ struct Hop {
     is_over: bool,
 }
 
+/// Facts about the input of a publication that begins a chain.
+#[derive(Debug, Default)]
+pub struct Origin {
+    /// The node that publishes the input; `None` if it is not known, or one of several.
+    pub node: Option<NodeName>,
+    /// Share of the input's traces that is exported.
+    pub share: Option<Share>,
+}
+
 /// What decides about the trace of a publication.
-enum Origin {
+enum Decision {
     /// The share of its input's traces: it begins a chain.
     Share(Share),
     /// The publication that it continues.
@@ -85,12 +94,12 @@ enum Origin {
 }
 
 impl Causality {
-    /// Adds a publication. `share` returns the traced share of its input.
+    /// Adds a publication. `origin` returns the facts about its input if it begins a chain.
     pub(super) fn add(
         &mut self,
         publication: &CausalPublication,
         now: Timestamp,
-        share: impl FnOnce() -> Option<Share>,
+        origin: impl FnOnce() -> Origin,
         tracer: &mut ChainTracer,
     ) {
         let CausalPublication {
@@ -119,11 +128,11 @@ impl Causality {
         };
         let mut latest = self.publications.iter_mut().rev().take(SEARCHED);
         let before = latest.find(is_origin);
-        let (mut topics, mut points, origin) = match before {
+        let (mut topics, mut points, decision) = match before {
             Some(hop) if hop.points.len() <= MAX_HOPS => {
                 hop.is_over = true;
-                let origin = hop.traced.map(Origin::Hop);
-                (hop.topics.clone(), hop.points.clone(), origin)
+                let decision = hop.traced.map(Decision::Hop);
+                (hop.topics.clone(), hop.points.clone(), decision)
             }
             _ => {
                 let point = Point {
@@ -131,8 +140,9 @@ impl Causality {
                     arrived: None,
                     started: None,
                 };
-                let share = is_known.then(share).flatten().map(Origin::Share);
-                (vec![(input.clone(), None)], vec![point], share)
+                let Origin { node, share } = origin();
+                let share = share.filter(|_| is_known).map(Decision::Share);
+                (vec![(input.clone(), node)], vec![point], share)
             }
         };
         if let Some(point) = points.last_mut() {
@@ -145,20 +155,24 @@ impl Causality {
             arrived: None,
             started: None,
         });
-        let traced = origin.zip(points.last_chunk()).and_then(|(origin, ends)| {
-            let [input, output] = *ends;
-            let step = Step {
-                publication,
-                input,
-                output,
-            };
-            let latest = self.publications.iter().rev().take(SEARCHED);
-            let known = latest.filter_map(|hop| hop.traced);
-            match origin {
-                Origin::Share(share) => step.begin(share, known, tracer),
-                Origin::Hop(before) => Some(step.go_on(before, known, tracer)),
-            }
-        });
+        let source = topics.first().and_then(|(_, node)| node.as_ref());
+        let traced = decision
+            .zip(points.last_chunk())
+            .and_then(|(decision, ends)| {
+                let [input, output] = *ends;
+                let step = Step {
+                    publication,
+                    source,
+                    input,
+                    output,
+                };
+                let latest = self.publications.iter().rev().take(SEARCHED);
+                let known = latest.filter_map(|hop| hop.traced);
+                match decision {
+                    Decision::Share(share) => step.begin(share, known, tracer),
+                    Decision::Hop(before) => Some(step.go_on(before, known, tracer)),
+                }
+            });
         if self.publications.len() >= MAX_PUBLICATIONS {
             self.publications.pop_front();
             self.evictions += 1;

@@ -41,6 +41,8 @@ pub(super) struct Output {
     pub(super) share: Option<Share>,
     /// Whether a node that publishes reads it.
     pub(super) is_read: bool,
+    /// Whether such a node runs on another host, as far as this is known.
+    pub(super) is_read_elsewhere: bool,
 }
 
 /// The writers of measured topics with a header.
@@ -69,11 +71,12 @@ impl NodeView {
 
 impl Graph {
     /// Builds the graph from discovery and the measured topics. `share` returns the traced share of
-    /// a topic.
+    /// a topic, `is_local` whether a participant runs on this host.
     pub(super) fn of(
         discovery: &Discovery,
         topics: &Topics,
         share: impl Fn(&Topic) -> Option<Share>,
+        is_local: impl Fn(&GuidPrefix) -> bool,
     ) -> Self {
         let owners = owners(discovery);
         let mut nodes: HashMap<(GuidPrefix, Option<&NodeName>), Inputs> = HashMap::new();
@@ -100,7 +103,7 @@ impl Graph {
             }
         }
         let mut views = HashMap::new();
-        let mut read = BTreeSet::new();
+        let (mut read, mut read_elsewhere) = (BTreeSet::new(), BTreeSet::new());
         for (owner, domain_id) in domains {
             let inputs = nodes.remove(&owner).unwrap_or_default();
             let (prefix, name) = owner;
@@ -116,6 +119,9 @@ impl Graph {
                 },
             };
             read.extend(view.inputs.keys().copied());
+            if !is_local(&prefix) {
+                read_elsewhere.extend(view.inputs.keys().copied());
+            }
             views.insert(owner, Arc::new(view));
         }
         let mut outputs = HashMap::with_capacity(writers.len());
@@ -133,6 +139,7 @@ impl Graph {
                     .unwrap_or_default(),
                 share: share(topic),
                 is_read: read.contains(&id),
+                is_read_elsewhere: read_elsewhere.contains(&id),
             };
             outputs.insert(writer, Arc::new(output));
         }
@@ -172,6 +179,33 @@ pub(super) fn owners(discovery: &Discovery) -> HashMap<Guid, &NodeName> {
         }
     }
     owners
+}
+
+/// Returns the node that publishes a topic. Of several, `is_meant` selects one; `None` if it does
+/// not, or if a publisher's node is not known.
+pub(crate) fn publisher(
+    discovery: &Discovery,
+    topic: &Topic,
+    is_meant: impl Fn(&NodeName) -> bool,
+) -> Option<NodeName> {
+    let node = |writer: &Guid| {
+        let participant = discovery.participants().get(&writer.prefix)?;
+        let mut nodes = participant.nodes.iter();
+        let node = nodes.find(|node| node.writers.contains(writer))?;
+        Some(node.name.clone())
+    };
+    let nodes: BTreeSet<Option<NodeName>> = topic.writers.iter().map(node).collect();
+    let nodes: Vec<Option<NodeName>> = match nodes.len() {
+        0 | 1 => nodes.into_iter().collect(),
+        _ => nodes
+            .into_iter()
+            .filter(|node| node.as_ref().is_some_and(&is_meant))
+            .collect(),
+    };
+    match <[_; 1]>::try_from(nodes) {
+        Ok([node]) => node,
+        Err(_) => None,
+    }
 }
 
 /// Returns whether it is a ROS topic whose messages begin with a header.

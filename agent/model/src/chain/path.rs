@@ -125,10 +125,16 @@ impl Paths {
                 return;
             }
             self.paths.retain(|known, _| !path.contains(known));
+            let unnamed = self.paths.keys().find(|known| known.is_named_by(&path));
+            if let Some(unnamed) = unnamed.map(Arc::clone)
+                && let Some(progress) = self.paths.remove(&unnamed)
+            {
+                self.paths.insert(Arc::clone(&path), progress);
+            }
             if self.paths.len() >= MAX_PATHS {
                 self.paths.retain(|_, known| known.last + IDLE > last);
             }
-            if self.paths.len() >= MAX_PATHS {
+            if self.paths.len() >= MAX_PATHS && !self.paths.contains_key(&path) {
                 self.refused += 1;
                 return;
             }

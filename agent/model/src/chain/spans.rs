@@ -1,7 +1,7 @@
 //! Spans of chains: one trace for each measurement on its way through nodes.
 //!
-//! Spans contain only what was observed here. Those of nodes on other hosts are reported by the
-//! agents there, under the same trace: its id follows from the measurement. The number of finished
+//! Spans contain only what was observed here, of nodes of this host. Those of nodes on other hosts
+//! are reported by the agents there, under the same trace: its id follows from the measurement. The number of finished
 //! spans is bounded, and dropped ones are counted.
 
 pub(super) mod causal;
@@ -33,8 +33,7 @@ pub enum ChainStage {
     Callback,
     /// From the arrival to the publication of the output, if the callback was not observed.
     Node,
-    /// From the publication of the input to that of the output, if the arrival was not observed
-    /// here.
+    /// From the publication of the input to that of the output, if the arrival was not observed.
     Hop,
 }
 
@@ -133,7 +132,7 @@ impl SpanId {
         }
         Self {
             bits: identity.bits() as u64,
-            is_of_host: stage == ChainStage::Hop,
+            is_of_host: false,
         }
     }
 

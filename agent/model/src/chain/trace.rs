@@ -84,6 +84,17 @@ impl Path {
         (begin < end).then_some((begin, end))
     }
 
+    /// Returns whether `other` is this chain with the names of nodes that are not known here.
+    #[must_use]
+    pub fn is_named_by(&self, other: &Self) -> bool {
+        let mut topics = self.topics.iter().zip(&other.topics);
+        (self.domain_id, self.method, self.topics.len())
+            == (other.domain_id, other.method, other.topics.len())
+            && topics.all(|((topic, node), (other, name))| {
+                topic == other && (node.is_none() || node == name)
+            })
+    }
+
     /// Returns whether all of `other` is a part of this chain.
     #[must_use]
     pub fn contains(&self, other: &Self) -> bool {

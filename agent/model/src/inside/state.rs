@@ -216,6 +216,13 @@ impl Inside {
         self.participants.contains(&prefix)
     }
 
+    /// Returns whether a node is known to run in this process.
+    #[must_use]
+    pub fn has_node(&self, process: u32, node: &NodeName) -> bool {
+        let process = self.processes.get(&process);
+        process.is_some_and(|process| process.facts.nodes.contains(node))
+    }
+
     /// Returns what processes show of a topic.
     #[must_use]
     pub fn topic(&self, domain_id: DomainId, naming: &Naming) -> Option<TopicInside> {

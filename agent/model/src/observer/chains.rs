@@ -1,11 +1,13 @@
 //! Messages with stamps, which chains consist of.
 
 use ros2probe_wire::names::DdsTopic;
-use ros2probe_wire::{Guid, Record, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Record, Timestamp};
 
 use super::Observer;
 use super::lists::traced_share;
-use crate::chain::causality::CausalPublication;
+use crate::chain::causality::{CausalPublication, Origin};
+use crate::chain::graph::publisher;
+use crate::names::{NodeName, TopicName};
 use crate::naming::Naming;
 use crate::route::Route;
 use crate::topic::Topic;
@@ -39,17 +41,34 @@ impl Observer {
             topics,
             tracer,
             watchlist,
+            discovery,
+            inside,
             ..
         } = self;
-        let share = || {
-            if !tracer.is_wanted() {
-                return None;
-            }
-            let input = DdsTopic::parse(&format!("rt{}", publication.input)).ok()?;
-            let input = topics.find(publication.domain_id, &Naming::of(&input))?;
-            traced_share(topics.get(input)?, watchlist)
+        let topic = |name: &TopicName| {
+            let name = DdsTopic::parse(&format!("rt{name}")).ok()?;
+            topics.get(topics.find(publication.domain_id, &Naming::of(&name))?)
         };
-        self.chains.publication(publication, self.clock, share);
+        // A process that is older than the agent has announced its nodes to discovery only.
+        let named = publication.node.is_none().then(|| {
+            let is_of_process = |node: &NodeName| inside.has_node(publication.process, node);
+            let node = publisher(discovery, topic(&publication.output)?, is_of_process);
+            Some(CausalPublication {
+                node: Some(node?),
+                ..publication.clone()
+            })
+        });
+        let named = named.flatten();
+        let publication = named.as_ref().unwrap_or(publication);
+        let origin = || {
+            let input = topic(&publication.input);
+            let share = input.filter(|_| tracer.is_wanted());
+            Origin {
+                node: input.and_then(|input| publisher(discovery, input, |_| false)),
+                share: share.and_then(|input| traced_share(input, watchlist)),
+            }
+        };
+        self.chains.publication(publication, self.clock, origin);
     }
 
     /// Evaluates the chains, and measures the topics that configured chains need.
@@ -57,8 +76,10 @@ impl Observer {
         let graph = (&self.discovery, &self.topics, &self.profiler);
         let watchlist = &self.watchlist;
         let share = |topic: &Topic| traced_share(topic, watchlist);
+        let (is_directed, receivers) = (self.settings.directed, &self.receivers);
+        let is_local = |prefix: &GuidPrefix| !is_directed || receivers.is_local(prefix);
         let times = (now, self.wall_clock);
-        let changed = self.chains.advance(graph, times, share);
+        let changed = self.chains.advance(graph, times, share, is_local);
         for (domain_id, dds_name) in changed {
             let id = DdsTopic::parse(&dds_name)
                 .ok()

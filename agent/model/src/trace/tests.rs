@@ -61,7 +61,7 @@ fn description() -> WriterDescription {
 
 fn take(tracer: &mut Tracer, records: &[Record], ratio: f64) -> Vec<Span> {
     for record in records {
-        tracer.record(record, || Some((description(), Share::of(ratio))));
+        tracer.record(record, false, || Some((description(), Share::of(ratio))));
     }
     tracer.take().spans
 }
@@ -164,6 +164,52 @@ fn a_multicast_whose_local_copies_are_seen_first_is_sent() {
 }
 
 #[test]
+fn messages_in_shared_memory_are_sent_here_and_received_from_no_other_host() {
+    let shared = |number, time| Record {
+        interface: 0,
+        ..data(number, time, flag::SHM)
+    };
+    let spans = take_all(&mut tracer(), &[shared(5, 10), shared(6, 20)], 1.0);
+    assert_eq!(
+        times(&spans),
+        [(SpanStage::Send, 10, 10), (SpanStage::Send, 20, 20)]
+    );
+    // For readers on another host, the wire shows the same message.
+    let records = [
+        fragments(5, 1, 4, 1_300, 300),
+        shared(5, 1_500),
+        fragments(5, 5, 6, 1_900, 40),
+        shared(5, 2_000),
+    ];
+    let spans = take_all(&mut tracer(), &records, 1.0);
+    assert_eq!(times(&spans), [(SpanStage::Send, 1_000, 1_900)]);
+}
+
+#[test]
+fn a_writer_of_this_host_has_no_arrivals_and_a_router_sends_nothing_of_its_own() {
+    let taken = |records: &[Record], is_local: bool| {
+        let mut tracer = tracer();
+        for record in records {
+            tracer.record(record, is_local, || Some((description(), Share::of(1.0))));
+        }
+        tracer.advance(Timestamp(SECOND));
+        times(&tracer.take().spans)
+    };
+    let copies = [data(5, 10, flag::HOST), data(6, 20, flag::HOST)];
+    assert_eq!(taken(&copies, true), []);
+    // A router passes a message of another host on, to a subscriber of this host.
+    let relayed = flag::STREAM | flag::HOST;
+    let passes = [
+        data(5, 10, relayed | flag::RELAYED),
+        data(5, 11, relayed | flag::OUTGOING),
+        data(5, 11, relayed),
+    ];
+    assert_eq!(taken(&passes, false), [(SpanStage::Receive, 10, 10)]);
+    let sent = [data(5, 10, relayed | flag::OUTGOING | flag::RELAYED)];
+    assert_eq!(taken(&sent, true), [(SpanStage::Send, 10, 10)]);
+}
+
+#[test]
 fn every_agent_samples_the_same_messages_and_as_many_as_asked() {
     let records: Vec<Record> = (1..=20_000).map(|n| data(n, n, flag::OUTGOING)).collect();
     let sampled = |ratio: f64| {
@@ -202,7 +248,7 @@ fn what_never_completes_or_is_never_acknowledged_takes_bounded_room() {
                 writer: guid_words(other),
                 ..data(sample, SECOND, flag::OUTGOING)
             };
-            tracer.record(&record, || Some((description(), Share::of(1.0))));
+            tracer.record(&record, false, || Some((description(), Share::of(1.0))));
         }
     }
     assert!(tracer.size().0 <= MAX_OPEN, "{:?}", tracer.size());
@@ -219,7 +265,7 @@ fn a_known_writer_is_looked_up_only_once() {
     let mut tracer = tracer();
     let mut asked = 0;
     for number in 1..=3 {
-        tracer.record(&data(number, number, 0), || {
+        tracer.record(&data(number, number, 0), false, || {
             asked += 1;
             // Discovery has not announced the writer at first.
             (asked > 1).then(|| (description(), None))

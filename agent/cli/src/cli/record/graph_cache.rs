@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ros2probe::client::Agent;
-use ros2probe_api::participants::ParticipantList;
+use ros2probe_api::participants::{ParticipantList, UnknownWriter};
 use ros2probe_api::topics::TopicList;
 use ros2probe_daemon::recording::{DiscoveredTopic, GraphSnapshot, by_name};
 
@@ -46,6 +46,19 @@ impl<'a> GraphCache<'a> {
     pub(super) fn latest_snapshot(&mut self) -> GraphSnapshot {
         self.refresh();
         self.graph.clone()
+    }
+
+    /// Writers whose announcement the agent missed. Empty if the agent no longer answers.
+    pub(super) fn unknown_writers(&self) -> Vec<UnknownWriter<'static>> {
+        let participants = self
+            .agent
+            .get_within::<ParticipantList<'_>>("/participants", GRAPH_TIMEOUT);
+        participants.map_or_else(|_| Vec::new(), |list| list.unknown_writers)
+    }
+
+    /// Returns whether a topic of this name is known in the domain.
+    pub(super) fn knows(&self, name: &str) -> bool {
+        self.known.contains_key(name)
     }
 
     fn refresh(&mut self) {

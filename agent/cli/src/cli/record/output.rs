@@ -1,20 +1,28 @@
 //! Messages of a recording on stderr, in the original's form: its state, its files and its end.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::io::{self, IsTerminal as _};
 use std::process::ExitCode;
 use std::sync::{Arc, Mutex};
-use std::time::{Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::anyhow;
 use ros2probe::client::Outcome;
+use ros2probe_api::participants::UnknownWriter;
+use ros2probe_api::recordings::FilterOptions;
 use ros2probe_daemon::escape::visible;
+use ros2probe_daemon::missed_announcements::{explanation, remedy_for, sentence};
 use ros2probe_daemon::recording::{
     Activity, Finished, GraphSnapshot, Recorder, shortfalls, unobserved_lines,
 };
 
 use super::super::notes::{SILENT, is_sampled, sampled};
 use super::graph_cache::{GraphCache, locked};
+
+/// Interval at which writers without a known topic are requested, and at which they are reported
+/// while they send.
+const LOOK: Duration = Duration::from_secs(2);
+const REPEAT: Duration = Duration::from_secs(10);
 
 /// Exit code of a conversion whose bag lacks messages of the capture.
 const INCOMPLETE: u8 = 3;
@@ -31,11 +39,79 @@ pub(super) struct RecordingOutput<'a> {
     progress: bool,
     /// Compression progress of a file, in tenths.
     compressing: u64,
+    unknown_writers: UnknownWriters<'a>,
+}
+
+/// Writers whose messages a recording lacks because their topics are unknown.
+struct UnknownWriters<'a> {
+    /// Source, if available.
+    graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
+    looked: Option<Instant>,
+    reported: Option<Instant>,
+    /// Messages of each at the last look.
+    messages: HashMap<String, u64>,
+}
+
+impl<'a> UnknownWriters<'a> {
+    fn new(graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>) -> Self {
+        Self {
+            graph_cache,
+            looked: None,
+            reported: None,
+            messages: HashMap::new(),
+        }
+    }
+
+    /// Returns the warning if it is due: at once, and from time to time while such writers send.
+    fn news(&mut self, options: &FilterOptions, now: Instant) -> Option<String> {
+        let is_due = |at: Option<Instant>, after| at.is_none_or(|at| now - at >= after);
+        if !is_due(self.looked, LOOK) {
+            return None;
+        }
+        let graph_cache = locked(self.graph_cache.as_ref()?);
+        self.looked = Some(now);
+        if !may_record_more(options, |name| graph_cache.knows(name)) {
+            return None;
+        }
+        let writers = graph_cache.unknown_writers();
+        drop(graph_cache);
+        let is_first = self.reported.is_none();
+        let count = |writer: &UnknownWriter<'_>| writer.measurement.messages;
+        let sends = |writer: &&UnknownWriter<'_>| {
+            let before = self.messages.get(&writer.guid);
+            is_first || before.is_none_or(|before| *before < count(writer))
+        };
+        let sending: Vec<_> = writers.iter().filter(sends).cloned().collect();
+        if sending.is_empty() || !is_due(self.reported, REPEAT) {
+            return None;
+        }
+        self.reported = Some(now);
+        let counts = writers
+            .iter()
+            .map(|writer| (writer.guid.clone(), count(writer)));
+        self.messages = counts.collect();
+        let remedy = explanation(remedy_for(&sending)?);
+        Some(format!(
+            "not recorded: {}: {remedy}",
+            sentence(sending.len())
+        ))
+    }
+}
+
+/// Returns whether the recording takes topics that are not known yet.
+fn may_record_more(options: &FilterOptions, is_known: impl Fn(&str) -> bool) -> bool {
+    options.all_topics
+        || options.all_services
+        || options.regex.is_some()
+        || !options.topic_types.is_empty()
+        || !options.services.is_empty()
+        || options.topics.iter().any(|name| !is_known(name))
 }
 
 impl<'a> RecordingOutput<'a> {
     pub(super) fn new(graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>) -> Self {
         Self {
+            unknown_writers: UnknownWriters::new(graph_cache.clone()),
             graph_cache,
             begun: Instant::now(),
             sampled: BTreeSet::new(),
@@ -113,6 +189,13 @@ impl<'a> RecordingOutput<'a> {
 
     fn recording(&mut self, recorder: &Recorder<'_>) {
         self.explain(recorder);
+        if let Some(text) = self
+            .unknown_writers
+            .news(recorder.options(), Instant::now())
+        {
+            self.clear();
+            log("WARN", &text);
+        }
         let new = recorder.sampled().difference(&self.sampled);
         self.print_sampled(new.cloned().collect());
         let report = recorder.report();

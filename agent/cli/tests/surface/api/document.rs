@@ -1,5 +1,7 @@
 //! The OpenAPI document: it describes what the agent accepts and answers.
 
+use std::collections::BTreeSet;
+
 use super::*;
 
 #[test]
@@ -17,6 +19,80 @@ fn the_checked_in_document_is_the_generated_one() {
         generated,
         "run `UPDATE_OPENAPI=1 cargo test -p ros2probe --test surface api::` and commit the result"
     );
+}
+
+/// Validates against the schema of OpenAPI 3.1 that schemathesis contains.
+const VALIDATE: &str = "
+import json, sys
+from schemathesis.specs.openapi.definitions import OPENAPI_31_VALIDATOR
+for error in OPENAPI_31_VALIDATOR.iter_errors(json.load(open(sys.argv[1]))):
+    print(list(error.instance_path), error.message)
+";
+
+/// `list` was the id of twelve operations, and `show` that of seven.
+#[test]
+fn the_document_is_valid_and_every_operation_has_an_id_of_its_own() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/openapi.json");
+    let python = schemathesis("python")
+        .args(["-c", VALIDATE])
+        .arg(&path)
+        .output()
+        .unwrap();
+    assert!(
+        python.status.success(),
+        "{}",
+        String::from_utf8_lossy(&python.stderr)
+    );
+    assert_eq!(String::from_utf8_lossy(&python.stdout), "");
+
+    let document: Value = serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap();
+    let tags = document["tags"].as_array().unwrap().iter();
+    let tags: Vec<&str> = tags.map(|tag| tag["name"].as_str().unwrap()).collect();
+    let mut ids = BTreeSet::new();
+    for (path, item) in document["paths"].as_object().unwrap() {
+        for (method, operation) in item.as_object().unwrap() {
+            let id = operation["operationId"].as_str().unwrap();
+            assert!(
+                ids.insert(id),
+                "{id} is the id of a second operation: {method} {path}"
+            );
+            let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_';
+            assert!(id.chars().all(is_plain), "{id} is no name of a function");
+            // OpenAPI 3.1.1, 4.8.9: each name in the path is a parameter, and the reverse.
+            let named: BTreeSet<&str> = path
+                .split('/')
+                .filter_map(|segment| segment.strip_prefix('{')?.strip_suffix('}'))
+                .collect();
+            let parameters = operation["parameters"].as_array().into_iter().flatten();
+            let of_path = parameters.filter(|parameter| parameter["in"] == "path");
+            let declared: Vec<&str> = of_path.map(|each| each["name"].as_str().unwrap()).collect();
+            assert_eq!(declared.len(), named.len(), "{method} {path}");
+            assert_eq!(
+                declared.into_iter().collect::<BTreeSet<_>>(),
+                named,
+                "{path}"
+            );
+            for tag in operation["tags"].as_array().unwrap() {
+                assert!(tags.contains(&tag.as_str().unwrap()), "{tag} of {path}");
+            }
+        }
+    }
+    assert!(ids.len() >= 38, "{}", ids.len());
+    for (name, schema) in document["components"]["schemas"].as_object().unwrap() {
+        assert!(jsonschema::meta::is_valid(schema), "{name}");
+    }
+    let mut waiting = vec![&document];
+    while let Some(value) = waiting.pop() {
+        match value {
+            Value::Object(object) => waiting.extend(object.values()),
+            Value::Array(array) => waiting.extend(array),
+            _ => {}
+        }
+        if let Some(reference) = value["$ref"].as_str() {
+            let pointer = reference.strip_prefix('#').unwrap();
+            assert!(document.pointer(pointer).is_some(), "{reference}");
+        }
+    }
 }
 
 #[test]
@@ -289,10 +365,10 @@ fn bounds_of_bodies(agent: &LocalAgent, document: &Value, check: Check<'_>) {
     }
 }
 
-/// The program of a Python package in a separate directory.
-fn schemathesis() -> Command {
+/// A program in the separate directory of a Python package.
+fn schemathesis(program: &str) -> Command {
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).parent().unwrap();
-    let program = target.join("tools/schemathesis/bin/st");
+    let program = target.join("tools/schemathesis/bin").join(program);
     assert!(
         program.exists(),
         "{} is missing: run `.ci/prerequisites.sh test`",
@@ -313,7 +389,7 @@ fn no_request_gets_an_undocumented_answer() {
     agent.wait_for_log("ready");
     let document = format!("http://{}/openapi.json", agent.api);
     // Streams do not end: how they are answered is tested elsewhere.
-    let output = schemathesis()
+    let output = schemathesis("st")
         .arg("--config-file")
         .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/schemathesis.toml"))
         .args(["run", &document])

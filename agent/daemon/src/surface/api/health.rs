@@ -12,6 +12,7 @@ use utoipa_axum::routes;
 
 use super::Context;
 use crate::agent_facts::{Ability, AgentFacts};
+use crate::missed_announcements;
 use crate::privilege;
 use crate::surface::foxglove::{ViewerListener, Viewers};
 use crate::surface::otlp::Host;
@@ -67,6 +68,10 @@ async fn health(State(context): State<Context>) -> Json<Health> {
         dropped_datagrams: agent.pieces_dropped,
         contended_datagrams: agent.contended,
         unknown_writers: snapshot.map_or(0, |snapshot| snapshot.unknown_writers.len()),
+        unknown_writers_remedy: snapshot
+            .filter(|snapshot| !snapshot.unknown_writers.is_empty())
+            .and_then(|snapshot| missed_announcements::remedy(snapshot))
+            .map(str::to_owned),
         topics_rejected: snapshot.map_or(0, |snapshot| snapshot.topics_rejected),
         source_reason: agent.source_reason.clone(),
         abilities: abilities(agent),

@@ -17,6 +17,7 @@ use super::party::service_type;
 use super::problem::Problem;
 use super::scope::Scope;
 use super::services::{Halves, services, sorted};
+use crate::missed_announcements;
 use ros2probe_api::names::{Names, NodeName, ServiceName, TopicName};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
@@ -76,6 +77,7 @@ fn names(snapshot: &Snapshot, scope: Scope) -> Names<'_> {
             .filter(|each| scope.admits(each.domain_id))
             .count(),
         unknown_writers: snapshot.unknown_writers.len(),
+        remedy: missed_announcements::remedy(snapshot).map(Cow::Borrowed),
         domains: participants.map(|each| each.domain_id.0).collect(),
         nodes: nodes
             .filter(|node| is_shown(DomainId(node.domain_id), node.hidden))

@@ -74,9 +74,13 @@ pub fn document() -> utoipa::openapi::OpenApi {
     let mut document = nouns(None).into_openapi();
     let paths = std::mem::take(&mut document.paths.paths);
     for (path, mut item) in paths {
-        operations(&mut item).for_each(complete);
         // The router marks parameters that may contain slashes with `*`.
-        document.paths.paths.insert(path.replace("{*", "{"), item);
+        let path = path.replace("{*", "{");
+        for (method, operation) in operations(&mut item) {
+            operation.operation_id = Some(operation_id(method, &path));
+            complete(operation);
+        }
+        document.paths.paths.insert(path, item);
     }
     let bodies = request_bodies(&document);
     let components = document.components.get_or_insert_default();
@@ -91,14 +95,35 @@ pub fn document() -> utoipa::openapi::OpenApi {
     document
 }
 
-fn operations(item: &mut PathItem) -> impl Iterator<Item = &mut Operation> {
+fn operations(item: &mut PathItem) -> impl Iterator<Item = (&'static str, &mut Operation)> {
     let all = [
-        &mut item.get,
-        &mut item.post,
-        &mut item.put,
-        &mut item.delete,
+        ("get", &mut item.get),
+        ("post", &mut item.post),
+        ("put", &mut item.put),
+        ("delete", &mut item.delete),
     ];
-    all.into_iter().flatten()
+    let operations = all.into_iter();
+    operations.filter_map(|(method, operation)| Some((method, operation.as_mut()?)))
+}
+
+/// Returns the id of an operation, which generated clients take as the name of a function:
+/// `get_recordings_by_name_files`. Names of handlers come more than once, as modules separate them.
+fn operation_id(method: &str, path: &str) -> String {
+    let mut id = method.to_owned();
+    for segment in path.split('/') {
+        let name = segment
+            .strip_prefix('{')
+            .and_then(|segment| segment.strip_suffix('}'));
+        let word = name
+            .unwrap_or(segment)
+            .replace(|c: char| !c.is_ascii_alphanumeric(), "_");
+        let word = word.trim_matches('_');
+        if !word.is_empty() {
+            id += if name.is_some() { "_by_" } else { "_" };
+            id += word;
+        }
+    }
+    id
 }
 
 fn complete(operation: &mut Operation) {

@@ -29,7 +29,7 @@ use crate::agent_facts::SourceKind;
 use crate::config::Access;
 use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
-    Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
+    Candidate, Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
 use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
 use ros2probe_model::snapshot::Snapshot;
@@ -289,7 +289,7 @@ fn topics(
 ) -> Vec<OpenTopic> {
     let topics = snapshot.topics.iter().filter(|topic| {
         domain_id.is_none_or(|wanted| wanted == topic.domain_id.0)
-            && selection.covers(topic.kind, &topic.name, &topic.dds_name, topic.hidden)
+            && selection.covers(&Candidate::from(*topic))
     });
     topics
         .take(most)

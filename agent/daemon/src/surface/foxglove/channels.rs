@@ -14,6 +14,7 @@ use super::graph::Graph;
 use super::names::DomainNames;
 use super::protocol::Advertised;
 use super::statistics;
+use crate::subscriptions::{Topic, TopicKey};
 
 /// Largest number of channels; further topics are left out.
 pub(super) const MAX_CHANNELS: usize = 4096;
@@ -37,6 +38,29 @@ pub(super) enum Content {
         domain_id: DomainId,
         dds_name: DdsName,
     },
+}
+
+impl Content {
+    /// Returns the content of the channel that shows messages of this topic and type.
+    pub(super) fn of(topic: &Topic) -> Self {
+        Self::Messages {
+            domain_id: topic.domain_id,
+            dds_name: topic.dds_name.clone(),
+            message_type: topic.message_type.clone(),
+        }
+    }
+
+    /// Returns the topic whose messages the channel shows. `None` for figures.
+    pub(super) fn messages_of(&self) -> Option<TopicKey> {
+        match self {
+            Self::Messages {
+                domain_id,
+                dds_name,
+                ..
+            } => Some((*domain_id, dds_name.clone())),
+            Self::Statistics { .. } => None,
+        }
+    }
 }
 
 /// A channel. It never changes; another definition is another channel.
@@ -90,6 +114,11 @@ impl Channel {
     /// Returns the id.
     pub(super) const fn id(&self) -> u32 {
         self.id
+    }
+
+    /// Returns the name of the topic that viewers show.
+    pub(super) fn topic(&self) -> &str {
+        &self.topic
     }
 
     /// Returns the form of an `advertise` message.

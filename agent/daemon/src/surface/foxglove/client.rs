@@ -14,7 +14,6 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures_util::{SinkExt as _, StreamExt as _};
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
-use ros2probe_model::names::{DdsName, TopicName};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::watch;
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
@@ -30,7 +29,7 @@ use super::graph::Graph;
 use super::protocol::{self, Level, Message, Metadata, Request, Subscribe, parse};
 use super::statistics::{self, Previous};
 use crate::config::Access;
-use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription};
+use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription, TopicKey};
 
 /// Largest message of a client, in bytes.
 const MAX_MESSAGE: usize = 256 << 10;
@@ -98,7 +97,8 @@ struct Subscribed {
 /// Lost messages of one reason, since its status was last removed.
 #[derive(Default)]
 struct Losses {
-    topics: BTreeMap<TopicName, u64>,
+    /// By the name that the client knows.
+    topics: BTreeMap<String, u64>,
     messages: u64,
     is_news: bool,
     quiet: u32,
@@ -296,9 +296,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 channel: Arc::clone(channel),
                 previous: Previous::default(),
             });
-            if let Content::Messages { dds_name, .. } = content {
-                fresh.insert(dds_name.clone());
-            }
+            fresh.extend(content.messages_of());
         }
         if !fresh.is_empty() {
             self.select(fresh).await?;
@@ -341,25 +339,22 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     /// Requests the messages of all subscribed topics, and the retained ones of those in `fresh`.
-    async fn select(&mut self, fresh: BTreeSet<DdsName>) -> Result<(), End> {
-        let names = self.ids.keys().filter_map(|content| match content {
-            Content::Messages { dds_name, .. } => Some(dds_name.clone()),
-            Content::Statistics { .. } => None,
-        });
-        let names: BTreeSet<_> = names.collect();
-        if names.is_empty() {
+    async fn select(&mut self, fresh: BTreeSet<TopicKey>) -> Result<(), End> {
+        let topics: BTreeSet<_> = self.ids.keys().filter_map(Content::messages_of).collect();
+        if topics.is_empty() {
             self.messages = None;
             return Ok(());
         }
         if let Some(messages) = &self.messages {
-            messages.select(names, fresh);
+            messages.select(topics, fresh);
             return Ok(());
         }
         let opened = self
             .shared
             .subscriptions
             .open(crate::subscriptions::Request {
-                topics: Selection::of_names(names),
+                topics: Selection::of_topics(topics),
+                // Each topic has its own.
                 domain_id: None,
                 depth: Depth::Payloads,
                 queue_bytes: QUEUE_BYTES,
@@ -487,13 +482,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     async fn pass_sample(&mut self, sample: &Sample) -> Result<(), End> {
-        let topic = &sample.topic;
-        let content = Content::Messages {
-            domain_id: topic.domain_id,
-            dds_name: topic.dds_name.clone(),
-            message_type: topic.message_type.clone(),
-        };
-        match (self.ids.get(&content), &sample.payload) {
+        let id = self.ids.get(&Content::of(&sample.topic));
+        match (id, &sample.payload) {
             (Some(id), Some(payload)) => {
                 let id = *id;
                 self.send_data(id, sample.time, payload).await
@@ -502,14 +492,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         }
     }
 
+    /// Counts a loss, unless no channel of the client has lost the messages: another type of the
+    /// topic has a channel of its own.
     fn count(&mut self, missed: &Missed) {
+        let id = self.ids.get(&Content::of(&missed.topic));
+        let Some(subscribed) = id.and_then(|id| self.subscribed.get(id)) else {
+            return;
+        };
         if missed.reason == MissedReason::QueueFull {
             self.viewer.dropped(missed.samples);
         }
         let mut losses = LOSSES.iter().zip(&mut self.losses);
         let losses = losses.find(|((reason, ..), _)| *reason == missed.reason);
         if let Some((_, losses)) = losses {
-            losses.add(missed);
+            losses.add(&subscribed.channel, missed.samples);
         }
     }
 
@@ -562,12 +558,12 @@ impl<S> Drop for Client<S> {
 }
 
 impl Losses {
-    fn add(&mut self, missed: &Missed) {
-        self.messages += missed.samples;
+    fn add(&mut self, channel: &Channel, messages: u64) {
+        self.messages += messages;
         self.is_news = true;
-        let name = &missed.topic.name;
+        let name = channel.topic();
         if self.topics.len() < COUNTED || self.topics.contains_key(name) {
-            *self.topics.entry(name.clone()).or_default() += missed.samples;
+            *self.topics.entry(name.to_owned()).or_default() += messages;
         }
     }
 

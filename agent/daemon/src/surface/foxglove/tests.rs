@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 
 use futures_util::{SinkExt as _, StreamExt as _};
 use ros2probe_message::Sources;
-use ros2probe_model::dispatch::{Dispatch, Sample, SampleOutcome, Topic};
+use ros2probe_model::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
+use ros2probe_model::naming::Naming;
 use ros2probe_model::snapshot::Snapshot;
 use ros2probe_testing::sample_robot;
+use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 use serde_json::{Value, json};
 use tokio::io::{DuplexStream, duplex};
@@ -146,7 +148,10 @@ struct Scene {
 
 impl Scene {
     async fn new(bytes: usize) -> Self {
-        let shared = shared(bytes);
+        Self::of(shared(bytes)).await
+    }
+
+    async fn of(shared: Arc<Shared>) -> Self {
         let (ours, theirs) = duplex(64 << 10);
         let viewer = shared.viewers.join(None, Access::All);
         let client = Client::new(ours, Arc::clone(&shared), Access::All, viewer).await;
@@ -273,7 +278,8 @@ async fn interest_follows_the_subscriptions_and_ends_with_the_viewer() {
             .map(|request| format!("{:?}", request.selection.include))
             .collect::<Vec<_>>()
     };
-    assert_eq!(topics(&scene.shared), [r#"[Names({"rt/chatter"})]"#]);
+    let chatter = r#"[Topics({(DomainId(0), "rt/chatter")})]"#;
+    assert_eq!(topics(&scene.shared), [chatter]);
     scene.deliver("/points", 1, 10);
     scene.deliver("/chatter", 2, 10);
     let data = loop {
@@ -294,6 +300,70 @@ async fn interest_follows_the_subscriptions_and_ends_with_the_viewer() {
     while shared.viewers.is_any() {
         tokio::task::yield_now().await;
     }
+}
+
+/// A channel is one topic of one domain and one type. The subscription of a viewer captured the
+/// topics of that name in every domain, and the viewer showed their losses.
+#[tokio::test]
+async fn a_channel_has_the_messages_and_losses_of_its_domain_and_type_only() {
+    let shared = shared(MEGABYTE);
+    let mut two = robot(&["/points", "/chatter"]);
+    let mut other = two.topics.clone();
+    for topic in &mut other {
+        topic.domain_id = DomainId(5);
+    }
+    two.topics.extend(other);
+    two.topics[0]
+        .message_types
+        .push("std_msgs/msg/String".into());
+    let agent = AgentFacts::new(SourceKind::Wire, Instant::now());
+    shared.latest.publish(two, agent);
+    let mut scene = Scene::of(shared).await;
+    scene.subscribe(&["/points", "/domain_5/chatter"]).await;
+    let requests = scene.shared.subscriptions.take_changed().unwrap();
+    let is_captured = |domain_id, name: &str| {
+        let naming = Naming::of(&DdsTopic::parse(name).unwrap());
+        requests[0].covers(DomainId(domain_id), &naming)
+    };
+    assert!(is_captured(0, "rt/points") && is_captured(5, "rt/chatter"));
+    assert!(!is_captured(5, "rt/points") && !is_captured(0, "rt/chatter"));
+    let of = |domain_id, name: &str, message_type: Option<&str>| {
+        let topic = Topic::clone(&sample(name, 1, 1).topic);
+        let message_type = message_type.map_or(topic.message_type.clone(), Into::into);
+        Arc::new(Topic {
+            domain_id: DomainId(domain_id),
+            message_type,
+            ..topic
+        })
+    };
+    let lost = |topic: Arc<Topic>, samples| Dispatch {
+        to: [1].into(),
+        outcome: SampleOutcome::Missed(Missed {
+            topic,
+            writer: Guid::default(),
+            first: SequenceNumber(1),
+            last: SequenceNumber(samples),
+            samples,
+            reason: MissedReason::NotCaptured,
+        }),
+    };
+    let losses = vec![
+        lost(of(5, "/points", None), 1_000),
+        lost(of(0, "/points", Some("std_msgs/msg/String")), 100),
+        lost(of(0, "/chatter", None), 10_000),
+        lost(of(0, "/points", None), 7),
+        lost(of(5, "/chatter", None), 3),
+    ];
+    scene.shared.subscriptions.deliver(losses, None);
+    let message = loop {
+        let status = scene.json().await;
+        if status["op"] == "status" {
+            break status["message"].as_str().unwrap().to_owned();
+        }
+    };
+    let expected = "10 messages were not captured because the agent reads too slowly: 7 of \
+                    /points, 3 of /domain_5/chatter";
+    assert_eq!(message, expected);
 }
 
 #[tokio::test]

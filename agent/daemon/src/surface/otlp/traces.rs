@@ -266,11 +266,12 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
         SpanStage::Receive => ("network.local.address", "network.local.port"),
     };
     let to = message.destination.socket_address();
-    attributes.extend([
-        int("fragments", message.fragments.into()),
-        attribute(address, to.ip().to_string()),
-        int(port, to.port().into()),
-    ]);
+    attributes.push(int("fragments", message.fragments.into()));
+    // Shared memory has no address.
+    if !to.ip().is_unspecified() {
+        attributes.push(attribute(address, to.ip().to_string()));
+        attributes.push(int(port, to.port().into()));
+    }
     attributes
 }
 

@@ -10,7 +10,7 @@ use super::{ChainSpan, ChainStage, ChainTracer, SpanId};
 use crate::chain::causality::CausalPublication;
 use crate::chain::trace::{Method, Point};
 use crate::identity::Identity;
-use crate::names::TopicName;
+use crate::names::{NodeName, TopicName};
 use crate::trace::share::Share;
 
 /// A publication whose trace is exported.
@@ -26,6 +26,8 @@ pub(in crate::chain) struct Traced {
 /// A publication, with the times of its input and of itself.
 pub(in crate::chain) struct Step<'a> {
     pub(in crate::chain) publication: &'a CausalPublication,
+    /// The node that publishes the first input of the chain.
+    pub(in crate::chain) source: Option<&'a NodeName>,
     pub(in crate::chain) input: Point,
     pub(in crate::chain) output: Point,
 }
@@ -57,7 +59,7 @@ impl Step<'_> {
         if !known.clone().any(|known| known.trace_id == trace_id) {
             let at = self.input.published;
             tracer.finish(ChainSpan {
-                node: None,
+                node: self.source.cloned(),
                 ..self.span((ChainStage::Publish, publish), (at, at), trace_id)
             });
         }

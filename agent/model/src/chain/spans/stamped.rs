@@ -1,5 +1,8 @@
 //! Spans of the messages with one stamp.
 //!
+//! A span belongs to a node, and the agent of the node's host exports it: the way of the input to
+//! the node, its processing, and the publication. Other agents derive its id without a copy of it.
+//!
 //! The stamp alone identifies the measurement if it has nanoseconds and is of the present. Then all
 //! agents that see a part of the chain report one trace. Rounded, simulated and recorded stamps
 //! come more than once: there, the first message of the chain is a part of the identity.
@@ -26,7 +29,7 @@ pub(in crate::chain) struct Stamped<'a> {
     pub(in crate::chain) causes: &'a [Option<usize>],
 }
 
-/// A hop: its input, its output, and when the input reached the node, if that was observed here.
+/// A hop: its input, its output, and when the input reached the node, if that was observed.
 struct Hop<'a> {
     input: &'a Published,
     output: &'a Published,
@@ -40,21 +43,22 @@ impl Stamped<'_> {
         if !self.messages.iter().any(is_traced) {
             return;
         }
-        for (index, message) in self.messages.iter().enumerate() {
+        let messages = self.messages.iter().enumerate();
+        for (index, message) in messages.filter(|(_, message)| message.is_local) {
             if let Some(trace_id) = self.trace_id(index) {
                 if let Some(hop) = self.hop(index) {
                     self.pass(index, &hop, trace_id, tracer);
                 }
-                if message.is_local {
-                    self.publish(index, message, trace_id, tracer);
-                }
+                self.publish(index, message, trace_id, tracer);
             }
         }
     }
 
-    /// Returns the trace of a message, or `None` if it is in no chain or not exported.
+    /// Returns the trace of a message, or `None` if it is in no chain or not exported. If a node of
+    /// another host reads the message, the chain may go on there, unseen by this agent.
     fn trace_id(&self, index: usize) -> Option<u128> {
-        if self.cause(index).is_none() && !self.causes.contains(&Some(index)) {
+        let is_in_chain = self.cause(index).is_some() || self.causes.contains(&Some(index));
+        if !is_in_chain && !self.messages.get(index)?.output.is_read_elsewhere {
             return None;
         }
         let mut first = index;
@@ -75,16 +79,10 @@ impl Stamped<'_> {
     fn hop(&self, index: usize) -> Option<Hop<'_>> {
         let (input, output) = (self.cause(index)?, self.messages.get(index)?);
         let input = self.messages.get(input)?;
-        // The arrival at another host is observed there.
-        let arrived = if output.is_local {
-            input.reached(output)
-        } else {
-            None
-        };
         Some(Hop {
             input,
             output,
-            arrived,
+            arrived: input.reached(output),
         })
     }
 
@@ -113,7 +111,7 @@ impl Stamped<'_> {
             output,
             arrived,
         } = *hop;
-        let parent = self.cause(index).map(|cause| self.anchor(cause, trace_id));
+        let parent = Some(publish(input, trace_id));
         let messages = (input, output);
         let span = |named, times| ChainSpan {
             parent,
@@ -138,16 +136,6 @@ impl Stamped<'_> {
         let named = (ChainStage::Node, hop.id(trace_id));
         let times = (arrived, output.published);
         tracer.finish(with_output(span(named, times), output));
-    }
-
-    /// Returns the span that stands for a message: its publication, or the hop to it if that was on
-    /// another host.
-    fn anchor(&self, index: usize, trace_id: u128) -> SpanId {
-        match (self.messages.get(index), self.hop(index)) {
-            (Some(message), Some(hop)) if !message.is_local => hop.id(trace_id),
-            (Some(message), _) => publish(message, trace_id),
-            (None, _) => SpanId::of(ChainStage::Publish, trace_id, &[]),
-        }
     }
 
     /// Returns a span without a parent, about a message and the node that publishes another one.

@@ -117,3 +117,37 @@ fn a_publication_of_another_time_or_topic_begins_a_chain_of_its_own() {
     ];
     assert_eq!(robot.shown(), expected);
 }
+
+/// The chain had no source, and a process older than the agent no node, although discovery names
+/// both.
+#[test]
+fn nodes_are_named_that_only_discovery_knows() {
+    let mut robot = Robot::new();
+    robot.node("/sensor", &[], &["/points"]);
+    robot.node("/filter", &["/points"], &["/filtered"]);
+    let play = |robot: &mut Robot, from: u64| {
+        for index in from..from + 20 {
+            let at = robot.after(index * 50 * MILLISECOND);
+            let way = ("/points", "/filtered");
+            let mut filter = hop("/filter", way, at, at + 500, at + MILLISECOND);
+            filter.node = None;
+            robot.observer.input(Input::CausalPublication(&filter));
+            robot.wait(50 * MILLISECOND);
+        }
+        robot.wait(3_000 * MILLISECOND);
+    };
+    // Before their announcement no one is named.
+    play(&mut robot, 0);
+    let [chain] = &robot.chains()[..] else {
+        panic!("{:?}", robot.chains())
+    };
+    assert_eq!(shown(chain), "/points -[?]-> /filtered");
+    robot.start();
+    play(&mut robot, 200);
+    let [chain] = &robot.chains()[..] else {
+        panic!("{:?}", robot.chains())
+    };
+    assert_eq!(shown(chain), "/points -[/filter]-> /filtered");
+    assert_eq!(chain.path.topics[0].1.as_deref(), Some("/sensor"));
+    assert_eq!(chain.count, 40);
+}

@@ -5,7 +5,7 @@ mod hosts;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use ros2probe_model::chain::spans::{ChainSpan, ChainSpans, ChainStage, MAX_FINISHED, SpanId};
+use ros2probe_model::chain::spans::{ChainSpan, ChainSpans, MAX_FINISHED, SpanId};
 use ros2probe_model::trace::Message;
 
 use super::*;

@@ -9,6 +9,7 @@ use super::inside;
 use super::structure::Ids;
 use super::values::{LOSS, lost_lately};
 use crate::agent_facts::{Ability, AgentFacts, SourceKind};
+use crate::missed_announcements;
 use crate::recording::counted;
 use ros2probe_api::live::{Finding, Severity};
 use ros2probe_model::diagnosis::{Diagnosis, Policies, Policy, TopicKey};
@@ -83,7 +84,8 @@ fn of_agent(all: &Circumstances<'_>) -> Vec<Finding> {
     if !snapshot.unknown_writers.is_empty() {
         let text = "Writers are active whose announcement was missed; their topics are unknown";
         let unknown = finding("unknown_writers", Severity::Warning, "", text.to_owned());
-        list.push(unknown.with_remedy("sudo rp discover --all"));
+        let remedy = missed_announcements::remedy(snapshot);
+        list.push(unknown.with_remedy(remedy.unwrap_or(missed_announcements::DISCOVER)));
     }
     if snapshot.topics_rejected > 0 {
         let text = "Watched topics are not measured: limits.topics is reached".to_owned();

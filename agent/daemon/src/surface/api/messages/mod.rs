@@ -28,13 +28,12 @@ use super::security::Granted;
 use super::topics::{TopicParameter, find};
 use super::{Context, Streamed};
 use crate::config::Access;
-use crate::subscriptions::{
-    Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
-};
+use crate::subscriptions::{Depth, Item, Overflow, Refused, Request, Selection, Subscription};
 use ros2probe_api::messages::{self, Beat, Definition, End, Message, Missed};
 use ros2probe_message::{Library, Limits, MessageType, decode};
 use ros2probe_model::dispatch::Sample;
-use ros2probe_model::names::TypeName;
+use ros2probe_model::names::{DdsName, TypeName};
+use ros2probe_wire::DomainId;
 use tree::{ELEMENTS, Tree};
 
 /// Slots for streams of all listeners; each makes the agent capture all payloads of its topic.
@@ -165,15 +164,13 @@ pub(super) async fn follow(
     }
     let state = context.state().await;
     let topic = find(state.known(), name, Domain::of(wanted.domain_id).checked()?)?;
-    let choice = Choice::parse(&topic.name)
-        .map_err(|error| Problem::new(Code::InvalidRequest, error.to_string()))?;
     let permit = STREAMS.try_acquire().map_err(|_| {
         let detail = format!("{MAX_READERS} topics are being read, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
     let opened = context
         .subscriptions
-        .open(request(choice, topic.domain_id.0));
+        .open(request(topic.domain_id, &topic.dds_name));
     let subscription = opened.map_err(|refused: Refused| {
         Problem::new(Code::TooManySubscriptions, refused.to_string())
     })?;
@@ -200,15 +197,12 @@ pub(super) async fn follow(
     Ok(response)
 }
 
-/// Returns the subscription of a stream.
-fn request(topic: Choice, domain_id: u32) -> Request {
+/// Returns the subscription of a stream. A request topic has the ROS name of its service, so only
+/// the DDS name is exact.
+fn request(domain_id: DomainId, dds_name: &DdsName) -> Request {
     Request {
-        topics: Selection {
-            include: vec![topic],
-            exclude: Vec::new(),
-            hidden: true,
-        },
-        domain_id: Some(domain_id),
+        topics: Selection::of_topics([(domain_id, dds_name.clone())]),
+        domain_id: Some(domain_id.0),
         depth: Depth::Payloads,
         queue_bytes: QUEUE_BYTES,
         // A slow client must not delay the agent, nor a replay.
@@ -396,7 +390,6 @@ fn value(message_type: Option<&MessageType>, sample: &Sample) -> Result<Option<J
 
 #[cfg(test)]
 mod tests {
-    use ros2probe_wire::DomainId;
     use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
     use tokio_util::sync::CancellationToken;
 
@@ -417,8 +410,8 @@ mod tests {
             bytes: 64 << 20,
         };
         let all = Arc::new(Subscriptions::new(latest, caps, CancellationToken::new()));
-        let choice = Choice::parse("/points").unwrap();
-        let mut subscription = all.open(request(choice, 0)).unwrap();
+        let asked = request(DomainId(0), &"rt/points".into());
+        let mut subscription = all.open(asked).unwrap();
         let topic = Arc::new(Topic {
             domain_id: DomainId(0),
             name: "/points".into(),

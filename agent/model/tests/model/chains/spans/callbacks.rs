@@ -59,7 +59,7 @@ fn callbacks_are_spans_between_publications() {
     let traces = by_trace(&spans);
     assert_eq!(traces.len(), 20);
     let expected = [
-        "publish /points (?) 0",
+        "publish /points (/sensor) 0",
         "  transit /points (/filter) 1000",
         "  wait /points (/filter) 200",
         "  callback /points -> /debug (/filter) 3800",

@@ -16,7 +16,7 @@ use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
 use super::*;
 
 const DISCOVERY_INFO: EntityId = EntityId([0, 0, 0x04, 0x03]);
-/// Nodes with input and output. `/filter` runs on the second host.
+/// Nodes with input and output.
 const NODES: [(&str, Option<&str>, &str); 3] = [
     ("sensor", None, "/points"),
     ("filter", Some("/points"), "/filtered"),
@@ -28,12 +28,16 @@ struct Agent {
     observer: Observer,
     /// Last digit of the host's address.
     host: u8,
+    hosts: Hosts,
     at: u64,
 }
 
-const fn host_of(node: usize) -> u8 {
-    if node == 1 { 2 } else { 1 }
-}
+/// The host of each node.
+type Hosts = [u8; NODES.len()];
+/// `/filter` runs on the second host.
+const BETWEEN: Hosts = [1, 2, 1];
+/// Only `/sensor` runs on the first host.
+const BEYOND: Hosts = [1, 2, 2];
 
 fn prefix(node: usize) -> GuidPrefix {
     let mut bytes = *b"\x01\x10host-node0";
@@ -41,9 +45,9 @@ fn prefix(node: usize) -> GuidPrefix {
     GuidPrefix(bytes)
 }
 
-fn address(node: usize) -> SocketAddrV4 {
+fn address(node: usize, hosts: Hosts) -> SocketAddrV4 {
     let port = 7411 + 2 * u16::try_from(node).unwrap();
-    SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, host_of(node)), port)
+    SocketAddrV4::new(Ipv4Addr::new(10, 0, 0, hosts[node]), port)
 }
 
 const fn writer(node: usize) -> Guid {
@@ -53,7 +57,7 @@ const fn writer(node: usize) -> Guid {
 }
 
 impl Agent {
-    fn new(host: u8) -> Self {
+    fn new(host: u8, hosts: Hosts) -> Self {
         let mut observer = Observer::new(Settings::default());
         let watch = Watch {
             trace: 1.0,
@@ -65,13 +69,15 @@ impl Agent {
         let mut agent = Self {
             observer,
             host,
+            hosts,
             at: START,
         };
         for (node, (name, input, output)) in NODES.into_iter().enumerate() {
             let prefix = prefix(node);
             let reader = Guid::new(prefix, EntityId([0, 0, 2, 4]));
             let from = || Forged::from(prefix);
-            let payload = forge::participant_at(prefix, 1_000_000, Some(0), &[address(node)]);
+            let payload =
+                forge::participant_at(prefix, 1_000_000, Some(0), &[address(node, hosts)]);
             agent.announce(from().data(SPDP, 1, &payload));
             let message_type = "sensor_msgs::msg::dds_::PointCloud2_";
             let payload = forge::endpoint(writer(node), &format!("rt{output}"), message_type, true);
@@ -110,7 +116,7 @@ impl Agent {
     /// after 100 µs, and at the other host 300 µs later.
     fn message(&mut self, node: usize, number: u64, at: u64, stamp: u64) {
         let is_read = node + 1 < NODES.len();
-        let destination = address(if is_read { node + 1 } else { node });
+        let destination = address(if is_read { node + 1 } else { node }, self.hosts);
         let [a, b] = [0, u32::from_ne_bytes([0, 0, 0xff, 0xff])];
         let record = Record {
             kind: kind::DATA,
@@ -126,7 +132,7 @@ impl Agent {
             stamp_nanoseconds: u32::try_from(stamp % 1_000_000_000).unwrap(),
             ..Record::default()
         };
-        if host_of(node) == self.host {
+        if self.hosts[node] == self.host {
             self.observer.input(Input::Record(&Record {
                 time: at + 100 * MICROSECOND,
                 flags: flag::STAMP | flag::HOST | flag::OUTGOING,
@@ -134,7 +140,7 @@ impl Agent {
                 ..record
             }));
         }
-        if is_read && host_of(node + 1) == self.host {
+        if is_read && self.hosts[node + 1] == self.host {
             self.observer.input(Input::Record(&Record {
                 time: at + 400 * MICROSECOND,
                 flags: flag::STAMP | flag::HOST,
@@ -151,8 +157,8 @@ fn rtps(at: u64) -> u64 {
 }
 
 /// Plays the chain to the agents of both hosts, with stamps of this granularity.
-fn play(granularity: u64) -> [Vec<ChainSpan>; 2] {
-    let mut agents = [Agent::new(1), Agent::new(2)];
+fn play(granularity: u64, hosts: Hosts) -> [Vec<ChainSpan>; 2] {
+    let mut agents = [Agent::new(1, hosts), Agent::new(2, hosts)];
     for agent in &mut agents {
         for index in 0..60 {
             let at = START + 3000 * MILLISECOND + index * 50 * MILLISECOND + 137 * index;
@@ -167,18 +173,32 @@ fn play(granularity: u64) -> [Vec<ChainSpan>; 2] {
     agents.map(|mut agent| agent.observer.drain().chain_spans.spans)
 }
 
+/// Asserts that each span comes from one agent, and that one of them exports its parent.
+fn is_whole([one, two]: [&[ChainSpan]; 2]) {
+    let ids = |spans: &[ChainSpan]| spans.iter().map(|span| span.id).collect::<BTreeSet<_>>();
+    let (first, second) = (ids(one), ids(two));
+    assert_eq!((first.len(), second.len()), (one.len(), two.len()));
+    assert!(first.is_disjoint(&second));
+    for span in one.iter().chain(two) {
+        let has_parent = |parent| first.contains(&parent) || second.contains(&parent);
+        assert!(span.parent.is_none_or(has_parent), "{span:#?}");
+        assert!(!span.id.is_of_host);
+    }
+}
+
+/// Each agent had a span of its own for a node of the other host, so backends showed it twice.
 #[test]
-fn two_agents_report_one_trace_each_with_the_nodes_of_its_host() {
-    let [one, two] = play(1);
+fn two_agents_report_one_trace_in_which_each_hop_is_once() {
+    let [one, two] = play(1, BETWEEN);
+    is_whole([&one, &two]);
     let (first, second) = (by_trace(&one), by_trace(&two));
     let (trace, of_one) = first.last_key_value().unwrap();
     let of_two = &second[trace];
     let expected = [
         "publish /points (/sensor) 100",
-        "  hop /points -> /filtered (/filter) 12400",
-        "    transit /filtered (/controller) 0",
-        "    node /filtered -> /cmd (/controller) 2600",
-        "      publish /cmd (/controller) 100",
+        "transit /filtered (/controller) 0",
+        "node /filtered -> /cmd (/controller) 2600",
+        "  publish /cmd (/controller) 100",
     ];
     assert_eq!(tree(of_one), expected);
     let expected = [
@@ -187,30 +207,40 @@ fn two_agents_report_one_trace_each_with_the_nodes_of_its_host() {
         "  publish /filtered (/filter) 100",
     ];
     assert_eq!(tree(of_two), expected);
-    // The parent is on the other host.
-    let published = of_one.iter().find(|span| span.parent.is_none()).unwrap();
-    let arrived = of_two
-        .iter()
-        .filter(|span| span.stage != ChainStage::Publish);
-    assert!(
-        arrived
-            .into_iter()
-            .all(|span| span.parent == Some(published.id))
-    );
     let together: Vec<_> = of_one.iter().chain(of_two).copied().collect();
-    assert_eq!(tree(&together).len(), 8);
-    // Only a hop on another host has an id of its own on each host.
-    for span in together {
-        assert_eq!(span.id.is_of_host, span.stage == ChainStage::Hop);
-    }
+    let expected = [
+        "publish /points (/sensor) 100",
+        "  transit /points (/filter) 0",
+        "  node /points -> /filtered (/filter) 11600",
+        "    publish /filtered (/filter) 100",
+        "      transit /filtered (/controller) 0",
+        "      node /filtered -> /cmd (/controller) 2600",
+        "        publish /cmd (/controller) 100",
+    ];
+    assert_eq!(tree(&together), expected);
     let common = first.keys().filter(|trace| second.contains_key(trace));
     assert!(common.count() > 40);
 }
 
 #[test]
 fn agents_that_see_the_first_message_agree_about_rounded_stamps_too() {
-    let [one, two] = play(50_000);
+    let [one, two] = play(50_000, BETWEEN);
+    is_whole([&one, &two]);
     let (first, second) = (by_trace(&one), by_trace(&two));
     let common = first.keys().filter(|trace| second.contains_key(trace));
     assert!(common.count() > 20, "{} {}", first.len(), second.len());
+}
+
+/// The agent of the sensor's host sees no message that continues the sensor's, and exported nothing.
+#[test]
+fn the_first_publication_is_exported_where_the_chain_goes_on_only_on_another_host() {
+    let [one, two] = play(1, BEYOND);
+    is_whole([&one, &two]);
+    let (first, second) = (by_trace(&one), by_trace(&two));
+    let (trace, of_two) = second.last_key_value().unwrap();
+    let together: Vec<_> = first[trace].iter().chain(of_two).copied().collect();
+    let lines = tree(&together);
+    assert_eq!(lines.len(), 7, "{lines:#?}");
+    assert_eq!(lines[0], "publish /points (/sensor) 100");
+    assert!(first.values().all(|trace| trace.len() == 1));
 }
