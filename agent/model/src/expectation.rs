@@ -14,6 +14,7 @@ use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 
+use super::loss_share::LossShare;
 use super::rate::{SECONDS, Slot};
 use crate::watch::Expectations;
 
@@ -70,6 +71,8 @@ pub struct Evidence<'a> {
     pub since: Timestamp,
     /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
+    /// Loss of the worst subscriber in the last ten seconds.
+    pub loss: LossShare,
 }
 
 /// State of one topic under one entry.
@@ -202,12 +205,10 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>) -> u8 {
             broken |= MAX_RATE;
         }
     }
-    if let Some(maximum) = expectations.max_loss_ratio {
-        let (slot, _) = (evidence.recent)(SECONDS);
-        let sent = slot.messages + slot.lost;
-        if sent > 0 && slot.lost as f64 > maximum * sent as f64 {
-            broken |= MAX_LOSS;
-        }
+    if let Some(maximum) = expectations.max_loss_ratio
+        && evidence.loss.exceeds(maximum)
+    {
+        broken |= MAX_LOSS;
     }
     if let Some(maximum) = expectations.max_latency {
         let (slot, _) = (evidence.recent)(1);
@@ -302,6 +303,10 @@ mod tests {
                     last_message: self.last_message,
                     since: Timestamp(1000 * SECOND),
                     recent: &recent,
+                    loss: LossShare {
+                        lost: 10 * slot.lost,
+                        expected: 10 * (slot.messages + slot.lost),
+                    },
                 },
             );
             self.judgement.state()

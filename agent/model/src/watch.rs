@@ -46,7 +46,8 @@ pub struct Expectations {
     pub min_rate_hz: Option<f64>,
     /// Largest rate, in messages per second.
     pub max_rate_hz: Option<f64>,
-    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
+    /// Largest share of messages that the worst subscriber may lose, from 0 to 1; see
+    /// [`LossShare`](crate::loss_share::LossShare).
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture.
     pub max_latency: Option<Duration>,
@@ -65,7 +66,7 @@ pub struct ExpectationValues {
     pub min_rate_hz: Option<f64>,
     /// Largest rate, in messages per second.
     pub max_rate_hz: Option<f64>,
-    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
+    /// Largest share of messages that the worst subscriber may lose, from 0 to 1.
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture, in milliseconds.
     pub max_latency_ms: Option<f64>,
