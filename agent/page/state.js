@@ -20,7 +20,7 @@ export const MOST_EVENTS = 1000;
  *   publishers: Endpoint[], subscriptions: Endpoint[]}} Topic
  * @typedef {{rate: number|null, bandwidth: number|null, messages: number|null,
  *   lost: number|null, lostNow: number|null, p50: number|null, p99: number|null, flags: number,
- *   last: number|null}} Figures
+ *   last: number|null, expected: number|null}} Figures
  * @typedef {{id: string, kind: string, severity: string, domain_id: number|null,
  *   topic: number|null, node: number|null, since: number|null, text: string,
  *   remedy: string|null, writer?: string, reader?: string, policies?: string[]}} Finding
@@ -31,7 +31,7 @@ export const MOST_EVENTS = 1000;
 /** @type {Figures} */
 const NO_FIGURES = Object.freeze({
   rate: null, bandwidth: null, messages: null, lost: null, lostNow: null, p50: null, p99: null,
-  flags: 0, last: null,
+  flags: 0, last: null, expected: null,
 });
 
 /** A series of the last ten minutes in steps; a step is the mean of its values. */
@@ -149,10 +149,10 @@ export class State {
   /** @param {any} values */
   takeValues(values) {
     for (const row of values.topics) {
-      const [id, rate, bandwidth, messages, lost, lostNow, p50, p99, flags, last] = row;
+      const [id, rate, bandwidth, messages, lost, lostNow, p50, p99, flags, last, expected] = row;
       if (!this.topics.has(id)) continue;
       this.figures.set(id, {
-        rate, bandwidth, messages, lost, lostNow, p50, p99, flags: flags ?? 0, last,
+        rate, bandwidth, messages, lost, lostNow, p50, p99, flags: flags ?? 0, last, expected,
       });
     }
     const [rate, bandwidth, lost, measured] = values.totals;

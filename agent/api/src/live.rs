@@ -261,9 +261,10 @@ pub struct Values {
     pub replay: Option<Progress>,
 }
 
-/// `[topic, messages per second, payload bytes per second, messages, lost messages, messages lost
-/// in the last second, median latency, 99th percentile of latency, flags, Unix time of the last
-/// message]`. All elements but topic and flags are null for a topic that is not measured.
+/// `[topic, messages per second, payload bytes per second, messages, messages that the worst
+/// subscriber lost, those of the last second, median latency, 99th percentile of latency, flags,
+/// Unix time of the last message, messages that the worst subscriber expected]`. All elements but
+/// topic and flags are null for a topic that is not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema), schema(as = LiveRow))]
 pub struct Row(
@@ -277,6 +278,7 @@ pub struct Row(
     pub Option<f64>,
     pub u32,
     pub Option<f64>,
+    pub Option<u64>,
 );
 
 /// `[messages, payload bytes, lost messages, measured topics]`.
@@ -301,7 +303,9 @@ impl Row {
     /// Returns the row of a topic that is not measured and has no flags.
     #[must_use]
     pub const fn empty(topic: u32) -> Self {
-        Self(topic, None, None, None, None, None, None, None, 0, None)
+        Self(
+            topic, None, None, None, None, None, None, None, 0, None, None,
+        )
     }
 }
 

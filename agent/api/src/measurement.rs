@@ -11,7 +11,8 @@ pub struct Measurement {
     pub messages: u64,
     /// Payload bytes of these messages.
     pub bytes: u64,
-    /// Messages that were sent but never received whole.
+    /// Messages that were sent and reached no receiver of this host whole. A subscriber may lose
+    /// more: see `subscriber_lost_messages`.
     pub lost_messages: u64,
     /// Messages that arrived late and closed a gap.
     pub recovered_messages: u64,
@@ -22,7 +23,13 @@ pub struct Measurement {
     /// Messages that the writer skipped (GAP), or that readers acknowledged although the agent did
     /// not see them. They do not count as lost.
     pub irrelevant_messages: u64,
-    /// Lost messages divided by sent messages; null before the first message.
+    /// Messages that the topic's worst subscriber expected: those that it received or lost. For a
+    /// writer, and for a topic without observed deliveries, those that were sent.
+    pub subscriber_expected_messages: u64,
+    /// Messages among them that it lost, anywhere on the way to its socket.
+    pub subscriber_lost_messages: u64,
+    /// Messages that the worst subscriber lost divided by those that it expected; null before the
+    /// first.
     pub loss_ratio: Option<f64>,
     /// Messages per second over the last window.
     pub rate_hertz: f64,
@@ -108,7 +115,8 @@ pub struct Delivered {
     pub bytes: u64,
     /// Messages that arrived by retransmission.
     pub recovered_messages: u64,
-    /// Messages that never arrived, for any reason.
+    /// Messages that never arrived, by any known cause. Delivered, lost and pending messages add up
+    /// to those that the receiver expected.
     pub lost_messages: u64,
     /// Lost messages that never reached this host.
     pub lost_before_host_messages: u64,
@@ -116,9 +124,9 @@ pub struct Delivered {
     pub lost_in_reassembly_messages: u64,
     /// Lost messages that the full receive buffer of the subscriber's socket dropped.
     pub lost_in_socket_buffer_messages: u64,
-    /// Lost messages whose cause is not known yet.
+    /// Missing messages that may still arrive, or whose cause is not known yet.
     pub pending_messages: u64,
-    /// Messages that arrived at a process without a reader of the topic.
+    /// Messages that arrived at a process without a known reader that matches the writer.
     pub unmatched_messages: u64,
     /// Messages and fragments that arrived more than once.
     pub duplicate_messages: u64,

@@ -8,16 +8,19 @@
 
 mod accounting;
 mod departed;
+mod shares;
+mod withheld;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, VecDeque};
 use std::time::Duration;
 
 use ros2probe_wire::record::{AckNack, Gap, Heartbeat, Sample};
 use ros2probe_wire::{Guid, GuidPrefix, Record, SequenceNumber, Timestamp};
 
 use super::journal::Journal;
-use super::loss::LossCause;
+use super::loss::{DeliveryLoss, LossCause};
 use super::loss_causes::{LossCauses, REASSEMBLY};
+use super::loss_share::RecentLoss;
 use super::measurement::Delivered;
 use super::reception::{CompleteSample, Outcome, Reception};
 use super::route::Direction;
@@ -26,7 +29,7 @@ use super::samples::Budget;
 use super::sequence::REACH;
 use super::size::Size;
 use super::undelivered::Undelivered;
-use super::writer::settle_window;
+use super::writer::{BEST_EFFORT_WINDOW, settle_window};
 use accounting::Accounting;
 pub use accounting::Totals;
 
@@ -42,8 +45,11 @@ const FIRST_MOMENTS: Duration = Duration::from_secs(5);
 /// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
 
+/// Largest number of losses of a withheld delivery that enter the journal later.
+const WITHHELD: usize = 64;
+
 /// The receiver of the samples.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 pub enum Receiver {
     /// A participant, on any route.
     Participant(GuidPrefix),
@@ -88,10 +94,16 @@ pub struct Delivery {
     waiting: Option<Timestamp>,
     /// Whether samples that left since then are already counted as lost.
     presumed_lost: bool,
+    /// Number of samples that left this host for the receiver a while ago and have not arrived.
+    under_way: u64,
+    /// Losses of the last seconds.
+    recent: RecentLoss,
     /// Whether all readers are best effort: they get no retransmissions and no HEARTBEATs.
     best_effort: bool,
     /// Whether samples use the network, at least for some readers, rather than only shared memory.
     uses_network: bool,
+    /// The latest losses, while the delivery is withheld.
+    withheld: Option<VecDeque<DeliveryLoss>>,
 }
 
 impl Delivery {
@@ -110,8 +122,11 @@ impl Delivery {
             opened: Timestamp(0),
             waiting: None,
             presumed_lost: false,
+            under_way: 0,
+            recent: RecentLoss::default(),
             best_effort: false,
             uses_network: false,
+            withheld: None,
         }
     }
 
@@ -130,11 +145,16 @@ impl Delivery {
             opened: _,
             waiting: _,
             presumed_lost: _,
+            under_way: _,
+            recent: _,
             best_effort: _,
             uses_network: _,
+            withheld,
         } = self;
+        let withheld = withheld.as_ref().map_or(0, VecDeque::len);
+        let withheld = Size::new("delivery.withheld", withheld, WITHHELD);
         let sizes = reception.sizes().chain(undelivered.sizes());
-        sizes.chain(loss_causes.sizes())
+        sizes.chain(loss_causes.sizes()).chain([withheld])
     }
 
     /// Allows fragmented samples that begin before `until` to be incomplete without a loss.
@@ -209,7 +229,9 @@ impl Delivery {
         self.reception.sequence_mut().know(number);
         if self.loss_causes.resolve(number) {
             self.tally.pending = self.tally.pending.saturating_sub(1);
-            totals.received.pending = totals.received.pending.saturating_sub(1);
+            if self.withheld.is_none() {
+                totals.received.pending = totals.received.pending.saturating_sub(1);
+            }
         }
     }
 
@@ -225,7 +247,7 @@ impl Delivery {
 
     /// Records that the last reader is gone: samples after its last one do not count as lost.
     pub fn close(&mut self, budget: &mut Budget) {
-        (self.waiting, self.presumed_lost) = (None, false);
+        (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
         self.reception.close(budget);
     }
 
@@ -291,11 +313,7 @@ impl Delivery {
             return;
         }
         if self.loss_causes.resolve(number) {
-            self.tally.pending -= 1;
-            context.totals.received.pending = context.totals.received.pending.saturating_sub(1);
-            self.split(context)
-                .2
-                .lose(LossCause::Reassembly, number, number);
+            self.split(context).2.explain(LossCause::Reassembly, number);
             return;
         }
         self.record_cause(number, LossCause::Reassembly, context);
@@ -342,7 +360,9 @@ impl Delivery {
     pub fn advance(&mut self, context: &mut DeliveryContext<'_>) {
         let (now, window) = (context.now, settle_window(self.is_reliable(context)));
         let (reception, budget, mut accounting) = self.split(context);
-        reception.advance(now, (window, window), budget, &mut |decision| {
+        // A sample that the writer withdrew is not retransmitted.
+        let windows = (window, BEST_EFFORT_WINDOW);
+        reception.advance(now, windows, budget, &mut |decision| {
             accounting.take(decision);
         });
         self.conclude(now, context);
@@ -372,6 +392,7 @@ impl Delivery {
             .filter(|number| !self.has(*number) && !other.has(*number))
             .collect();
         self.tally.add(&other.tally);
+        self.recent.absorb(&other.recent);
         let total = &mut context.totals.received.pending;
         *total = total.saturating_sub(std::mem::take(&mut self.tally.pending));
         self.loss_causes.absorb(other.loss_causes);
@@ -460,8 +481,10 @@ impl Delivery {
                 context.now.nanoseconds_since(noticed)
             });
             waited = seconds(waited_for);
-            let breakdown = context.totals.breakdown.get_or_insert_default();
-            breakdown.retransmission.observe(waited);
+            if self.withheld.is_none() {
+                let breakdown = context.totals.breakdown.get_or_insert_default();
+                breakdown.retransmission.observe(waited);
+            }
         }
         self.count(context, |tally| {
             tally.messages += 1;
@@ -544,7 +567,9 @@ impl Delivery {
 
     fn count(&mut self, context: &mut DeliveryContext<'_>, change: impl Fn(&mut Delivered)) {
         change(&mut self.tally);
-        change(context.totals.of(self.main.direction));
+        if self.withheld.is_none() {
+            change(context.totals.of(self.main.direction));
+        }
     }
 
     /// Splits the borrow into the reception, its memory budget, and the accounting of decisions.
@@ -561,6 +586,7 @@ impl Delivery {
             loss_causes: &mut self.loss_causes,
             totals: &mut context.totals.received,
             journal: context.journal,
+            withheld: self.withheld.as_mut(),
             writer: context.writer,
             receiver: self.receiver,
             main: self.main,

@@ -78,7 +78,6 @@ pub enum Change {
 #[derive(Debug)]
 struct PendingEndpoint {
     at: Timestamp,
-    announces_readers: bool,
     announcement: Box<EndpointAnnouncement>,
 }
 
@@ -399,7 +398,6 @@ impl Discovery {
             last_seen: origin.at,
             endpoints: BTreeSet::new(),
             nodes: Vec::new(),
-            all_readers_announced: false,
             watched: 0,
             local: false,
             sends: false,

@@ -13,6 +13,7 @@ use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::churn;
+use super::delivery::Receiver;
 use super::diagnosis::Diagnosis;
 use super::expectation::WatchState;
 use super::inside::facts::LifecycleState;
@@ -26,6 +27,8 @@ const MOST: u16 = 512;
 const MANY: usize = 1024;
 /// Largest number of writers whose losses within a second are combined.
 const BURSTS: usize = 1024;
+/// Largest number of receivers of one writer whose losses within a second are compared.
+const LOSERS: usize = 32;
 /// Longest text kept in an event, such as a topic's name.
 pub(crate) const TEXT: usize = 256;
 /// Longest list kept in an event, such as the participants of a duplicate node.
@@ -123,7 +126,7 @@ pub enum EventKind {
     },
 }
 
-/// Lost samples of one writer.
+/// Samples of one writer that its worst receiver lost.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LossBurst {
     /// GUID of the writer.
@@ -187,6 +190,8 @@ struct ClassQuota {
 struct Burst {
     at: Timestamp,
     losses: LossBurst,
+    /// Number of samples that each receiver lost.
+    losers: Vec<(Receiver, u64)>,
 }
 
 impl Class {
@@ -244,11 +249,13 @@ impl Events {
             classes,
             bursts,
         } = self;
+        let losers = bursts.values().map(|burst| burst.losers.len()).max();
         let room = MANY + classes.len() * usize::from(MOST);
         vec![
             Size::new("events.waiting", waiting.len(), room),
             Size::new("events.classes", classes.len(), Class::ALL.len()),
             Size::new("events.bursts", bursts.len(), BURSTS),
+            Size::new("events.losers", losers.unwrap_or(0), LOSERS),
         ]
     }
 
@@ -258,35 +265,69 @@ impl Events {
         self.waiting.len() >= MANY
     }
 
-    /// Adds a loss to the burst of its writer.
+    /// Adds samples that reached no receiver to the burst of their writer.
     pub fn lose(&mut self, loss: &Loss) {
         let count = loss.last.steps_since(loss.first).saturating_add(1);
-        if let Some(burst) = self.bursts.get_mut(&loss.writer) {
-            burst.at = burst.at.max(loss.at);
+        if let Some(burst) = self.burst(loss.writer, loss.at, (loss.first, loss.last)) {
             burst.losses.count = burst.losses.count.saturating_add(count);
-            burst.losses.first = burst.losses.first.min(loss.first);
-            burst.losses.last = burst.losses.last.max(loss.last);
-            return;
         }
-        if self.bursts.len() >= BURSTS {
-            self.classes.entry(Class::Loss).or_default().overflow += 1;
+    }
+
+    /// Adds samples that one receiver lost to the burst of their writer. A burst has the count of
+    /// the receiver that lost most.
+    pub fn lose_delivery(
+        &mut self,
+        writer: Guid,
+        receiver: Receiver,
+        at: Timestamp,
+        (first, last): (SequenceNumber, SequenceNumber),
+    ) {
+        let count = last.steps_since(first).saturating_add(1);
+        let Some(burst) = self.burst(writer, at, (first, last)) else {
             return;
-        }
-        let losses = LossBurst {
-            writer: loss.writer,
-            topic: None,
-            node: None,
-            count,
-            first: loss.first,
-            last: loss.last,
         };
-        self.bursts.insert(
-            loss.writer,
-            Burst {
-                at: loss.at,
-                losses,
+        let is_full = burst.losers.len() >= LOSERS;
+        let mut losers = burst.losers.iter_mut();
+        let lost = match losers.find(|(loser, _)| *loser == receiver) {
+            Some((_, lost)) => {
+                *lost = lost.saturating_add(count);
+                *lost
+            }
+            None if is_full => count,
+            None => {
+                burst.losers.push((receiver, count));
+                count
+            }
+        };
+        burst.losses.count = burst.losses.count.max(lost);
+    }
+
+    fn burst(
+        &mut self,
+        writer: Guid,
+        at: Timestamp,
+        (first, last): (SequenceNumber, SequenceNumber),
+    ) -> Option<&mut Burst> {
+        if self.bursts.len() >= BURSTS && !self.bursts.contains_key(&writer) {
+            self.classes.entry(Class::Loss).or_default().overflow += 1;
+            return None;
+        }
+        let burst = self.bursts.entry(writer).or_insert_with(|| Burst {
+            at,
+            losses: LossBurst {
+                writer,
+                topic: None,
+                node: None,
+                count: 0,
+                first,
+                last,
             },
-        );
+            losers: Vec::new(),
+        });
+        burst.at = burst.at.max(at);
+        burst.losses.first = burst.losses.first.min(first);
+        burst.losses.last = burst.losses.last.max(last);
+        Some(burst)
     }
 
     /// Sets the topic of the burst of a writer that is gone.
@@ -298,7 +339,7 @@ impl Events {
 
     /// Ends all bursts. `complete` fills in what is known about the writers.
     pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
-        for (_, Burst { at, mut losses }) in std::mem::take(&mut self.bursts) {
+        for (_, Burst { at, mut losses, .. }) in std::mem::take(&mut self.bursts) {
             complete(&mut losses);
             self.push(at, EventKind::Loss(losses));
         }
@@ -432,6 +473,35 @@ mod tests {
         events.push(Timestamp(SECOND), node("/b"));
         let taken = events.take();
         assert_eq!((taken.events.len(), taken.overflow.len()), (1, 0));
+    }
+
+    #[test]
+    fn a_burst_has_the_count_of_the_receiver_that_lost_most() {
+        let mut events = Events::default();
+        let receiver = |number| Receiver::Participant(GuidPrefix([number; 12]));
+        let run = |first, last| (SequenceNumber(first), SequenceNumber(last));
+        events.lose_delivery(guid(1), receiver(1), Timestamp(10), run(5, 7));
+        events.lose_delivery(guid(1), receiver(2), Timestamp(10), run(6, 7));
+        events.lose_delivery(guid(1), receiver(2), Timestamp(11), run(9, 10));
+        events.end_bursts(|_| {});
+        let EventKind::Loss(burst) = &events.take().events[0].kind else {
+            panic!("a loss")
+        };
+        assert_eq!((burst.count, burst.first.0, burst.last.0), (4, 5, 10));
+    }
+
+    #[test]
+    fn more_receivers_that_lose_than_are_compared_stay_bounded() {
+        let mut events = Events::default();
+        for number in 0..100 {
+            let receiver = Receiver::Participant(GuidPrefix([number; 12]));
+            let run = (SequenceNumber(1), SequenceNumber(2));
+            events.lose_delivery(guid(1), receiver, Timestamp(10), run);
+        }
+        let sizes = events.sizes();
+        let losers = sizes.iter().find(|size| size.table == "events.losers");
+        let losers = losers.unwrap();
+        assert_eq!((losers.entries, losers.cap), (LOSERS, LOSERS));
     }
 
     #[test]

@@ -20,6 +20,7 @@ use std::time::Duration;
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
+use super::loss_share::LossShare;
 use super::rate::{SECONDS, Slot};
 use crate::watch::Expectations;
 
@@ -78,6 +79,8 @@ pub struct Evidence<'a> {
     pub observed: Timestamp,
     /// Returns counts of the last whole seconds and the number of these seconds.
     pub recent: &'a dyn Fn(u64) -> (Slot, u64),
+    /// Loss of the worst subscriber in the last ten seconds.
+    pub loss: LossShare,
 }
 
 /// State of one topic under one entry.
@@ -225,12 +228,10 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
             broken |= MAX_RATE;
         }
     }
-    if let Some(maximum) = expectations.max_loss_ratio {
-        let (slot, _) = (evidence.recent)(SECONDS);
-        let sent = slot.messages + slot.lost;
-        if sent > 0 && slot.lost as f64 > maximum * sent as f64 {
-            broken |= MAX_LOSS;
-        }
+    if let Some(maximum) = expectations.max_loss_ratio
+        && evidence.loss.exceeds(maximum)
+    {
+        broken |= MAX_LOSS;
     }
     if let Some(maximum) = expectations.max_latency {
         let (slot, _) = (evidence.recent)(1);
@@ -329,6 +330,10 @@ mod tests {
                     since: Timestamp(1000 * SECOND),
                     observed: self.observed,
                     recent: &recent,
+                    loss: LossShare {
+                        lost: 10 * slot.lost,
+                        expected: 10 * (slot.messages + slot.lost),
+                    },
                 },
             );
             self.judgement.state()

@@ -62,7 +62,7 @@ pub struct Row {
     topic: u32,
     /// Messages received whole.
     pub messages: u32,
-    /// Messages settled as lost.
+    /// Messages that the worst subscriber lost.
     pub lost: u32,
     /// Payload bytes.
     pub bytes: f32,
@@ -245,7 +245,7 @@ impl History {
         let after = PreviousTotals {
             messages: counted.messages,
             bytes: counted.bytes,
-            lost: counted.lost,
+            lost: counted.loss.lost,
             earlier: counted.earlier,
             latency: counted.source_latency,
             interarrival: counted.interarrival,

@@ -125,9 +125,12 @@ impl Journal {
         std::mem::take(&mut self.missing)
     }
 
-    /// Adds a loss, extending the last entry if the loss continues it.
-    pub fn lose(&mut self, loss: Loss) {
-        self.events.lose(&loss);
+    /// Adds a loss, extending the last entry if the loss continues it. It becomes an event unless
+    /// its receivers report it.
+    pub fn lose(&mut self, loss: Loss, has_receivers: bool) {
+        if !has_receivers {
+            self.events.lose(&loss);
+        }
         if let Some(last) = self.losses.back_mut()
             && last.writer == loss.writer
             && last.last.precedes(loss.first)

@@ -49,6 +49,7 @@ pub mod journal;
 pub mod limits;
 pub mod loss;
 pub mod loss_causes;
+pub mod loss_share;
 pub mod measurement;
 pub mod names;
 pub mod naming;

@@ -5,6 +5,7 @@ use ros2probe_wire::Timestamp;
 
 use super::histogram::Histogram;
 use super::loss::LossCause;
+use super::loss_share::LossShare;
 
 /// Counts and times while the topic was watched. Counters never decrease while the topic exists.
 #[derive(Clone, Debug, Default)]
@@ -15,6 +16,9 @@ pub struct Measurement {
     pub bytes: u64,
     /// Samples settled as lost: a gap that was neither excused nor filled in time.
     pub lost: u64,
+    /// Samples that the worst subscriber expected and lost; for a writer, those that did not reach
+    /// this host.
+    pub loss: LossShare,
     /// Samples that filled a gap late, by retransmission or reordering.
     pub recovered: u64,
     /// Samples and fragments received more than once.
@@ -74,10 +78,10 @@ pub struct SampledFacts {
     pub uncertain: u64,
 }
 
-/// Samples of one or several deliveries. No field except `pending` ever decreases.
+/// Samples of one or several deliveries. No field except `pending` and `awaited` ever decreases.
 ///
 /// `messages - history + lost() + irrelevant` is the number of samples that were decided since the
-/// delivery began. Samples that may still arrive are not included.
+/// delivery began. `awaited` has those that are not decided.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Delivered {
     /// Samples that arrived (or left) whole, without duplicates.
@@ -106,6 +110,8 @@ pub struct Delivered {
     pub lost_in_socket_buffer: u64,
     /// Lost samples whose cause is unknown so far: the kernel may still wait for IP fragments.
     pub pending: u64,
+    /// Missing samples that may still arrive, and are not in any other count.
+    pub awaited: u64,
 }
 
 /// Time that a writer's samples spent in each stage, in histograms with finer buckets.
@@ -128,6 +134,7 @@ impl Measurement {
         self.messages += other.messages;
         self.bytes += other.bytes;
         self.lost += other.lost;
+        self.loss.add(other.loss);
         self.recovered += other.recovered;
         self.duplicates += other.duplicates;
         self.incomplete += other.incomplete;
@@ -172,6 +179,18 @@ impl Delivered {
         self.lost_before_host + self.lost_in_reassembly + self.lost_in_socket_buffer + self.pending
     }
 
+    /// Returns the number of lost samples whose cause is known.
+    #[must_use]
+    pub const fn lost_by_any(&self) -> u64 {
+        self.lost() - self.pending
+    }
+
+    /// Returns the number of missing samples that may still arrive, or whose cause is unknown.
+    #[must_use]
+    pub const fn open(&self) -> u64 {
+        self.pending + self.awaited
+    }
+
     /// Returns the number of samples lost by this cause.
     #[must_use]
     pub const fn lost_by(&self, cause: LossCause) -> u64 {
@@ -205,6 +224,7 @@ impl Delivered {
         self.lost_in_reassembly += other.lost_in_reassembly;
         self.lost_in_socket_buffer += other.lost_in_socket_buffer;
         self.pending += other.pending;
+        self.awaited += other.awaited;
     }
 }
 

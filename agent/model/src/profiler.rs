@@ -15,6 +15,7 @@ use ros2probe_wire::{Guid, Record, SequenceNumber, Timestamp};
 use super::delivery::Totals;
 use super::in_order::Progress;
 use super::journal::Journal;
+use super::loss_share::LossShare;
 use super::measurement::Measurement;
 use super::receivers::GraphView;
 use super::route::Destination;
@@ -96,6 +97,7 @@ struct WriterRef {
     writer: Guid,
     reliable: bool,
     topic: Option<TopicId>,
+    has_receivers: bool,
 }
 
 /// Counts of a writer that is no longer measured.
@@ -107,6 +109,8 @@ pub struct Retired {
     pub measurement: Measurement,
     /// Sums over its deliveries.
     pub totals: Option<Totals>,
+    /// Losses of its worst receiver in this second.
+    pub departed: LossShare,
 }
 
 /// The result of a record.
@@ -212,6 +216,11 @@ impl Profiler {
     #[must_use]
     pub fn get(&self, guid: Guid) -> Option<&Measured> {
         self.writers.get(&guid)
+    }
+
+    /// Returns a measured writer.
+    pub fn get_mut(&mut self, guid: Guid) -> Option<&mut Measured> {
+        self.writers.get_mut(&guid)
     }
 
     /// Returns all measured writers.
@@ -435,13 +444,15 @@ impl Profiler {
         ));
         self.unknown_writers.remove(&guid);
         let subscribers = measured.subscribers.take();
-        let totals = subscribers.map(|subscribers| {
+        let stopped = subscribers.map(|subscribers| {
             subscribers.stop(&mut self.shared.writer_context(writer_ref, now, journal, graph))
         });
+        let (totals, departed) = stopped.unzip();
         Some(Retired {
             topic: writer_ref.topic?,
             measurement: measured.writer.measurement(now),
             totals,
+            departed: departed.unwrap_or_default(),
         })
     }
 
@@ -506,6 +517,7 @@ impl Profiler {
             if let Some(subscribers) = &mut measured.subscribers {
                 subscribers
                     .settle(&mut self.shared.writer_context(writer_ref, now, journal, graph));
+                subscribers.end_second();
             }
             // A writer that sent more than once and was never announced is an unknown writer.
             measured.metered |= measured.topic.is_none() && measured.writer.messages() > 1;
@@ -552,6 +564,7 @@ impl SharedBudgets {
             budget,
             journal,
             wall_clock,
+            has_receivers: writer_ref.has_receivers,
         }
     }
 
@@ -577,10 +590,12 @@ impl SharedBudgets {
 
 impl Measured {
     fn writer_ref(&self, writer: Guid) -> WriterRef {
+        let subscribers = self.subscribers.as_ref();
         WriterRef {
             writer,
             reliable: self.writer.traits().reliable,
             topic: self.topic,
+            has_receivers: subscribers.is_some_and(|subscribers| subscribers.has_receivers()),
         }
     }
 

@@ -10,20 +10,22 @@
 //! "unknown".
 
 mod addresses;
+mod matched;
 
 use std::collections::{HashMap, HashSet, VecDeque};
 
 use ros2probe_wire::record::flag;
-use ros2probe_wire::{Guid, GuidPrefix, Record};
+use ros2probe_wire::{DomainId, GuidPrefix, Record};
 
 use addresses::AnnouncedAddresses;
+pub use matched::{Matched, MatchedReaders};
 
 use super::discovery::Discovery;
 use super::route::{Destination, Route};
 use super::size::Size;
 use super::sockets::SocketFacts;
 use super::sockets::Sockets;
-use super::topic::{Topic, Topics};
+use super::topic::Topics;
 use super::wall_clock::WallClock;
 
 /// Largest number of participants remembered per socket or process.
@@ -62,17 +64,6 @@ pub struct GraphView<'a> {
     pub topics: &'a Topics,
     /// Difference between model time and calendar time, for timestamps of writers.
     pub wall_clock: WallClock,
-}
-
-/// Whether a receiver has a reader of the topic.
-#[derive(Clone, Copy, PartialEq, Eq, Debug)]
-pub enum Matched {
-    /// The receiver has a reader.
-    Yes,
-    /// The receiver has no reader: all of its announcements were captured.
-    No,
-    /// Some announcements were missed, or the receiver is not known.
-    Unknown,
 }
 
 /// Participants that a socket may belong to.
@@ -390,6 +381,21 @@ impl Receivers {
     /// Returns the participant that receives on this route.
     #[must_use]
     pub fn owner(&self, route: &Route, discovery: &Discovery) -> Option<GuidPrefix> {
+        match self.owners(route, discovery, None)[..] {
+            [owner] => Some(owner),
+            _ => None,
+        }
+    }
+
+    /// Returns the participants, one of which receives on this route. `domain_id` is that of the
+    /// samples' topic, if known.
+    #[must_use]
+    pub fn owners(
+        &self,
+        route: &Route,
+        discovery: &Discovery,
+        domain_id: Option<DomainId>,
+    ) -> Vec<GuidPrefix> {
         if route.socket != 0 {
             let users = self.users.get(&route.socket);
             let facts = self.sockets.get(route.socket);
@@ -409,51 +415,30 @@ impl Receivers {
                 if !left.is_empty() {
                     open = left;
                 }
-                if let [owner] = open[..] {
-                    return Some(owner);
+                if open.len() == 1 {
+                    return open;
                 }
             }
             if !open.is_empty() {
-                return None;
+                let is_there = |owner: &GuidPrefix| {
+                    let known = discovery.participants().get(owner);
+                    known.map(|participant| participant.domain_id) == domain_id
+                };
+                if open.iter().any(is_there) {
+                    open.retain(is_there);
+                }
+                return open;
             }
             let announced = facts.and_then(|facts| facts.own_process_id);
             if let Some(owner) = announced.and_then(|process| announced_in(process, discovery)) {
-                return Some(owner);
+                return vec![owner];
             }
         }
-        let prefix = self.addresses.owner(&route.destination)?;
-        let is_known = discovery.participants().contains_key(&prefix);
-        (is_known && !route.destination.is_multicast()).then_some(prefix)
+        let owner = self.addresses.owner(&route.destination);
+        let is_known = |prefix: &GuidPrefix| discovery.participants().contains_key(prefix);
+        let owner = owner.filter(|_| !route.destination.is_multicast());
+        owner.filter(is_known).into_iter().collect()
     }
-}
-
-impl GraphView<'_> {
-    /// Returns whether this participant reads the topic, as far as that is known.
-    #[must_use]
-    pub fn matched(&self, topic: Option<&Topic>, prefix: GuidPrefix) -> Matched {
-        let Some(topic) = topic else {
-            return Matched::Unknown;
-        };
-        if readers(topic, prefix).next().is_some() {
-            return Matched::Yes;
-        }
-        match self.discovery.participants().get(&prefix) {
-            Some(participant) if participant.all_readers_announced => Matched::No,
-            _ => Matched::Unknown,
-        }
-    }
-}
-
-/// Returns this participant's readers of the topic, sorted, without those of buffer topics.
-pub fn readers(topic: &Topic, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
-    [&topic.readers, &topic.buffer_endpoints]
-        .into_iter()
-        .flat_map(move |list| {
-            let start = list.partition_point(|guid| guid.prefix < prefix);
-            let own = list.get(start..).unwrap_or_default().iter().copied();
-            own.take_while(move |guid| guid.prefix == prefix)
-                .filter(|guid| !guid.entity.is_writer())
-        })
 }
 
 /// Returns the only participant that announces this process id, or `None`. Fast DDS announces only

@@ -240,6 +240,11 @@ impl Reception {
         partial
     }
 
+    /// Drops all unfinished samples.
+    pub fn discard(&mut self, budget: &mut Budget) {
+        self.samples.clear(budget);
+    }
+
     /// Excuses all samples after the last one that arrived, because the receiver is gone.
     pub fn close(&mut self, budget: &mut Budget) {
         let sequence = &mut self.sequence;

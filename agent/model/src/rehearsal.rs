@@ -7,6 +7,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 
 use crate::expectation::{Evidence, Judgement, WatchState};
+use crate::loss_share::{self, LossShare};
 use crate::rate::Slot;
 use crate::watch::Expectations;
 
@@ -21,8 +22,10 @@ const BEGIN: u64 = 1_000_000;
 pub struct Second {
     /// Messages received whole.
     pub messages: u32,
-    /// Messages settled as lost.
+    /// Messages that the worst subscriber lost.
     pub lost: u32,
+    /// Messages that it expected: those that it received or lost.
+    pub expected: u32,
     /// Messages with a latency.
     pub delayed: u32,
     /// Sum of their latencies in seconds.
@@ -67,6 +70,7 @@ pub fn violations(expectations: &Expectations, seconds: &[Second]) -> Vec<&'stat
                 since: instant(since),
                 observed: instant(observed),
                 recent: &recent,
+                loss: loss(seconds, place + 1),
             },
         );
         if matches!(judgement.state(), WatchState::Violated | WatchState::Silent) {
@@ -96,6 +100,19 @@ fn recent(seconds: &[Second], begin: usize, end: usize, length: u64) -> (Slot, u
         });
     }
     (sum, (end - begin) as u64)
+}
+
+/// Returns the loss of the seconds before `end`.
+fn loss(seconds: &[Second], end: usize) -> LossShare {
+    let begin = end.saturating_sub(loss_share::SECONDS);
+    let mut sum = LossShare::default();
+    for second in seconds.get(begin..end).unwrap_or_default() {
+        sum.add(LossShare {
+            lost: second.lost.into(),
+            expected: second.expected.into(),
+        });
+    }
+    sum
 }
 
 fn instant(place: usize) -> Timestamp {

@@ -8,11 +8,10 @@ use std::time::Duration;
 
 use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
 
-use super::receivers::{GraphView, Matched};
+use super::receivers::{Matched, MatchedReaders};
 use super::route::Direction;
 use super::route::{Destination, Route};
 use super::size::Size;
-use super::topic::Topic;
 
 /// Largest number of routes per writer.
 const LIMIT: usize = 512;
@@ -40,9 +39,11 @@ pub struct KnownRoute {
     pub owner: Option<GuidPrefix>,
     /// The participant of directed messages on it, the only evidence of a receiver.
     directed_to: Option<GuidPrefix>,
-    /// Whether that participant reads the topic; for an outgoing multicast, whether any participant
-    /// does.
+    /// Whether that participant has a reader that matches the writer; for an outgoing multicast,
+    /// whether the topic has any reader.
     pub matched: Matched,
+    /// Whether one of several participants receives on it, and each has a matching reader.
+    pub is_shared: bool,
     /// Index of its delivery, if resolved.
     pub delivery: Option<usize>,
     /// Time of the last record.
@@ -73,6 +74,7 @@ impl Routes {
                 owner: _,
                 directed_to: _,
                 matched: _,
+                is_shared: _,
                 delivery: _,
                 last_seen: _,
                 brought: _,
@@ -136,8 +138,7 @@ impl Routes {
         &mut self,
         route: Route,
         now: Timestamp,
-        graph: &GraphView<'_>,
-        topic: Option<&Topic>,
+        readers: MatchedReaders<'_>,
     ) -> usize {
         if let Some(index) = self.find(&route) {
             self.last = index;
@@ -156,6 +157,7 @@ impl Routes {
             owner: None,
             directed_to: None,
             matched: Matched::Unknown,
+            is_shared: false,
             delivery: None,
             last_seen: now,
             brought: 0,
@@ -163,7 +165,7 @@ impl Routes {
             has_data: false,
             left: VecDeque::new(),
         };
-        known.resolve(graph, topic);
+        known.resolve(readers);
         let index = self.routes.partition_point(|known| known.route < route);
         self.routes.insert(index, known);
         self.last = index;
@@ -195,13 +197,20 @@ impl Routes {
 }
 
 impl KnownRoute {
-    /// Resolves the receiver of each route that is out of date.
-    pub fn resolve(&mut self, graph: &GraphView<'_>, topic: Option<&Topic>) {
+    /// Resolves the receiver of the route.
+    pub fn resolve(&mut self, readers: MatchedReaders<'_>) {
+        let (graph, topic) = (readers.graph(), readers.topic());
         let is_there = |prefix: &GuidPrefix| graph.discovery.participants().contains_key(prefix);
-        self.owner = graph
+        let domain_id = topic.map(|topic| topic.domain_id);
+        let owners = graph
             .receivers
-            .owner(&self.route, graph.discovery)
-            .or(self.directed_to.filter(is_there));
+            .owners(&self.route, graph.discovery, domain_id);
+        let has_reader = |owner: &GuidPrefix| readers.matched(*owner) == Matched::Yes;
+        self.is_shared = owners.len() > 1 && owners.iter().all(has_reader);
+        self.owner = match owners[..] {
+            [owner] => Some(owner),
+            _ => self.directed_to.filter(is_there),
+        };
         self.delivery = None;
         let leaves_for_all =
             self.route.direction == Direction::Sent && self.route.destination.is_multicast();
@@ -210,22 +219,17 @@ impl KnownRoute {
                 Some(topic) if !topic.readers.is_empty() => Matched::Yes,
                 _ => Matched::Unknown,
             },
-            Some(owner) => graph.matched(topic, owner),
+            Some(owner) => readers.matched(owner),
             None => Matched::Unknown,
         };
     }
 
     /// Records a message directed to this participant on a route.
-    pub fn note_directed(
-        &mut self,
-        prefix: GuidPrefix,
-        graph: &GraphView<'_>,
-        topic: Option<&Topic>,
-    ) {
+    pub fn note_directed(&mut self, prefix: GuidPrefix, readers: MatchedReaders<'_>) {
         if self.owner.is_none() && self.directed_to != Some(prefix) {
             self.directed_to = Some(prefix);
             self.owner = self.directed_to;
-            self.matched = graph.matched(topic, prefix);
+            self.matched = readers.matched(prefix);
         }
     }
 
@@ -269,6 +273,7 @@ mod tests {
             owner: None,
             directed_to: None,
             matched: Matched::Unknown,
+            is_shared: false,
             delivery: None,
             last_seen: Timestamp(0),
             brought: 0,

@@ -297,6 +297,15 @@ impl Sequence {
         self.settled
     }
 
+    /// Returns the number of missing samples that may still arrive.
+    #[must_use]
+    pub fn undecided(&self) -> u64 {
+        let is_open =
+            |number: &SequenceNumber| !self.received.get(*number) && !self.excused.get(*number);
+        let undecided = self.settled.max(self.floor()).until(self.next);
+        undecided.filter(is_open).count() as u64
+    }
+
     /// Returns the time at which this number was detected as missing, if remembered.
     #[must_use]
     pub fn missed_since(&self, number: SequenceNumber) -> Option<Timestamp> {

@@ -11,9 +11,13 @@
 //! unicast.
 //!
 //! A sample directed (INFO_DST) at a participant concerns no other participant at the same socket.
-//! If that participant is known to have no reader of the topic, the sample counts as unmatched.
+//!
+//! **Only a reader makes a subscriber.** A sample that reaches a participant without a known reader
+//! that matches the writer counts as unmatched. Samples at a socket whose participant is unknown
+//! are withheld until it is known.
 
 mod lifecycle;
+mod receivers;
 mod submessages;
 
 use ros2probe_wire::record::{Body, Sample, flag};
@@ -24,16 +28,16 @@ use super::delivery::{Delivery, DeliveryContext, Receiver, Totals, seconds};
 use super::departures::Departures;
 use super::header::PLAUSIBLE;
 use super::journal::Journal;
+use super::loss_share::LossShare;
 use super::measurement::Breakdown;
-use super::receivers::{GraphView, Matched};
+use super::receivers::{GraphView, Matched, MatchedReaders};
 use super::reception::CompleteSample;
-use super::route::{Destination, Direction, Route};
-use super::routes::{KnownRoute, Routes};
+use super::route::{Destination, Route};
+use super::routes::Routes;
 use super::samples::Budget;
 use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
 use super::topic::{Topic, TopicId};
-use lifecycle::is_best_effort;
 
 /// Largest number of samples compared with a sibling at once.
 const LOOK_BACK: u64 = 4096;
@@ -54,6 +58,10 @@ pub struct Subscribers {
     reassembled: bool,
     /// Whether some routes are observed at sockets.
     at_socket: bool,
+    /// Whether any participant has a reader that matches the writer.
+    has_readers: bool,
+    /// Losses in this second of a receiver that is gone; those of the worst.
+    departed: LossShare,
     /// Generation of the results in `routes`.
     generation: u64,
     /// See [`Delivery::allow_incomplete`].
@@ -119,6 +127,8 @@ impl Subscribers {
             acknowledgements,
             reassembled: _,
             at_socket: _,
+            has_readers: _,
+            departed: _,
             generation: _,
             sure_from: _,
         } = self;
@@ -134,19 +144,6 @@ impl Subscribers {
             sure_from,
             ..Self::default()
         }
-    }
-
-    /// Returns each delivery with its routes.
-    pub fn deliveries(&self) -> impl Iterator<Item = (&Delivery, Vec<&KnownRoute>)> {
-        self.deliveries.iter().map(|delivery| {
-            let leads_there = |known: &&KnownRoute| match delivery.receiver() {
-                Receiver::Route(route) => known.route == route,
-                Receiver::Participant(prefix) => {
-                    known.route.direction == Direction::Received && known.owner == Some(prefix)
-                }
-            };
-            (delivery, self.routes.iter().filter(leads_there).collect())
-        })
     }
 
     /// Records that bytes for this destination were not captured: what is missing before `at` may
@@ -214,10 +211,8 @@ impl Subscribers {
         if !is_host && self.at_socket && self.routes.is_at_socket(route.destination) {
             return RecordNovelty::SeenAtSocket;
         }
-        let topic = context.topic();
-        let mut index = self
-            .routes
-            .find_or_insert(route, context.now, &context.graph, topic);
+        let readers = context.readers();
+        let mut index = self.routes.find_or_insert(route, context.now, readers);
         if let Some(known) = self.routes.get_mut(index) {
             known.last_seen = known.last_seen.max(context.now);
             if is_host && !known.at_socket {
@@ -298,7 +293,11 @@ impl Subscribers {
         let Some((receiver, matched)) = self.receiver(index, record, context) else {
             return false;
         };
-        if matched == Matched::No {
+        let is_elsewhere = match receiver {
+            Receiver::Participant(_) => matched != Matched::Yes,
+            Receiver::Route(route) => route.socket == 0 && !self.has_readers,
+        };
+        if is_elsewhere {
             if let Body::Sample(sample) = body
                 && sample.is_message()
                 && sample.is_end()
@@ -331,7 +330,7 @@ impl Subscribers {
         context: &mut WriterContext<'_>,
     ) -> Option<(Receiver, Matched)> {
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
-        let (graph, topic) = (context.graph, context.topic());
+        let readers = context.readers();
         let known = self.routes.get_mut(index)?;
         let is_multicast = known.route.destination.is_multicast();
         if let Some(prefix) = directed.filter(|_| !is_multicast) {
@@ -339,11 +338,11 @@ impl Subscribers {
                 // The receiver ignores it.
                 return None;
             }
-            known.note_directed(prefix, &graph, topic);
+            known.note_directed(prefix, readers);
             let matched = if known.owner == Some(prefix) {
                 known.matched
             } else {
-                graph.matched(topic, prefix)
+                readers.matched(prefix)
             };
             return Some((Receiver::Participant(prefix), matched));
         }
@@ -413,7 +412,11 @@ impl Subscribers {
 
     /// Processes a sample that arrived whole on this route.
     fn came(&mut self, index: usize, place: usize, whole: &CompleteSample, now: Timestamp) {
-        self.transfer(whole, now);
+        let withheld = self.deliveries.get(place).map(Delivery::is_withheld);
+        let is_counted = withheld == Some(false);
+        if is_counted {
+            self.transfer(whole, now);
+        }
         let Some(known) = self.routes.get_mut(index).filter(|_| !whole.recovered) else {
             return;
         };
@@ -422,6 +425,7 @@ impl Subscribers {
         let brought = known.brought;
         if let Some(left) = self.departures.find(whole.number, route.destination)
             && now >= left
+            && is_counted
         {
             let transit = now.nanoseconds_since(left);
             self.breakdown().transit.observe(seconds(transit));
@@ -523,7 +527,7 @@ impl Subscribers {
         if cached.is_some() {
             return cached;
         }
-        let route = known.route;
+        let (route, is_shared) = (known.route, known.is_shared);
         let place = match self.find(receiver) {
             Some(place) => place,
             None if context.quota.used >= context.quota.limit => {
@@ -534,8 +538,11 @@ impl Subscribers {
             None => {
                 context.quota.used += 1;
                 let mut delivery = Delivery::new(receiver, route, context.now);
-                delivery.learn(is_best_effort(receiver, context));
+                delivery.learn(is_best_effort(receiver, context.readers()));
                 delivery.allow_incomplete(self.sure_from);
+                if is_unknown(receiver) && !is_shared {
+                    delivery.withhold();
+                }
                 self.deliveries.push(delivery);
                 self.count_open();
                 self.deliveries.len() - 1
@@ -567,10 +574,24 @@ impl<'a> WriterContext<'a> {
     fn topic(&self) -> Option<&'a Topic> {
         self.graph.topics.get(self.topic?)
     }
+
+    fn readers(&self) -> MatchedReaders<'a> {
+        MatchedReaders::new(self.graph, self.topic(), self.writer)
+    }
 }
 
 fn is_open(delivery: &Delivery) -> bool {
     matches!(delivery.receiver(), Receiver::Route(route) if route.is_open())
+}
+
+/// Returns whether the receiver is a socket of an unknown participant.
+const fn is_unknown(receiver: Receiver) -> bool {
+    matches!(receiver, Receiver::Route(route) if route.socket != 0)
+}
+
+/// Returns whether the receiver has matching readers, all of them best effort.
+fn is_best_effort(receiver: Receiver, readers: MatchedReaders<'_>) -> bool {
+    matches!(receiver, Receiver::Participant(prefix) if readers.are_best_effort(prefix))
 }
 
 fn is_reader(topic: &Topic, guid: Guid) -> bool {

@@ -12,6 +12,7 @@ use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
+use super::loss_share::{LossShare, TopicLoss};
 use super::measurement::Measurement;
 use super::names::{DdsName, TypeName};
 use super::naming::Naming;
@@ -59,6 +60,8 @@ pub struct Topic {
     pub retired: Option<Box<Measurement>>,
     /// Sums over the deliveries of these writers.
     pub retired_totals: Option<Box<Totals>>,
+    /// What its worst subscriber lost.
+    pub loss: TopicLoss,
     /// Time at which a reader last appeared.
     pub reader_appeared: Timestamp,
     /// Time at which its first reader appeared, since it last had none.
@@ -100,8 +103,15 @@ impl Topic {
         self.vanished.is_some()
     }
 
-    /// Adds the counts of a writer that is no longer measured.
-    pub fn retire(&mut self, measurement: &Measurement, totals: Option<&Totals>) {
+    /// Adds the counts of a writer that is no longer measured, and the losses of its worst receiver
+    /// in this second.
+    pub fn retire(
+        &mut self,
+        measurement: &Measurement,
+        totals: Option<&Totals>,
+        departed: LossShare,
+    ) {
+        self.loss.leave(departed);
         if let Some(totals) = totals {
             self.retired_totals.get_or_insert_default().add(totals);
         }
@@ -179,6 +189,7 @@ impl Topics {
                 requested: _,
                 retired: _,
                 retired_totals: _,
+                loss: _,
                 reader_appeared: _,
                 subscribed: _,
                 published: _,
@@ -404,6 +415,7 @@ impl Topics {
     pub fn forget_measurement(&mut self, id: TopicId) {
         if let Some(topic) = self.topics.get_mut(&id) {
             (topic.retired, topic.retired_totals) = (None, None);
+            topic.loss = TopicLoss::default();
         }
     }
 
@@ -456,6 +468,7 @@ impl Topics {
                 requested: None,
                 retired: None,
                 retired_totals: None,
+                loss: TopicLoss::default(),
                 reader_appeared: Timestamp(0),
                 subscribed: Timestamp(0),
                 published: Timestamp(0),

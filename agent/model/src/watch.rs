@@ -48,7 +48,8 @@ pub struct Expectations {
     pub max_rate_hz: Option<f64>,
     /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
     pub window_s: Option<u32>,
-    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
+    /// Largest share of messages that the worst subscriber may lose, from 0 to 1; see
+    /// [`LossShare`](crate::loss_share::LossShare).
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture.
     pub max_latency: Option<Duration>,
@@ -69,7 +70,7 @@ pub struct ExpectationValues {
     pub max_rate_hz: Option<f64>,
     /// Window of both rates, in seconds; `None` for one of at least three messages (1 to 10 s).
     pub window_s: Option<u32>,
-    /// Largest share of lost messages, lost / (received + lost), from 0 to 1.
+    /// Largest share of messages that the worst subscriber may lose, from 0 to 1.
     pub max_loss_ratio: Option<f64>,
     /// Longest time from INFO_TS to the capture, in milliseconds.
     pub max_latency_ms: Option<f64>,

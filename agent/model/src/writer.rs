@@ -17,6 +17,7 @@ use super::histogram::Histogram;
 use super::in_order::Progress;
 use super::journal::{Journal, Missing};
 use super::loss::Loss;
+use super::loss_share::LossShare;
 use super::measurement::{EarlierCounts, Measurement};
 use super::rate::{SECONDS, Slot, Window};
 use super::reception::{Decision, Outcome, Reception};
@@ -59,6 +60,8 @@ pub struct MeasurementContext<'a> {
     pub journal: &'a mut Journal,
     /// Difference between model time and calendar time, for the writer's timestamps.
     pub wall_clock: WallClock,
+    /// Whether the samples of any receiver are counted, so that losses are reported per receiver.
+    pub has_receivers: bool,
 }
 
 /// A counted message.
@@ -238,6 +241,15 @@ impl Writer {
         self.tally.messages
     }
 
+    /// Returns the samples that did not reach this host among all.
+    #[must_use]
+    pub const fn share(&self) -> LossShare {
+        LossShare {
+            lost: self.tally.lost,
+            expected: self.tally.messages + self.tally.lost,
+        }
+    }
+
     /// Returns the time of the last message.
     #[must_use]
     pub const fn last_message(&self) -> Option<Timestamp> {
@@ -301,13 +313,15 @@ impl Writer {
             Body::Sample(sample) => counted = self.sample(sample, context),
             Body::Heartbeat(heartbeat) => {
                 self.traits.reliable = true;
-                let (reception, mut settling) = self.parts(context.journal, context.now);
+                let (reception, mut settling) =
+                    self.parts(context.journal, (context.now, context.has_receivers));
                 reception.heartbeat(heartbeat, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
             }
             Body::Gap(gap) => {
-                let (reception, mut settling) = self.parts(context.journal, context.now);
+                let (reception, mut settling) =
+                    self.parts(context.journal, (context.now, context.has_receivers));
                 reception.gap(gap, context.budget, &mut |decision| {
                     settling.take(decision);
                 });
@@ -370,7 +384,8 @@ impl Writer {
             self.leave_unseen(context.journal);
         }
         let (now, window) = (context.now, settle_window(self.traits.reliable));
-        let (reception, mut settling) = self.parts(context.journal, context.now);
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
         let windows = (window, BEST_EFFORT_WINDOW);
         reception.advance(now, windows, context.budget, &mut |decision| {
             settling.take(decision);
@@ -383,7 +398,8 @@ impl Writer {
             sampled.settle_all();
             self.leave_unseen(context.journal);
         }
-        let (reception, mut settling) = self.parts(context.journal, context.now);
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
         reception.settle(context.budget, &mut |decision| settling.take(decision));
     }
 
@@ -406,6 +422,7 @@ impl Writer {
             messages: self.tally.messages,
             bytes: self.tally.bytes,
             lost: self.tally.lost,
+            loss: self.share(),
             recovered: self.tally.recovered,
             duplicates: self.tally.duplicates,
             incomplete: self.tally.incomplete,
@@ -434,13 +451,14 @@ impl Writer {
     const fn parts<'a>(
         &'a mut self,
         journal: &'a mut Journal,
-        at: Timestamp,
+        (at, has_receivers): (Timestamp, bool),
     ) -> (&'a mut Reception, Settling<'a>) {
         let settling = Settling {
             tally: &mut self.tally,
             journal,
             writer: self.guid,
             at,
+            has_receivers,
         };
         (&mut self.reception, settling)
     }
@@ -453,7 +471,8 @@ impl Writer {
         let record = sample.record();
         let now = record_time(record);
         let reliable = self.traits.reliable;
-        let (reception, mut settling) = self.parts(context.journal, context.now);
+        let (reception, mut settling) =
+            self.parts(context.journal, (context.now, context.has_receivers));
         let outcome = reception.sample(sample, reliable, context.budget, &mut |decision| {
             settling.take(decision);
         });
@@ -535,6 +554,7 @@ struct Settling<'a> {
     journal: &'a mut Journal,
     writer: Guid,
     at: Timestamp,
+    has_receivers: bool,
 }
 
 impl Settling<'_> {
@@ -561,12 +581,13 @@ impl Settling<'_> {
         let count = last - first + 1;
         self.tally.lost += count;
         self.tally.window.second(self.at).lost += count;
-        self.journal.lose(Loss {
+        let loss = Loss {
             at: self.at,
             writer: self.writer,
             first,
             last,
-        });
+        };
+        self.journal.lose(loss, self.has_receivers);
     }
 }
 

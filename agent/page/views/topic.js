@@ -158,7 +158,7 @@ const STATIONS = /** @type {[string, string][]} */ ([
   ['lost_before_host_messages', 'before this host'],
   ['lost_in_reassembly_messages', 'in IP reassembly'],
   ['lost_in_socket_buffer_messages', 'in the socket buffer'],
-  ['pending_messages', 'at an unknown place so far'],
+  ['pending_messages', 'or late, not known so far'],
 ]);
 
 /** Messages sent, lost at each place, and delivered, per subscriber. @param {{details: any}} props */
@@ -184,7 +184,7 @@ function Waterfall({ details }) {
       <th scope="col" class="number">Delivered</th><th scope="col">Share</th></tr></thead>
     <tbody>${received.map((/** @type {any} */ each) => {
       const { delivered } = each;
-      const total = delivered.messages + delivered.lost_messages;
+      const total = delivered.messages + delivered.lost_messages + delivered.pending_messages;
       const who = each.nodes.length ? each.nodes.join(', ')
         : each.process ? `${each.process} ${each.process_id}` : each.subscriber || each.destination;
       return html`<tr key=${`${each.writer} ${each.destination} ${each.subscriber}`}>

@@ -62,9 +62,8 @@ export function Topics({ query }) {
       .map((flag) => FLAGS[flag]?.[1] ?? flag).join(' ')}`));
   const figures = (/** @type {any} */ topic) => state.figuresOf(topic.id);
   const loss = (/** @type {any} */ topic) => {
-    const { lost, messages } = figures(topic);
-    return lost == null || messages == null || lost + messages === 0 ? null
-      : lost / (lost + messages);
+    const { lost, expected } = figures(topic);
+    return lost == null || !expected ? null : lost / expected;
   };
   const columns = [
     { key: 'name', title: 'Topic', header: true, by: (/** @type {any} */ topic) => topic.name,

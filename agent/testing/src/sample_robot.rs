@@ -18,6 +18,7 @@ use ros2probe_model::diagnosis::{
 };
 use ros2probe_model::discovery::Addresses;
 use ros2probe_model::histogram::Histogram;
+use ros2probe_model::loss_share::LossShare;
 use ros2probe_model::services::latency::Latencies;
 use ros2probe_model::snapshot::{
     AcknowledgementFacts, ActionFacts, Breakdown, ChurnCount, DecodeErrorCount, Delivered,
@@ -487,6 +488,10 @@ fn measurement() -> Measurement {
         messages: 123_456,
         bytes: 79_504_384_000,
         lost: 12,
+        loss: LossShare {
+            lost: 96,
+            expected: 996,
+        },
         recovered: 3,
         duplicates: 4,
         incomplete: 1,

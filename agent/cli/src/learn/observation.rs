@@ -25,6 +25,7 @@ pub struct Observation {
 struct Totals {
     messages: u64,
     lost: u64,
+    expected: u64,
     delayed: u64,
     delay: f64,
     odd_timestamps: u64,
@@ -66,7 +67,8 @@ impl Observation {
             let latency = it.latency.unwrap_or_default();
             Totals {
                 messages: it.messages,
-                lost: it.lost_messages,
+                lost: it.subscriber_lost_messages,
+                expected: it.subscriber_expected_messages,
                 delayed: latency.count,
                 delay: latency.mean_seconds * count(latency.count),
                 odd_timestamps: it.negative_latency_messages + it.implausible_latency_messages,
@@ -84,6 +86,7 @@ impl Observation {
             self.seconds.push(Second {
                 messages: share(messages, step, steps),
                 lost: share(since.lost, step, steps),
+                expected: share(since.expected, step, steps),
                 delayed: share(since.delayed, step, steps),
                 delay: narrow(since.delay / f64::from(steps)),
                 silence: last
@@ -114,6 +117,7 @@ impl Totals {
         Self {
             messages: self.messages.saturating_sub(before.messages),
             lost: self.lost.saturating_sub(before.lost),
+            expected: self.expected.saturating_sub(before.expected),
             delayed: self.delayed.saturating_sub(before.delayed),
             delay: (self.delay - before.delay).max(0.0),
             odd_timestamps: self.odd_timestamps.saturating_sub(before.odd_timestamps),

@@ -64,7 +64,8 @@ impl Robot {
         let sum =
             before.mean_seconds * before.count as f64 + activity.latency * activity.messages as f64;
         counted.messages += activity.messages;
-        counted.lost_messages += activity.lost;
+        counted.subscriber_lost_messages += activity.lost;
+        counted.subscriber_expected_messages += activity.messages + activity.lost;
         if count > 0 {
             counted.latency = Some(Distribution {
                 count,
@@ -370,7 +371,7 @@ proptest! {
         for (messages, lost, latency, publishers, subscriptions) in seconds {
             last = if messages > 0 { Some(0.01) } else { last.map(|it: f32| it + 1.0) };
             list.push(Second {
-                messages, lost, delayed: messages, delay: latency * messages as f32,
+                messages, lost, expected: messages + lost, delayed: messages, delay: latency * messages as f32,
                 silence: last, publishers, subscriptions,
             });
         }

@@ -6,9 +6,9 @@
 
 use std::ops::RangeInclusive;
 
-use ros2probe_daemon::config::Expectations;
 use ros2probe_daemon::config::rehearsal::{self, GRACE, Second};
 use ros2probe_daemon::config::watch::ExpectationValues;
+use ros2probe_daemon::config::{Expectations, LossShare};
 
 use super::observation::Observation;
 use super::statistics::{Summary, rounded_down, rounded_up};
@@ -247,20 +247,18 @@ impl<'a> Draft<'a> {
     fn loss(&mut self) {
         const KEY: &str = "max_loss_ratio";
         let lost: u64 = self.seconds.iter().map(|it| u64::from(it.lost)).sum();
+        let expected: u64 = self.seconds.iter().map(|it| u64::from(it.expected)).sum();
         let windows = self.seconds.windows(LOSS_WINDOW);
         let windows = windows.map(|it| {
             let sum = |count: fn(&Second) -> u32| it.iter().map(|s| u64::from(count(s))).sum();
-            (sum(|second| second.messages), sum(|second| second.lost))
+            LossShare {
+                lost: sum(|second| second.lost),
+                expected: sum(|second| second.expected),
+            }
         });
-        let windows: Vec<(u64, u64)> = windows
-            .filter(|(messages, lost)| messages + lost > 0)
-            .collect();
-        let ratios = windows
-            .iter()
-            .map(|(messages, lost)| number(*lost) / number(messages + lost));
-        let sent = windows
-            .iter()
-            .map(|(messages, lost)| number(messages + lost));
+        let windows: Vec<LossShare> = windows.filter(|share| share.expected > 0).collect();
+        let ratios = windows.iter().filter_map(|share| share.ratio());
+        let sent = windows.iter().map(|share| number(share.expected));
         let (Some(ratios), Some(sent)) = (Summary::of(ratios), Summary::of(sent)) else {
             return self.leave_out(KEY, "the topic was seen for less than 10 s");
         };
@@ -274,7 +272,7 @@ impl<'a> Draft<'a> {
         });
         let seen = format!(
             "{lost} of {} messages lost, at most {} % in 10 s",
-            self.messages + lost,
+            expected,
             short(ratios.maximum * 100.0)
         );
         let why = if base > MOST_LOSS {

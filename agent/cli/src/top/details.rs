@@ -223,7 +223,7 @@ fn causes(it: &Delivered) -> String {
         ("before this host", it.lost_before_host_messages),
         ("in reassembly", it.lost_in_reassembly_messages),
         ("in full socket buffers", it.lost_in_socket_buffer_messages),
-        ("cause unknown so far", it.pending_messages),
+        ("pending", it.pending_messages),
     ];
     let causes = causes.iter().filter(|(_, count)| *count > 0);
     let causes: Vec<_> = causes

@@ -20,7 +20,7 @@ rp top: a robot's topics as its agent sees them     any key: back
  Esc               one step back          q Ctrl-C   quit
 
  HZ B/S     of the last seconds          WANTED   what a watch expects of HZ
- LOSS       of 30 s: lost by a writer, or on the way to a receiver, the worse
+ LOSS       of 30 s, of the subscriber that lost most
  MED P99    from the writer's timestamp to the capture; across hosts this needs
             synchronised clocks          P/S      publishers/subscribers
  STATE      ok, quiet (no message), no pub, no sub, unwatched (not measured),

@@ -7,7 +7,6 @@ use std::time::{Duration, Instant};
 
 use super::text::safe;
 use ros2probe_api::Open;
-use ros2probe_api::measurement::Delivered;
 use ros2probe_api::topics::{ReasonCode, Topic};
 
 /// Time span of losses in the table, so that an old loss does not hide a new one.
@@ -82,8 +81,7 @@ pub struct Row {
     pub wanted: (Option<f64>, Option<f64>),
     /// Payload bytes a second.
     pub bandwidth: Option<f64>,
-    /// Ratio of lost to sent messages: lost by writers or on the way to a receiver, whichever is
-    /// larger.
+    /// Ratio of messages that the worst subscriber lost.
     pub loss: Option<f64>,
     /// Median latency in seconds.
     pub median: Option<f64>,
@@ -99,11 +97,11 @@ pub struct Row {
     pub problems: Vec<&'static str>,
 }
 
-/// Counters from which losses are computed.
+/// Messages that the worst subscriber expected and lost.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counters {
-    sent: (u64, u64),
-    delivered: (u64, u64),
+    expected: u64,
+    lost: u64,
 }
 
 /// Counters of the last [`WINDOW`].
@@ -139,30 +137,22 @@ impl Past {
 impl Counters {
     fn of(topic: &Topic<'_>) -> Self {
         let measured = topic.measurement.as_ref();
-        let received = topic.received.as_ref();
-        let delivered = |it: &Delivered| (it.messages, it.lost_messages);
-        Self {
-            sent: measured.map_or((0, 0), |it| (it.messages, it.lost_messages)),
-            delivered: received.map_or((0, 0), delivered),
-        }
+        measured.map_or_else(Self::default, |it| Self {
+            expected: it.subscriber_expected_messages,
+            lost: it.subscriber_lost_messages,
+        })
     }
 
-    /// The larger of both ratios, and whether messages were lost. `None` if nothing was sent, or
-    /// the counters restarted.
+    /// The ratio, and whether messages were lost. `None` if none was expected, or the counters
+    /// restarted.
     #[expect(
         clippy::cast_precision_loss,
         reason = "a ratio of counts far below 2^52"
     )]
     fn since(self, first: Self) -> Option<(f64, bool)> {
-        let ratio = |now: (u64, u64), then: (u64, u64)| {
-            let came = now.0.checked_sub(then.0)?;
-            let lost = now.1.checked_sub(then.1)?;
-            (came + lost > 0).then(|| lost as f64 / (came + lost) as f64)
-        };
-        let sent = ratio(self.sent, first.sent);
-        let delivered = ratio(self.delivered, first.delivered);
-        let worse = sent.into_iter().chain(delivered).reduce(f64::max)?;
-        Some((worse, worse > 0.0))
+        let expected = self.expected.checked_sub(first.expected)?;
+        let lost = self.lost.checked_sub(first.lost)?;
+        (expected > 0).then(|| (lost as f64 / expected as f64, lost > 0))
     }
 }
 
@@ -470,14 +460,14 @@ mod tests {
     }
 
     #[test]
-    fn a_loss_counts_while_it_is_new_for_any_receiver() {
+    fn a_loss_counts_while_it_is_new_for_the_worst_subscriber() {
         let start = Instant::now();
         let at = |seconds: u64| start + Duration::from_secs(seconds);
-        let facts = |messages: u64, lost: u64, undelivered: u64| {
+        let facts = |expected: u64, lost: u64| {
             topic(json!({
                 "publishers": [{"measurement": {}}],
-                "measurement": {"messages": messages, "lost_messages": lost, "rate_hertz": 1.0},
-                "received": {"messages": messages - undelivered, "lost_messages": undelivered},
+                "measurement": {"subscriber_expected_messages": expected,
+                    "subscriber_lost_messages": lost, "rate_hertz": 1.0},
             }))
         };
         let mut past = Past::default();
@@ -486,17 +476,17 @@ mod tests {
             (row.loss, row.problems)
         };
         // Earlier losses are shown, but not as a recent problem.
-        assert_eq!(seen(0, &facts(100, 100, 0)), (Some(0.5), vec![]));
-        assert_eq!(seen(1, &facts(200, 100, 0)), (Some(0.0), vec![]));
-        let (loss, problems) = seen(2, &facts(280, 120, 50));
+        assert_eq!(seen(0, &facts(200, 100)), (Some(0.5), vec![]));
+        assert_eq!(seen(1, &facts(300, 100)), (Some(0.0), vec![]));
+        let (loss, problems) = seen(2, &facts(380, 150));
         assert_eq!(problems, ["loss"]);
         assert!((loss.unwrap() - 50.0 / 180.0).abs() < 1e-9, "{loss:?}");
         for second in 3..40 {
-            seen(second, &facts(280 + second, 120, 50));
+            seen(second, &facts(380 + second, 150));
         }
-        assert_eq!(seen(40, &facts(400, 120, 50)), (Some(0.0), vec![]));
+        assert_eq!(seen(40, &facts(500, 150)), (Some(0.0), vec![]));
         // The agent has restarted.
-        assert_eq!(seen(41, &facts(10, 0, 0)), (Some(0.0), vec![]));
+        assert_eq!(seen(41, &facts(10, 0)), (Some(0.0), vec![]));
     }
 
     #[test]

@@ -31,6 +31,7 @@ use ros2probe_message::Dialect;
 pub use ros2probe_model::chain::expected::ExpectedChain;
 pub use ros2probe_model::glob;
 pub use ros2probe_model::limits::{Limit, Limits, Row as LimitRow};
+pub use ros2probe_model::loss_share::LossShare;
 pub use ros2probe_model::rehearsal;
 pub use ros2probe_model::watch::{
     self, Expectations, ManyGlobs, PatternError, Retain, Watch, Watchlist, check_globs,

@@ -196,7 +196,8 @@ pub(super) const MESSAGE_LOST: Definition = Definition::new(
         "first_sequence_number",
         "last_sequence_number",
     ],
-    "Messages of a measured writer were lost; one event per second.",
+    "A subscriber lost messages of a measured writer; one event per second, with the count of the \
+     subscriber that lost most.",
 );
 pub(super) const EXPECTATION_CHANGED: Definition = Definition::new(
     "ros2.topic.expectation_changed",

@@ -242,7 +242,20 @@ pub(super) const TOPIC_BYTES: Metric = Metric::counter(
 pub(super) const TOPIC_LOST: Metric = Metric::counter(
     "ros2_topic_lost_messages_total",
     TOPIC,
-    "Messages that were sent but never seen whole: sequence gaps neither excused nor repaired.",
+    "Messages that were sent but never seen whole on this host: sequence gaps neither excused nor \
+     repaired. A subscriber may lose more.",
+);
+pub(super) const TOPIC_SUBSCRIBER_EXPECTED: Metric = Metric::counter(
+    "ros2_topic_subscriber_expected_messages_total",
+    TOPIC,
+    "Messages that the topic's worst subscriber expected: those that it received or lost; where no \
+     delivery is observed, those that were sent.",
+);
+pub(super) const TOPIC_SUBSCRIBER_LOST: Metric = Metric::counter(
+    "ros2_topic_subscriber_lost_messages_total",
+    TOPIC,
+    "Messages among them that it lost, anywhere on the way to its socket; max_loss_ratio limits \
+     their share.",
 );
 pub(super) const TOPIC_RECOVERED: Metric = Metric::counter(
     "ros2_topic_recovered_messages_total",
@@ -427,6 +440,8 @@ pub const CATALOGUE: &[Metric] = &[
     TOPIC_MESSAGES,
     TOPIC_BYTES,
     TOPIC_LOST,
+    TOPIC_SUBSCRIBER_EXPECTED,
+    TOPIC_SUBSCRIBER_LOST,
     TOPIC_RECOVERED,
     TOPIC_DUPLICATES,
     TOPIC_INCOMPLETE,

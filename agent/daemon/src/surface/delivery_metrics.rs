@@ -133,7 +133,7 @@ impl<'a> Deliveries<'a> {
                 })
             })
         })?;
-        self.each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.pending.into())?;
+        self.each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.open().into())?;
         self.each_received(sink, &metric::SUBSCRIBER_RECOVERED, |got| {
             got.recovered.into()
         })?;
@@ -276,7 +276,7 @@ pub(super) fn sums(
         Ok(())
     })?;
     let rest: [(&Metric, Count); 4] = [
-        (&metric::TOPIC_DELIVERY_PENDING, |got| got.pending),
+        (&metric::TOPIC_DELIVERY_PENDING, |got| got.open()),
         (&metric::TOPIC_DELIVERY_RECOVERED, |got| got.recovered),
         (&metric::TOPIC_DELIVERY_IRRELEVANT, |got| got.irrelevant),
         (&metric::TOPIC_DELIVERY_UNMATCHED, |got| got.unmatched),

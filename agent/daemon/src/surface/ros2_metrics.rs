@@ -295,10 +295,16 @@ pub(super) fn topics(
             )
         })
     })?;
-    let counters: [(&Metric, Count); 6] = [
+    let counters: [(&Metric, Count); 8] = [
         (&metric::TOPIC_MESSAGES, |measured| measured.messages),
         (&metric::TOPIC_BYTES, |measured| measured.bytes),
         (&metric::TOPIC_LOST, |measured| measured.lost),
+        (&metric::TOPIC_SUBSCRIBER_EXPECTED, |measured| {
+            measured.loss.expected
+        }),
+        (&metric::TOPIC_SUBSCRIBER_LOST, |measured| {
+            measured.loss.lost
+        }),
         (&metric::TOPIC_RECOVERED, |measured| measured.recovered),
         (&metric::TOPIC_DUPLICATES, |measured| measured.duplicates),
         (&metric::TOPIC_INCOMPLETE, |measured| measured.incomplete),

@@ -1,8 +1,10 @@
 //! Effects of decisions about a delivery's samples: counters, causes, journal entries.
 
+use std::collections::VecDeque;
+
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
-use super::Receiver;
+use super::{Receiver, WITHHELD};
 use crate::journal::Journal;
 use crate::loss::DeliveryLoss;
 use crate::loss::LossCause;
@@ -53,6 +55,8 @@ pub(super) struct Accounting<'a> {
     pub(super) loss_causes: &'a mut LossCauses,
     pub(super) totals: &'a mut Delivered,
     pub(super) journal: &'a mut Journal,
+    /// The losses of a withheld delivery, which changes neither totals nor journal.
+    pub(super) withheld: Option<&'a mut VecDeque<DeliveryLoss>>,
     pub(super) writer: Guid,
     pub(super) receiver: Receiver,
     pub(super) main: Route,
@@ -70,8 +74,7 @@ impl Accounting<'_> {
             Decision::Lost { first, last, .. } => (first, last),
             Decision::Irrelevant(number) => {
                 self.loss_causes.forget(number);
-                self.tally.irrelevant += 1;
-                self.totals.irrelevant += 1;
+                self.count(|tally| tally.irrelevant += 1);
                 return;
             }
         };
@@ -80,6 +83,10 @@ impl Accounting<'_> {
             runs.push((first, last, cause));
         });
         for (first, last, cause) in runs {
+            if self.withheld.is_none() {
+                let events = &mut self.journal.events;
+                events.lose_delivery(self.writer, self.receiver, self.at, (first, last));
+            }
             match cause {
                 Some(cause) => self.lose(cause, first, last),
                 None => self.wait(first, last),
@@ -93,8 +100,7 @@ impl Accounting<'_> {
             self.lose(LossCause::BeforeHost, first, last);
             return;
         };
-        self.tally.pending += last - first + 1;
-        self.totals.pending += last - first + 1;
+        self.count(|tally| tally.pending += last - first + 1);
         if let Some((first, last)) = self.loss_causes.wait(first, last, until) {
             self.conclude(first, last);
         }
@@ -103,16 +109,20 @@ impl Accounting<'_> {
     /// Settles pending samples as lost before this host.
     pub(super) fn conclude(&mut self, first: SequenceNumber, last: SequenceNumber) {
         let count = last - first + 1;
-        self.tally.pending = self.tally.pending.saturating_sub(count);
-        self.totals.pending = self.totals.pending.saturating_sub(count);
+        self.count(|tally| tally.pending = tally.pending.saturating_sub(count));
         self.lose(LossCause::BeforeHost, first, last);
+    }
+
+    /// Settles a pending sample as lost by this cause.
+    pub(super) fn explain(&mut self, cause: LossCause, number: SequenceNumber) {
+        self.count(|tally| tally.pending = tally.pending.saturating_sub(1));
+        self.lose(cause, number, number);
     }
 
     pub(super) fn lose(&mut self, cause: LossCause, first: SequenceNumber, last: SequenceNumber) {
         let count = last - first + 1;
-        self.tally.lose(cause, count);
-        self.totals.lose(cause, count);
-        self.journal.lose_delivery(DeliveryLoss {
+        self.count(|tally| tally.lose(cause, count));
+        let loss = DeliveryLoss {
             at: self.at,
             writer: self.writer,
             participant: match self.receiver {
@@ -124,6 +134,21 @@ impl Accounting<'_> {
             cause,
             first,
             last,
-        });
+        };
+        let Some(withheld) = &mut self.withheld else {
+            self.journal.lose_delivery(loss);
+            return;
+        };
+        if withheld.len() >= WITHHELD {
+            withheld.pop_front();
+        }
+        withheld.push_back(loss);
+    }
+
+    fn count(&mut self, change: impl Fn(&mut Delivered)) {
+        change(self.tally);
+        if self.withheld.is_none() {
+            change(self.totals);
+        }
     }
 }

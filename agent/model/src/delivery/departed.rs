@@ -16,7 +16,7 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) {
         if !self.reception.sequence().started() || newest < self.next() {
-            (self.waiting, self.presumed_lost) = (None, false);
+            (self.waiting, self.presumed_lost, self.under_way) = (None, false, 0);
             return;
         }
         let since = *self.waiting.get_or_insert(context.now);
@@ -25,10 +25,12 @@ impl Delivery {
             self.presumed_lost = true;
             until = until.max(since + FIRST_MOMENTS);
         }
+        let due = left_by(context.now - UNDER_WAY).filter(|_| !self.presumed_lost);
         let lost = left_by(until).filter(|number| *number >= self.next());
         if let Some(number) = lost.filter(|_| until >= since) {
             self.exists(number, context);
         }
+        self.under_way = due.map_or(0, |due| due.next().steps_since(self.next()));
     }
 
     /// Settles samples up to `newest`, which have left for this receiver and will not arrive.

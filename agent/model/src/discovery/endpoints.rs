@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use std::cmp::Reverse;
 
-use ros2probe_wire::discovery::{EndpointAnnouncement, Role};
+use ros2probe_wire::discovery::EndpointAnnouncement;
 use ros2probe_wire::rtps::Locator;
-use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
 use super::entity::DiscoveredEntity;
 use super::eviction::{Newcomer, Table};
@@ -38,11 +38,8 @@ impl Discovery {
             return false;
         }
         let guid = announcement.guid;
-        let announces_readers =
-            announcement.role == Role::Reader && origin.sequence_number == SequenceNumber::FIRST;
         let pending = PendingEndpoint {
             at: origin.at,
-            announces_readers,
             announcement: Box::new(announcement),
         };
         let is_known = self.participants.contains_key(&guid.prefix);
@@ -85,7 +82,6 @@ impl Discovery {
         let announcement = &pending.announcement;
         let guid = announcement.guid;
         let participant = self.participants.get_mut(&guid.prefix)?;
-        participant.all_readers_announced |= pending.announces_readers;
         let domain_id = participant.domain_id;
         if let Some(known) = self.endpoints.get_mut(&guid) {
             if *known.topic == *announcement.topic.as_str() {

@@ -96,8 +96,6 @@ pub struct Participant {
     pub endpoints: BTreeSet<Guid>,
     /// Its nodes.
     pub nodes: Vec<Node>,
-    /// Whether all of its reader announcements were captured, from the first on.
-    pub all_readers_announced: bool,
     /// Number of its endpoints whose topics are watched by exact name.
     pub(super) watched: usize,
     /// Whether a socket on this host sends for it.
@@ -269,7 +267,6 @@ impl Participant {
             last_seen: _,
             endpoints,
             nodes,
-            all_readers_announced: _,
             domain_source: _,
             nodes_from: _,
             watched: _,

@@ -227,8 +227,6 @@ impl Remembered {
             last_seen: now,
             endpoints: BTreeSet::new(),
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
-            // The agent may have missed announcements of readers while it did not run.
-            all_readers_announced: false,
             watched: 0,
             local: false,
             sends: false,

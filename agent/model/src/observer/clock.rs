@@ -1,5 +1,6 @@
 //! Decisions that depend on time: leases, windows, gaps, expectations and diagnosis.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use ros2probe_wire::Timestamp;
@@ -7,10 +8,13 @@ use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::{SECOND, nanoseconds};
 
 use super::{JUMP, Observer, TICK, graph};
+use crate::delivery::Receiver;
 use crate::diagnosis;
 use crate::event::{EventKind, TEXT, bounded, bounded_finding};
 use crate::expectation::Evidence;
 use crate::expectation::WatchState;
+use crate::loss_share::LossShare;
+use crate::measurement::Measurement;
 use crate::rate::Slot;
 
 impl Observer {
@@ -54,9 +58,47 @@ impl Observer {
         for writer in self.payloads.unsettled() {
             self.payloads.give_all(writer, self.clock);
         }
+        self.end_second_of_losses();
         self.report_losses();
         self.settle_chains();
         self.examine(self.clock);
+    }
+
+    /// Determines what the worst subscriber of each measured topic lost in the last second.
+    fn end_second_of_losses(&mut self) {
+        for id in self.topics.ids() {
+            let Some(topic) = self.topics.get_mut(id) else {
+                continue;
+            };
+            let Some(retired) = &topic.retired else {
+                continue;
+            };
+            let mut unreached = retired.loss;
+            let mut subscribers: BTreeMap<Receiver, (LossShare, LossShare)> = BTreeMap::new();
+            for writer in topic.writers.iter().chain(&topic.buffer_endpoints) {
+                let Some(measured) = self.profiler.get_mut(*writer) else {
+                    continue;
+                };
+                unreached.add(measured.writer.share());
+                let Some(receivers) = &mut measured.subscribers else {
+                    continue;
+                };
+                topic.loss.leave(receivers.take_departed());
+                for (receiver, recent) in receivers.losses() {
+                    let (window, last) = subscribers.entry(receiver).or_default();
+                    window.add(recent.window());
+                    last.add(recent.last());
+                }
+            }
+            let mut counted = Measurement {
+                messages: unreached.expected - unreached.lost,
+                ..Measurement::default()
+            };
+            self.inside
+                .apply(topic.domain_id, &topic.naming, &mut counted);
+            unreached.expected = unreached.lost + counted.messages;
+            topic.loss.end_second(subscribers.into_values(), unreached);
+        }
     }
 
     /// Reports the losses of the last second.
@@ -102,6 +144,7 @@ impl Observer {
                 .locate(|prefix| self.receivers.is_local(prefix));
             self.settle_inside(now);
             self.promote();
+            self.end_second_of_losses();
             self.judge(now);
             self.advance_calls(now);
             self.advance_chains(now);
@@ -184,6 +227,7 @@ impl Observer {
                 since: topic.published,
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,
+                loss: topic.loss.window,
             };
             let mut judgements = topic.judgements.clone();
             for (index, judgement) in &mut judgements {

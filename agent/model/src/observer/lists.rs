@@ -173,7 +173,11 @@ impl Observer {
         };
         self.report_missing();
         if let Some(topic) = self.topics.get_mut(retired.topic) {
-            topic.retire(&retired.measurement, retired.totals.as_ref());
+            topic.retire(
+                &retired.measurement,
+                retired.totals.as_ref(),
+                retired.departed,
+            );
         }
     }
 

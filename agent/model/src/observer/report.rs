@@ -164,6 +164,7 @@ fn topic(
             .filter_map(|each| each.measurement.as_ref());
         own.for_each(|own| sum.add(own));
         observer.inside.apply(topic.domain_id, &topic.naming, sum);
+        sum.loss = topic.loss.total;
     }
     let totals = deliveries::totals(observer, topic);
     TopicFacts {
@@ -208,6 +209,7 @@ pub(super) fn measured(
         }
         let inside = &observer.inside;
         inside.apply(topic.domain_id, &topic.naming, &mut sum);
+        sum.loss = topic.loss.total;
         Some((topic.domain_id, &topic.naming.dds_name, sum))
     })
 }

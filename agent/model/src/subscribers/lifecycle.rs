@@ -3,13 +3,13 @@
 
 use std::time::Duration;
 
-use ros2probe_wire::qos::Reliability;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
-use super::{Subscribers, WriterContext, delivery_context, is_reader};
+use super::{Subscribers, WriterContext, delivery_context, is_best_effort, is_reader, is_unknown};
 use crate::delivery::{Delivery, Receiver, Totals};
-use crate::receivers::{Matched, readers};
+use crate::loss_share::LossShare;
+use crate::receivers::Matched;
 use crate::route::Route;
 
 /// A route is dropped after this long without a record, unless it leads to a known reader.
@@ -29,6 +29,7 @@ impl Subscribers {
         }
         self.expect(context, false);
         if now.0.is_multiple_of(SECOND) {
+            self.deliveries.iter_mut().for_each(Delivery::end_second);
             self.routes.retain(|known| {
                 known.matched == Matched::Yes || known.last_seen + ROUTE_TIMEOUT > now
             });
@@ -48,11 +49,24 @@ impl Subscribers {
         }
     }
 
-    /// Settles all samples, returns the quota, and returns the counts.
-    pub fn stop(mut self, context: &mut WriterContext<'_>) -> Totals {
+    /// Ends a second at the end of the input.
+    pub fn end_second(&mut self) {
+        self.deliveries.iter_mut().for_each(Delivery::end_second);
+    }
+
+    /// Settles all samples, returns the quota, and returns the counts and the losses of the worst
+    /// receiver in this second.
+    pub fn stop(mut self, context: &mut WriterContext<'_>) -> (Totals, LossShare) {
         self.settle(context);
+        for delivery in &mut self.deliveries {
+            if delivery.is_withheld() {
+                delivery.discard(context.budget, &mut self.totals);
+            }
+        }
         context.quota.used = context.quota.used.saturating_sub(self.deliveries.len());
-        self.totals
+        let shares = self.received().map(Delivery::last_share);
+        let worst = shares.chain([self.departed]).max_by_key(|share| share.lost);
+        (self.totals, worst.unwrap_or_default())
     }
 
     /// Returns the time of the last record of each delivery that can be dropped for a new one.
@@ -100,11 +114,9 @@ impl Subscribers {
                 }
                 continue;
             }
-            if self
-                .routes
-                .get(at)
-                .is_none_or(|known| known.matched == Matched::No)
-            {
+            let known = self.routes.get(at);
+            let is_wire = main.socket == 0 && !self.has_readers;
+            if is_wire || known.is_none_or(|known| known.matched == Matched::No) {
                 continue;
             }
             let Some(leaving) = self.routes.leaving(main.destination) else {
@@ -151,36 +163,34 @@ impl Subscribers {
 
     /// Updates the receivers of all routes if the facts have changed.
     pub(super) fn refresh(&mut self, context: &mut WriterContext<'_>) {
-        let (graph, topic) = (context.graph, context.topic());
+        let (graph, topic, readers) = (context.graph, context.topic(), context.readers());
         if self.generation == graph.receivers.generation() {
             return;
         }
         self.generation = graph.receivers.generation();
+        self.has_readers = readers.any();
         let before = self.routes.iter().count();
         self.routes
             .retain(|known| !graph.receivers.is_closed(known.route.socket));
         let closed = before > self.routes.iter().count();
         for known in self.routes.iter_mut() {
-            known.resolve(&graph, topic);
+            known.resolve(readers);
         }
         self.identify(context);
         if closed {
             self.drop_orphans(context);
         }
         for delivery in &mut self.deliveries {
-            if let Receiver::Participant(prefix) = delivery.receiver()
-                && graph.matched(topic, prefix) == Matched::No
-            {
+            let is_left = match delivery.receiver() {
+                Receiver::Participant(prefix) => readers.matched(prefix) != Matched::Yes,
+                Receiver::Route(route) => !route.is_sent() && !self.has_readers,
+            };
+            if is_left {
                 delivery.close(context.budget);
             }
-            delivery.learn(is_best_effort(delivery.receiver(), context));
+            delivery.learn(is_best_effort(delivery.receiver(), readers));
             let appeared = match delivery.receiver() {
-                Receiver::Participant(prefix) => topic.and_then(|topic| {
-                    let known = |guid| graph.discovery.endpoints().get(&guid);
-                    readers(topic, prefix)
-                        .filter_map(|guid| Some(known(guid)?.first_seen))
-                        .min()
-                }),
+                Receiver::Participant(prefix) => readers.since(prefix),
                 Receiver::Route(_) => topic.map(|topic| topic.reader_appeared),
             };
             if let Some(at) = appeared.filter(|at| *at > delivery.seen().1) {
@@ -191,20 +201,36 @@ impl Subscribers {
             .retain(|guid| topic.is_some_and(|topic| is_reader(topic, guid)));
     }
 
-    /// Merges the deliveries of routes that lead to the same participant.
+    /// Gives deliveries the participants to which their routes lead, and merges those of one
+    /// participant. Samples from before the announcement of its reader were not for it.
     fn identify(&mut self, context: &mut WriterContext<'_>) {
+        let readers = context.readers();
         let mut index = 0;
-        while let Some(delivery) = self.deliveries.get(index) {
+        while let Some(delivery) = self.deliveries.get_mut(index) {
             index += 1;
             let Receiver::Route(route) = delivery.receiver() else {
                 continue;
             };
             let known = self.routes.find(&route).and_then(|at| self.routes.get(at));
-            let owner = known
-                .filter(|_| !route.is_sent())
-                .and_then(|known| known.owner);
-            let Some(owner) = owner else { continue };
+            let Some(known) = known.filter(|_| !route.is_sent()) else {
+                continue;
+            };
+            let Some(owner) = known.owner else {
+                if known.is_shared {
+                    delivery.publish(context.journal, &mut self.totals);
+                }
+                continue;
+            };
             let place = index - 1;
+            if is_unknown(delivery.receiver()) {
+                let since = readers.since(owner);
+                if since.is_none_or(|since| since > delivery.seen().0) {
+                    self.discard(place, context);
+                    index = 0;
+                    continue;
+                }
+                delivery.publish(context.journal, &mut self.totals);
+            }
             if let Some(other) = self.find(Receiver::Participant(owner)) {
                 let messages = |place: usize| {
                     let delivery = self.deliveries.get(place);
@@ -233,10 +259,20 @@ impl Subscribers {
         self.count_open();
     }
 
+    /// Drops a delivery that turned out to be of a participant without a reader.
+    fn discard(&mut self, place: usize, context: &mut WriterContext<'_>) {
+        let mut delivery = self.deliveries.remove(place);
+        delivery.discard(context.budget, &mut self.totals);
+        context.quota.used = context.quota.used.saturating_sub(1);
+        self.routes
+            .iter_mut()
+            .for_each(|known| known.delivery = None);
+    }
+
     /// Drops deliveries without a route.
     fn drop_orphans(&mut self, context: &mut WriterContext<'_>) {
         let led_to: Vec<_> = self
-            .deliveries()
+            .with_routes()
             .map(|(_, routes)| !routes.is_empty())
             .collect();
         for (delivery, is_led_to) in self.deliveries.iter_mut().zip(&led_to) {
@@ -251,10 +287,17 @@ impl Subscribers {
     fn remove(&mut self, context: &mut WriterContext<'_>, mut goes: impl FnMut(&Delivery) -> bool) {
         let before = self.deliveries.len();
         let (totals, reassembled) = (&mut self.totals, self.reassembled);
+        let departed = &mut self.departed;
         self.deliveries.retain_mut(|delivery| {
             let goes = goes(delivery);
-            if goes {
+            if goes && delivery.is_withheld() {
+                delivery.discard(context.budget, totals);
+            } else if goes {
                 delivery.settle(&mut delivery_context(totals, reassembled, context));
+                let share = delivery.last_share();
+                if !delivery.main().is_sent() && share.lost > departed.lost {
+                    *departed = share;
+                }
             }
             !goes
         });
@@ -267,15 +310,4 @@ impl Subscribers {
             self.count_open();
         }
     }
-}
-
-/// Returns whether the receiver has known readers, all of them best effort.
-pub(super) fn is_best_effort(receiver: Receiver, context: &WriterContext<'_>) -> bool {
-    let (Receiver::Participant(prefix), Some(topic)) = (receiver, context.topic()) else {
-        return false;
-    };
-    let endpoints = context.graph.discovery.endpoints();
-    let known = readers(topic, prefix).filter_map(|guid| endpoints.get(&guid));
-    let mut known = known.map(|endpoint| endpoint.qos.reliability == Reliability::RELIABLE);
-    known.next() == Some(false) && !known.any(|is_reliable| is_reliable)
 }

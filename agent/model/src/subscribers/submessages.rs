@@ -21,11 +21,11 @@ impl Subscribers {
         let Some(known) = self.routes.get(index) else {
             return;
         };
-        // Without a known reader, the route must have carried samples.
-        let holds = known.has_data || matched == Matched::Yes;
+        let is_known = matched == Matched::Yes && matches!(receiver, Receiver::Participant(_));
+        // Without a known receiver, the route must have carried samples.
+        let holds = known.has_data || is_known;
         let is_meant = heartbeat.record().reader().prefix != GuidPrefix::UNKNOWN;
-        let opens =
-            matched == Matched::Yes && (is_meant || !known.route.destination.is_multicast());
+        let opens = is_known && (is_meant || !known.route.destination.is_multicast());
         let place = match self.find(receiver) {
             None if opens => self.delivery(index, receiver, context),
             found => found,
@@ -96,14 +96,19 @@ impl Subscribers {
         let record = sample.record();
         let destination = Destination::of(record);
         let directed = Some(record.reader().prefix).filter(|to| *to != GuidPrefix::UNKNOWN);
+        let has_readers = self.has_readers;
         for delivery in &mut self.deliveries {
             let leads_there = |known: &KnownRoute| {
                 !known.route.is_sent()
                     && known.route.destination == destination
                     && match delivery.receiver() {
-                        Receiver::Route(route) => known.route == route,
+                        Receiver::Route(route) => {
+                            known.route == route && (route.socket != 0 || has_readers)
+                        }
                         Receiver::Participant(prefix) => {
-                            known.owner == Some(prefix) && directed.is_none_or(|to| to == prefix)
+                            known.owner == Some(prefix)
+                                && known.matched == Matched::Yes
+                                && directed.is_none_or(|to| to == prefix)
                         }
                     }
             };

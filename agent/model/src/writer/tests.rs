@@ -41,6 +41,7 @@ impl Bench {
             budget: &mut self.budget,
             journal: &mut self.journal,
             wall_clock: WallClock::default(),
+            has_receivers: false,
         };
         self.writer.record(&record, self.opened, &mut context)
     }
@@ -65,6 +66,7 @@ impl Bench {
                 budget: &mut self.budget,
                 journal: &mut self.journal,
                 wall_clock: WallClock::default(),
+                has_receivers: false,
             };
             self.writer.advance(&mut context);
         }

@@ -4,5 +4,7 @@
 mod causes;
 mod control;
 mod fates;
+mod readers;
 mod receivers;
 mod routes;
+mod settling;

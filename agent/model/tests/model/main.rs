@@ -17,6 +17,7 @@ mod fixtures;
 mod forged;
 mod header;
 mod inside;
+mod loss;
 mod memory;
 mod observer;
 mod order;

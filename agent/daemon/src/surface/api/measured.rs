@@ -17,12 +17,7 @@ pub(super) fn buckets(values: &Histogram) -> Vec<Bucket> {
 }
 
 /// Returns the answer's form of a measurement.
-#[expect(
-    clippy::cast_precision_loss,
-    reason = "a ratio of counts far below 2^52"
-)]
 pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
-    let sent = facts.messages + facts.lost;
     let last_message = facts.last_message;
     Measurement {
         messages: facts.messages,
@@ -32,7 +27,9 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
         duplicate_messages: facts.duplicates,
         incomplete_messages: facts.incomplete,
         irrelevant_messages: facts.irrelevant,
-        loss_ratio: (sent > 0).then(|| facts.lost as f64 / sent as f64),
+        subscriber_expected_messages: facts.loss.expected,
+        subscriber_lost_messages: facts.loss.lost,
+        loss_ratio: facts.loss.ratio(),
         rate_hertz: facts.rate_hz,
         bandwidth_bytes_per_second: facts.bandwidth,
         last_message_timestamp_seconds: last_message.map(|time| time.seconds()),
@@ -57,11 +54,11 @@ pub(super) fn delivered(facts: &snapshot::Delivered) -> Delivered {
         messages: facts.messages,
         bytes: facts.bytes,
         recovered_messages: facts.recovered,
-        lost_messages: facts.lost(),
+        lost_messages: facts.lost_by_any(),
         lost_before_host_messages: facts.lost_before_host,
         lost_in_reassembly_messages: facts.lost_in_reassembly,
         lost_in_socket_buffer_messages: facts.lost_in_socket_buffer,
-        pending_messages: facts.pending,
+        pending_messages: facts.open(),
         unmatched_messages: facts.unmatched,
         duplicate_messages: facts.duplicates,
         irrelevant_messages: facts.irrelevant,

@@ -32,7 +32,8 @@ pub(in crate::surface) const TOPIC_SENT_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERED: Metric = Metric::counter(
     "ros2_topic_delivered_messages_total",
     TOPIC,
-    "Messages that reached a receiver on this host whole, once per receiver.",
+    "Messages that reached a subscriber on this host whole, once per subscriber: a process with a \
+     reader that matches the writer.",
 );
 pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
     "ros2_topic_delivered_bytes_total",
@@ -43,13 +44,14 @@ pub(in crate::surface) const TOPIC_DELIVERED_BYTES: Metric = Metric::counter(
 pub(in crate::surface) const TOPIC_DELIVERY_LOST: Metric = Metric::counter(
     "ros2_topic_delivery_lost_messages_total",
     &["domain_id", "topic", "cause"],
-    "Messages that a receiver on this host never received, by place of loss: before_host, \
+    "Messages that a subscriber on this host never received, by place of loss: before_host, \
      reassembly or socket_buffer.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_PENDING: Metric = Metric::gauge(
     "ros2_topic_delivery_pending_messages",
     TOPIC,
-    "Lost messages whose place of loss the kernel reports only after up to 35 s.",
+    "Missing messages that may still arrive, or whose place of loss the kernel reports only after \
+     up to 35 s.",
 );
 pub(in crate::surface) const TOPIC_DELIVERY_RECOVERED: Metric = Metric::counter(
     "ros2_topic_delivery_recovered_messages_total",
@@ -64,7 +66,7 @@ pub(in crate::surface) const TOPIC_DELIVERY_IRRELEVANT: Metric = Metric::counter
 pub(in crate::surface) const TOPIC_DELIVERY_UNMATCHED: Metric = Metric::counter(
     "ros2_topic_delivery_unmatched_messages_total",
     TOPIC,
-    "Messages that arrived at a socket without a reader of the topic.",
+    "Messages that arrived at a process without a known reader that matches the writer.",
 );
 pub(in crate::surface) const TOPIC_LAG: Metric = Metric::gauge(
     "ros2_topic_acknowledgement_lag_messages",
@@ -159,7 +161,7 @@ pub(in crate::surface) const SUBSCRIBER_LOST: Metric = Metric::counter(
 pub(in crate::surface) const SUBSCRIBER_PENDING: Metric = Metric::gauge(
     "ros2_subscriber_pending_messages",
     SUBSCRIBER,
-    "Lost messages whose place of loss is not known yet.",
+    "Missing messages that may still arrive, or whose place of loss is not known yet.",
 )
 .experimental();
 pub(in crate::surface) const SUBSCRIBER_RECOVERED: Metric = Metric::counter(
@@ -184,7 +186,7 @@ pub(in crate::surface) const SUBSCRIBER_IRRELEVANT: Metric = Metric::counter(
 pub(in crate::surface) const SUBSCRIBER_UNMATCHED: Metric = Metric::counter(
     "ros2_subscriber_unmatched_messages_total",
     SUBSCRIBER,
-    "Messages that arrived without a reader of the topic; not counted as received.",
+    "Messages that arrived without a known reader that matches the writer; not counted as received.",
 )
 .experimental();
 pub(in crate::surface) const READER_LAG: Metric = Metric::gauge(

@@ -57,16 +57,14 @@ const FIGURES: [Figure; 13] = [
     }),
     (
         "lost_messages",
-        "Messages that were sent but never received whole.",
+        "Messages that were sent and reached no receiver of this host whole.",
         |second| Some(number(second.measured.lost)),
     ),
     (
         "loss_ratio",
-        "Lost messages divided by sent messages, since the start.",
-        |second| {
-            let sent = second.measured.messages + second.measured.lost;
-            (sent > 0).then(|| number(second.measured.lost) / number(sent))
-        },
+        "Messages that the worst subscriber lost divided by those that it expected, since the \
+         start.",
+        |second| second.measured.loss.ratio(),
     ),
     (
         "recovered_messages",

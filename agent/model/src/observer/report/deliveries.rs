@@ -7,7 +7,8 @@ use ros2probe_wire::{EntityId, Guid, Timestamp};
 use crate::delivery::{Delivery, Receiver, Totals};
 use crate::names::NodeName;
 use crate::observer::Observer;
-use crate::receivers::readers;
+use crate::observer::graph;
+use crate::receivers::MatchedReaders;
 use crate::route::Direction;
 use crate::routes::KnownRoute;
 use crate::snapshot::{AcknowledgementFacts, DeliveryFacts, Subscriber};
@@ -24,6 +25,7 @@ pub(super) fn totals(observer: &Observer, topic: &Topic) -> Totals {
         let measured = observer.profiler.get(*writer);
         if let Some(subscribers) = measured.and_then(|measured| measured.subscribers.as_ref()) {
             sum.add(subscribers.totals());
+            sum.received.awaited += subscribers.awaited();
         }
     }
     sum
@@ -65,12 +67,13 @@ fn delivery_facts(
     (delivery, routes): (&Delivery, &[&KnownRoute]),
 ) -> DeliveryFacts {
     let main = delivery.main();
+    let matched = MatchedReaders::new(graph!(observer), Some(topic), writer);
     let owner = match delivery.receiver() {
         Receiver::Participant(prefix) => Some(prefix),
         Receiver::Route(_) => routes.first().and_then(|known| known.owner),
     };
     let mut readers: Vec<_> = owner
-        .map(|prefix| readers(topic, prefix).collect())
+        .map(|prefix| matched.of(prefix).collect())
         .unwrap_or_default();
     readers.sort_unstable();
     let nodes: BTreeSet<_> = readers
@@ -109,7 +112,7 @@ fn delivery_facts(
         cgroup: socket.and_then(|socket| socket.cgroup.clone()),
         first_seen,
         last_seen,
-        delivered: *delivery.tally(),
+        delivered: delivery.facts(),
     }
 }
 

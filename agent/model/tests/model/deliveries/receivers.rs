@@ -171,11 +171,17 @@ fn a_silent_unknown_receiver_is_removed() {
     };
     host.data(bob, 1);
     host.data(nobody, 2);
-    assert_eq!(host.deliveries().len(), 2);
+    let followed = |host: &Host| {
+        let tables = host.snapshot().tables;
+        let row = tables.iter().find(|row| row.table == "deliveries");
+        row.unwrap().size
+    };
+    assert_eq!((followed(&host), host.deliveries().len()), (2, 1));
     for _ in 0..62 {
         host.wait(1000);
     }
-    assert_eq!(host.deliveries().len(), 1);
+    assert_eq!((followed(&host), host.deliveries().len()), (1, 1));
+    assert_eq!(host.topic().received.unwrap().unmatched, 1);
     assert_eq!(host.deliveries()[0].participant.unwrap().prefix, BOB);
 }
 

@@ -194,6 +194,7 @@ fn copies_of_a_multicast_on_its_way_out_are_no_duplicates() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411);
     let group = bob.multicast(101);
+    host.owner(group, BOB);
     for number in 1..=10 {
         host.data(group.leaving(), number);
         host.data(group.leaving(), number);
@@ -223,12 +224,12 @@ fn a_full_table_refuses_counts_and_evicts_the_silent() {
         ..Settings::default()
     });
     let bob = host.reader(BOB, 7411);
-    let at = |socket: u64| CapturePoint {
-        socket,
-        ..bob.multicast(socket)
+    let at = |port: u16| CapturePoint {
+        address: SocketAddrV4::new([10, 0, 0, 9].into(), port),
+        ..bob.wire()
     };
     for number in 1..=10 {
-        (1..=5).for_each(|socket| host.data(at(socket), number));
+        (1..=5).for_each(|port| host.data(at(port), number));
     }
     assert_eq!(host.deliveries().len(), 3);
     let row = |host: &Host| {
@@ -241,15 +242,15 @@ fn a_full_table_refuses_counts_and_evicts_the_silent() {
     };
     assert_eq!(row(&host), (3, 3, 20));
     for number in 11..=60 {
-        (3..=5).for_each(|socket| host.data(at(socket), number));
+        (3..=5).for_each(|port| host.data(at(port), number));
         host.wait(400);
     }
-    let sockets: Vec<_> = host
+    let ports: Vec<_> = host
         .deliveries()
         .iter()
-        .map(|each| each.sockets.clone())
+        .map(|each| each.destination.port())
         .collect();
-    assert_eq!(sockets, [[3], [4], [5]]);
+    assert_eq!(ports, [3, 4, 5]);
     assert!(
         host.deliveries()
             .iter()

@@ -79,7 +79,9 @@ impl Figures<'_> {
         let known = self.past.id(topic.domain_id, &topic.dds_name);
         let flags = self.flags(topic, known);
         let Some(measured) = topic.measurement.as_deref() else {
-            return Row(id, None, None, None, None, None, None, None, flags, None);
+            return Row(
+                id, None, None, None, None, None, None, None, flags, None, None,
+            );
         };
         let second = known.and_then(|known| last?.row(known));
         let latency = second.and_then(|second| second.latency());
@@ -90,12 +92,13 @@ impl Figures<'_> {
             Some(thousandths(measured.rate_hz)),
             Some(measured.bandwidth.round()),
             Some(measured.messages),
-            Some(measured.lost),
+            Some(measured.loss.lost),
             Some(second.map_or(0, |second| second.lost)),
             part(0),
             part(1),
             flags,
             at.map(|at| thousandths(at.seconds())),
+            Some(measured.loss.expected),
         )
     }
 

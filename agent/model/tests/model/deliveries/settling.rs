@@ -1,0 +1,133 @@
+//! Every sample is at each time delivered, lost or pending, also when the writer falls silent.
+
+use ros2probe_model::loss::LossCause;
+use ros2probe_testing::model::forge::{Message, SEDP_WRITERS};
+use ros2probe_testing::model::host::{ALICE, BOB, CapturePoint, Host, WRITER};
+use ros2probe_wire::Guid;
+
+/// Adds Bob with a best-effort reader, and makes the writer best effort.
+fn best_effort(host: &mut Host) -> CapturePoint {
+    let bob = host.reader(BOB, 7411);
+    host.writer(false);
+    host.subscribe_with(BOB, 2, false);
+    bob
+}
+
+/// Returns samples that are delivered, lost with a cause, and pending.
+fn states(host: &Host) -> (u64, u64, u64) {
+    let facts = host.deliveries()[0].delivered;
+    let sum = host.topic().received.unwrap();
+    assert_eq!((sum.lost(), sum.open()), (facts.lost(), facts.open()));
+    (facts.messages, facts.lost_by_any(), facts.open())
+}
+
+#[test]
+fn half_received_messages_of_a_writer_that_stops_are_pending_and_lost_soon_after() {
+    let mut host = Host::new();
+    let bob = best_effort(&mut host);
+    host.data(bob, 1);
+    host.wait(300);
+    for number in 2..=50 {
+        // Every fifth loses its second half, as IP fragments do.
+        let count = if number % 5 == 0 { 5 } else { 10 };
+        host.put(host.fragments(bob, number, 1, count));
+        host.wait(100);
+        let (delivered, lost, pending) = states(&host);
+        assert_eq!(delivered + lost + pending, number);
+    }
+    let (delivered, lost, pending) = states(&host);
+    assert_eq!(delivered + lost + pending, 50);
+    assert!(pending > 0);
+    host.wait(3000);
+    assert_eq!(states(&host), (40, 10, 0));
+}
+
+#[test]
+fn the_last_messages_of_a_best_effort_writer_are_pending_until_they_are_lost() {
+    let mut host = Host::new();
+    let bob = best_effort(&mut host);
+    for number in 1..=20 {
+        host.data(bob.leaving(), number);
+        host.wait(1);
+        if number <= 17 {
+            host.data(bob, number);
+        }
+        host.wait(100);
+    }
+    host.wait(2000);
+    assert_eq!(states(&host), (17, 0, 3));
+    // Bob still announces himself.
+    host.participant(BOB, bob.address);
+    host.wait(1000);
+    host.participant(BOB, bob.address);
+    (0..4).for_each(|_| host.wait(1000));
+    assert_eq!(states(&host), (17, 3, 0));
+    assert_eq!(host.losses(LossCause::BeforeHost), [18, 19, 20]);
+}
+
+#[test]
+fn what_left_for_a_socket_that_was_closed_is_not_pending_for_ever() {
+    let mut host = Host::new();
+    let bob = best_effort(&mut host);
+    for number in 1..=100 {
+        host.data(bob.leaving(), number);
+        host.wait(1);
+        if number <= 17 {
+            host.data(bob, number);
+        }
+        host.wait(100);
+    }
+    host.unsubscribe(BOB, 3);
+    (0..3).for_each(|_| host.wait(1000));
+    let facts = host.deliveries()[0].delivered;
+    assert_eq!((facts.messages, facts.lost(), facts.awaited), (17, 0, 0));
+}
+
+#[test]
+fn the_losses_of_a_reliable_writer_that_leaves_are_settled_when_it_leaves() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in (1..=20).filter(|number| ![7, 19].contains(number)) {
+        host.data(bob, number);
+        host.wait(10);
+    }
+    host.heartbeat(bob, 1, 21);
+    host.wait(100);
+    assert_eq!(states(&host), (18, 0, 3));
+    let writer = Guid::new(ALICE, WRITER);
+    host.announce(Message::from(ALICE).dispose_by_hash(SEDP_WRITERS, 2, writer));
+    host.wait(100);
+    assert_eq!(host.losses(LossCause::BeforeHost), [7, 19, 21]);
+    let sum = host.topic().received.unwrap();
+    assert_eq!((sum.messages, sum.lost_by_any(), sum.open()), (18, 3, 0));
+    host.wait(1000);
+    assert_eq!(host.measurement().loss.lost, 3);
+}
+
+#[test]
+fn what_a_writer_withdrew_is_lost_within_two_seconds() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in (1..=20).filter(|number| *number != 7) {
+        host.data(bob, number);
+        host.wait(10);
+    }
+    assert_eq!(states(&host), (19, 0, 1));
+    // The writer keeps the last ten only.
+    host.heartbeat(bob, 11, 20);
+    host.wait(2000);
+    assert_eq!(states(&host), (19, 1, 0));
+}
+
+#[test]
+fn a_gap_of_a_reliable_writer_is_pending_until_its_repair() {
+    let mut host = Host::new();
+    let bob = host.reader(BOB, 7411);
+    for number in (1..=20).filter(|number| *number != 7) {
+        host.data(bob, number);
+    }
+    host.wait(8000);
+    assert_eq!(states(&host), (19, 0, 1));
+    host.data(bob, 7);
+    assert_eq!(states(&host), (20, 0, 0));
+}
