@@ -39,6 +39,7 @@ mod samples;
 mod shm;
 mod shm_exact;
 mod sources;
+mod start_orders;
 mod unnoticed;
 
 use std::process::Command;

@@ -24,5 +24,6 @@ mod order;
 mod restart;
 mod room;
 mod services;
+mod start_orders;
 mod tables;
 mod zenoh;

@@ -1,4 +1,5 @@
-//! Real DDS participants: one command line for three stacks (see `agent/cli/tests/peers/peer.hpp`).
+//! Real DDS participants and sessions of Zenoh: one command line for four stacks (see
+//! `agent/cli/tests/peers/peer.hpp`).
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -19,6 +20,8 @@ pub enum Stack {
     Fast,
     Cyclone,
     Rust,
+    /// Sessions with the keys, tokens and attachments of rmw_zenoh. They need a [`router`].
+    Zenoh,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +63,7 @@ pub struct Peer {
 }
 
 impl Stack {
+    /// The stacks of DDS.
     pub const ALL: [Stack; 3] = [Stack::Fast, Stack::Cyclone, Stack::Rust];
 
     fn program(self) -> Result<PathBuf> {
@@ -67,7 +71,20 @@ impl Stack {
             Stack::Fast => built("fastdds"),
             Stack::Cyclone => built("cyclonedds"),
             Stack::Rust => is_there(robot()?, "cargo build --example robot"),
+            Stack::Zenoh => {
+                let python = target_directory()?.join("tools/zenoh/bin/python");
+                is_there(python, ".ci/prerequisites.sh test")
+            }
         }
+    }
+
+    /// Returns the script that its program runs, if it is an interpreter.
+    fn script(self) -> Option<&'static str> {
+        const SCRIPT: &str = concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/../cli/tests/peers/zenoh/peer.py"
+        );
+        (self == Stack::Zenoh).then_some(SCRIPT)
     }
 
     /// Returns the library of this name that its program loads, as the dynamic linker finds it.
@@ -114,6 +131,25 @@ impl Stream {
             ..Stream::small(count)
         }
     }
+}
+
+/// Starts a router of Zenoh, which connects to the routers of these hosts.
+pub fn router(host: &Namespace, others: &[&Namespace]) -> Result<Process> {
+    let mut words = vec!["--role".to_owned(), "router".to_owned()];
+    for other in others {
+        words.extend([
+            "--connect".to_owned(),
+            format!("tcp/{}:7447", other.address()),
+        ]);
+    }
+    let words = Stack::Zenoh
+        .script()
+        .map(str::to_owned)
+        .into_iter()
+        .chain(words);
+    let mut router = Process::start(&host.inside(), Stack::Zenoh.program()?, words)?;
+    router.wait_for("ready", PATIENCE)?;
+    Ok(router)
 }
 
 /// Starts a publisher that holds its samples, and a subscriber matched with it.
@@ -172,9 +208,12 @@ impl Peer {
             Role::Publisher => "pub",
             Role::Subscriber => "sub",
         };
-        let mut words: Vec<String> = ["--role", role_name, "--topic", &stream.topic, "--hold"]
+        let options = ["--role", role_name, "--topic", &stream.topic, "--hold"];
+        let options = options.into_iter();
+        let mut words: Vec<String> = stack
+            .script()
             .into_iter()
-            .filter(|word| *word != "--hold" || role == Role::Publisher)
+            .chain(options.filter(|word| *word != "--hold" || role == Role::Publisher))
             .map(str::to_owned)
             .collect();
         let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);

@@ -103,9 +103,10 @@ impl Size {
         }
     }
 
-    /// Datagrams that make a sample.
+    /// Datagrams that make a sample. Zenoh sends over TCP.
     const fn datagrams(self, stack: Stack) -> u64 {
         match (self, stack) {
+            (_, Stack::Zenoh) => 0,
             (Size::B320, _) => 1,
             (Size::KB644, Stack::Fast) => 10,
             (Size::KB644, Stack::Cyclone) => 48,

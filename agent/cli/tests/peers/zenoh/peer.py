@@ -1,0 +1,238 @@
+"""A ROS 2 publisher, subscriber or router over Zenoh, announced as rmw_zenoh does.
+
+    peer.py --role router [--connect ENDPOINT]...
+    peer.py --role pub|sub [--topic /t] [--size BYTES] [--rate HZ] [--count N] [--depth N] ...
+
+The command line and the log of `pub` and `sub` equal those of the peers of DDS (../peer.hpp). Options
+that only DDS has are accepted and ignored. A node is a session of its own, which connects to the
+router of its host, and directly to the other sessions there. `--linger` keeps a publisher after its
+last message.
+"""
+
+import argparse
+import json
+import os
+import select
+import signal
+import struct
+import sys
+import threading
+import time
+import traceback
+
+import xxhash
+import zenoh
+
+TYPE = "std_msgs::msg::dds_::UInt8MultiArray_/TypeHashNotSupported"
+# Encapsulation, layout without dimensions, and the length of the data.
+OVERHEAD = 16
+ROUTER = "tcp/localhost:7447"
+
+stopped = threading.Event()
+
+
+def options():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--role", choices=["pub", "sub", "router"], required=True)
+    parser.add_argument("--connect", action="append", default=[])
+    parser.add_argument("--topic", default="/points")
+    parser.add_argument("--size", type=int, default=320)
+    parser.add_argument("--rate", type=float, default=20.0)
+    parser.add_argument("--count", type=int, default=0)
+    parser.add_argument("--depth", type=int, default=10)
+    parser.add_argument("--domain", type=int, default=0)
+    parser.add_argument("--peers", type=int, default=1)
+    parser.add_argument("--stretch", type=int, default=0)
+    parser.add_argument("--linger", type=float, default=1.0)
+    parser.add_argument("--node", action="append", default=[])
+    parser.add_argument("--log")
+    parser.add_argument("--hold", action="store_true")
+    parser.add_argument("--reliable", action="store_true")
+    parser.add_argument("--best-effort", action="store_true")
+    parser.add_argument("--receive-buffer", type=int)
+    return parser.parse_args()
+
+
+def config(mode, listen, connect):
+    """The settings in which the default files of rmw_zenoh differ from Zenoh's own."""
+    settings = {
+        "mode": mode,
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {
+            "period_init_ms": 1000,
+            "period_max_ms": 4000,
+            "period_increase_factor": 2,
+        },
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "timestamping/enabled": True,
+        "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": 60000,
+        "transport/link/tx/keep_alive": 2,
+    }
+    if mode == "peer":
+        target = {"router": ["router", "peer"], "peer": ["router"]}
+        settings["scouting/gossip/target"] = target
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def say(line):
+    print(line, flush=True)
+
+
+class Log:
+    def __init__(self, path):
+        self.file = open(path, "w", buffering=1) if path else None
+        self.write(ev="start", stack="zenoh", pid=os.getpid())
+
+    def write(self, **event):
+        if self.file:
+            self.file.write(json.dumps({"t": time.time_ns(), **event}) + "\n")
+
+
+def wait_for_line():
+    while not stopped.is_set():
+        if select.select([sys.stdin], [], [], 0.05)[0]:
+            # A line at a time, unbuffered, so that `select` sees the next one.
+            while (byte := os.read(0, 1)) != b"\n":
+                if not byte:
+                    sys.exit("standard input ended before the start")
+            return
+
+
+def sleep_until(due):
+    while not stopped.is_set() and (left := due - time.monotonic()) > 0:
+        time.sleep(min(left, 0.05))
+
+
+class Session:
+    """The session of one process, with its nodes."""
+
+    def __init__(self, options):
+        self.options = options
+        self.session = zenoh.open(config("peer", ["tcp/localhost:0"], [ROUTER]))
+        self.zid = str(self.session.zid())
+        self.tokens = []
+        self.others = set()
+
+    def token(self, *chunks):
+        key = "/".join(["@ros2_lv", str(self.options.domain), self.zid, *chunks])
+        self.tokens.append(self.session.liveliness().declare_token(key))
+        return key
+
+    def announce(self, kind):
+        """Announces the nodes. The first one has the endpoint, whose GID is returned."""
+        names = self.options.node or ["/publisher" if kind == "MP" else "/subscriber"]
+        for number, name in enumerate(names):
+            namespace, _, base = name.rpartition("/")
+            where = ["%", namespace.replace("/", "%") or "%", base]
+            self.token(str(number), str(number), "NN", *where)
+            if number == 0:
+                qos = f"::,{self.options.depth}:,:,:,,"
+                topic = self.options.topic.replace("/", "%")
+                key = self.token("0", "10", kind, *where, topic, *TYPE.split("/"), qos)
+        hash = xxhash.xxh3_128_intdigest(key.encode())
+        gid = struct.pack("<QQ", hash & (1 << 64) - 1, hash >> 64)
+        other = "MS" if kind == "MP" else "MP"
+        pattern = f"@ros2_lv/{self.options.domain}/*/*/*/{other}/**"
+        topic = f"/{self.options.topic.replace('/', '%')}/"
+
+        def seen(sample):
+            key = str(sample.key_expr)
+            if topic in key:
+                is_put = sample.kind == zenoh.SampleKind.PUT
+                (self.others.add if is_put else self.others.discard)(key)
+
+        self.tokens.append(self.session.liveliness().declare_subscriber(pattern, seen, history=True))
+        return gid
+
+    def key(self):
+        return f"{self.options.domain}{self.options.topic}/{TYPE}"
+
+    def wait_matched(self):
+        while not stopped.is_set() and len(self.others) < self.options.peers:
+            time.sleep(0.01)
+        say("matched")
+
+
+def publish(options, log):
+    session = Session(options)
+    publisher = session.session.declare_publisher(
+        session.key(),
+        congestion_control=zenoh.CongestionControl.DROP,
+        reliability=zenoh.Reliability.RELIABLE,
+    )
+    gid = session.announce("MP")
+    say("ready")
+    session.wait_matched()
+    if options.hold:
+        wait_for_line()
+    start, first, number = time.monotonic(), 0, 0
+    data = bytearray(options.size - OVERHEAD)
+    header = struct.pack("<BBBBIII", 0, 1, 0, 0, 0, 0, len(data))
+    while not stopped.is_set() and (options.count == 0 or number < options.count):
+        if options.stretch and number == first + options.stretch:
+            wait_for_line()
+            start, first = time.monotonic(), number
+        sleep_until(start + (number - first) / options.rate)
+        if stopped.is_set():
+            break
+        now = time.time_ns()
+        data[:16] = struct.pack("<Qq", number, now)
+        attachment = struct.pack("<qqB", number + 1, now, 16) + gid
+        publisher.put(header + bytes(data), attachment=attachment)
+        log.write(ev="pub", seq=number, len=options.size)
+        number += 1
+    log.write(ev="stop")
+    say("done")
+    sleep_until(time.monotonic() + options.linger)
+
+
+def subscribe(options, log):
+    session = Session(options)
+
+    def receive(sample):
+        payload = bytes(sample.payload)
+        number, stamp = struct.unpack_from("<Qq", payload, OVERHEAD)
+        log.write(ev="sub", seq=number, len=len(payload), stamp_ns=stamp)
+
+    kept = session.session.declare_subscriber(session.key(), receive)
+    session.announce("MS")
+    say("ready")
+    session.wait_matched()
+    stopped.wait()
+    kept.undeclare()
+
+
+def route(options):
+    router = zenoh.open(config("router", ["tcp/[::]:7447"], options.connect))
+    say("ready")
+    stopped.wait()
+    router.close()
+
+
+def main():
+    for number in [signal.SIGINT, signal.SIGTERM]:
+        signal.signal(number, lambda *_: stopped.set())
+    selected = options()
+    status = 1
+    try:
+        if selected.role == "router":
+            route(selected)
+        else:
+            act = publish if selected.role == "pub" else subscribe
+            act(selected, Log(selected.log))
+        status = 0
+    except Exception:
+        traceback.print_exc()
+    # Threads of Zenoh do not delay the end.
+    os._exit(status)
+
+
+main()

@@ -1,0 +1,216 @@
+//! Discovery of a running stream in every order: whatever the agent learns first, the figures of the
+//! same messages are equal once it knows all of it, and none is wrong on the way.
+
+use std::net::SocketAddrV4;
+use std::sync::Arc;
+
+use ros2probe_model::input::Input;
+use ros2probe_model::observer::{Observer, Settings};
+use ros2probe_model::snapshot::{Delivered, TopicFacts};
+use ros2probe_testing::model::domain::watchlist;
+use ros2probe_testing::model::forge::{self, Message};
+use ros2probe_testing::model::host::{
+    ALICE, BOB, CAROL, CapturePoint, Host, READER, START, WRITER,
+};
+use ros2probe_wire::record::flag;
+use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+
+/// The writer of `ros_discovery_info`.
+const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
+/// Milliseconds between messages: 50 Hz.
+const PERIOD: u64 = 20;
+const RATE: f64 = 50.0;
+/// Messages between two steps of discovery, and afterwards.
+const BETWEEN: u64 = 15;
+const AFTERWARDS: u64 = 1000;
+
+/// What the agent learns of the robot. Alice publishes, Bob subscribes, and Carol shares the host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    Alice,
+    Writer,
+    AliceNode,
+    Bob,
+    Reader,
+    BobSocket,
+    Carol,
+}
+
+const STEPS: [Step; 7] = [
+    Step::Alice,
+    Step::Writer,
+    Step::AliceNode,
+    Step::Bob,
+    Step::Reader,
+    Step::BobSocket,
+    Step::Carol,
+];
+
+struct Scene {
+    host: Host,
+    sent: u64,
+}
+
+/// Figures of the last messages.
+#[derive(Debug, PartialEq, Eq)]
+struct Figures {
+    messages: u64,
+    lost: u64,
+    /// Participant, readers, delivered and lost messages of each receiver.
+    deliveries: Vec<(Option<Guid>, Vec<Guid>, u64, u64)>,
+    unknown_writers: usize,
+    publishers: usize,
+    subscriptions: usize,
+}
+
+impl Scene {
+    fn new() -> Self {
+        let mut observer = Observer::new(Settings::default());
+        observer.input(Input::Watchlist(Arc::new(watchlist(&["/**"]))));
+        observer.input(Input::Time(Timestamp(START)));
+        let host = Host {
+            observer,
+            now: START,
+        };
+        Self { host, sent: 0 }
+    }
+
+    fn receiver(prefix: GuidPrefix) -> CapturePoint {
+        let port = if prefix == BOB { 7411 } else { 7413 };
+        CapturePoint {
+            socket: port,
+            address: SocketAddrV4::new([10, 0, 0, 2].into(), 7411),
+            directed: None,
+            flags: flag::HOST,
+        }
+    }
+
+    fn learn(&mut self, step: Step) {
+        let host = &mut self.host;
+        match step {
+            Step::Alice => host.participant(ALICE, "10.0.0.1:7411".parse().unwrap()),
+            Step::Writer => host.writer(true),
+            Step::AliceNode => {
+                let writer = Guid::new(ALICE, WRITER);
+                let payload = forge::entities(ALICE, 24, &[("/", "sensor", writer)]);
+                host.announce(Message::from(ALICE).data(NODES, 1, &payload));
+            }
+            Step::Bob => host.participant(BOB, Self::receiver(BOB).address),
+            Step::Reader => host.subscribe(BOB, 1),
+            Step::BobSocket => host.owner(Self::receiver(BOB), BOB),
+            Step::Carol => {
+                host.bystander(CAROL, 7413);
+                host.owner(Self::receiver(CAROL), CAROL);
+            }
+        }
+    }
+
+    /// Sends messages by multicast, which reach both sockets of the port. The topic's rate never
+    /// exceeds the true one.
+    fn send(&mut self, count: u64) {
+        for _ in 0..count {
+            self.host.wait(PERIOD);
+            self.sent += 1;
+            for (prefix, socket) in [(BOB, 7401), (CAROL, 7403)] {
+                let seen = Self::receiver(prefix).multicast(socket);
+                self.host.data(seen, self.sent);
+            }
+            if self.sent.is_multiple_of(5) {
+                self.is_plausible();
+            }
+        }
+    }
+
+    fn is_plausible(&self) {
+        let Some(topic) = self.topic() else { return };
+        if let Some(measurement) = topic.measurement {
+            let rate = measurement.rate_hz;
+            assert!(rate <= RATE * 1.1, "{rate} Hz after {}", self.sent);
+            assert_eq!(measurement.lost, 0);
+        }
+        for delivery in topic.deliveries {
+            assert!(!delivery.readers.is_empty(), "{delivery:?}");
+            assert_eq!(lost(&delivery.delivered), 0, "{delivery:?}");
+        }
+    }
+
+    fn topic(&self) -> Option<TopicFacts> {
+        let mut topics = self.host.snapshot().topics.into_iter();
+        topics.find(|topic| topic.name == "/chatter")
+    }
+
+    fn figures(&self) -> Figures {
+        let topic = self.topic().unwrap();
+        let measurement = topic.measurement.unwrap();
+        let deliveries = topic.deliveries.into_iter().map(|delivery| {
+            let delivered = delivery.delivered;
+            (
+                delivery.participant,
+                delivery.readers,
+                delivered.messages,
+                lost(&delivered),
+            )
+        });
+        Figures {
+            messages: measurement.messages,
+            lost: measurement.lost,
+            deliveries: deliveries.collect(),
+            unknown_writers: self.host.snapshot().unknown_writers.len(),
+            publishers: topic.publishers.len(),
+            subscriptions: topic.subscriptions.len(),
+        }
+    }
+}
+
+#[test]
+fn discovery_in_every_order_gives_the_same_figures() {
+    for order in permutations(&STEPS) {
+        let mut scene = Scene::new();
+        // Sockets of multicast have their owners, as those of unicast.
+        for step in &order {
+            scene.send(BETWEEN);
+            scene.learn(*step);
+        }
+        // The last messages that were sent before all was known settle.
+        scene.send(100);
+        let before = scene.figures();
+        scene.send(AFTERWARDS);
+        let after = scene.figures();
+        assert_eq!(after.messages - before.messages, AFTERWARDS, "{order:?}");
+        assert_eq!(after.lost, 0, "{order:?}");
+        assert_eq!(after.unknown_writers, 0, "{order:?}");
+        assert_eq!((after.publishers, after.subscriptions), (1, 1), "{order:?}");
+        let bob = Guid::new(BOB, READER);
+        assert_eq!(after.deliveries.len(), 1, "{order:?}: {after:#?}");
+        let (participant, readers, delivered, lost) = &after.deliveries[0];
+        assert_eq!(participant.map(|guid| guid.prefix), Some(BOB), "{order:?}");
+        assert_eq!(readers, &[bob], "{order:?}");
+        assert_eq!(*lost, 0, "{order:?}");
+        let delivered_before = before.deliveries.first().map_or(0, |each| each.2);
+        assert_eq!(delivered - delivered_before, AFTERWARDS, "{order:?}");
+        let rate = scene.topic().unwrap().measurement.unwrap().rate_hz;
+        assert!((rate - RATE).abs() < 1.0, "{order:?}: {rate} Hz");
+    }
+}
+
+fn lost(delivered: &Delivered) -> u64 {
+    delivered.lost_before_host
+        + delivered.lost_in_reassembly
+        + delivered.lost_in_socket_buffer
+        + delivered.pending
+}
+
+fn permutations(steps: &[Step]) -> Vec<Vec<Step>> {
+    let Some((first, rest)) = steps.split_first() else {
+        return vec![Vec::new()];
+    };
+    let mut all = Vec::new();
+    for order in permutations(rest) {
+        for place in 0..=order.len() {
+            let mut order = order.clone();
+            order.insert(place, *first);
+            all.push(order);
+        }
+    }
+    all
+}
