@@ -305,6 +305,8 @@ impl LiveSource {
             settle = filter_reader::SETTLE_NANOSECONDS;
         }
         self.leave_exact_mode(&clocks, observer);
+        // What was polled must not overtake what uprobes saw before.
+        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.poll(&clocks, observer);
             settle = filter_reader::SETTLE_NANOSECONDS;
@@ -313,9 +315,6 @@ impl LiveSource {
             let at_sockets = self.host.as_ref().map(|host| host.reader().streams());
             wire.poll(&clocks, at_sockets, observer)?;
             settle = settle.max(wire_tap::SETTLE_NANOSECONDS);
-        }
-        if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.poll(&clocks, observer);
         }
         for round in self.inside.iter().flat_map(Inside::take) {
             observer.input(Input::Inside(round.report));
@@ -361,14 +360,20 @@ impl LiveSource {
         if let Some(host) = &mut self.host {
             host.drain(&clocks, observer);
         }
+        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.drain(&clocks, observer);
         }
         for wire in &mut self.wires {
             wire.drain(&clocks, observer);
         }
+    }
+
+    /// Passes what was polled in shared memory to the model, or to the uprobes' buffer.
+    fn take_polled(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.poll(&clocks, observer);
+            let order = self.exact.as_mut().and_then(Uprobe::order_mut);
+            shared_memory.poll(clocks, order, observer);
         }
     }
 
