@@ -19,6 +19,8 @@ pub struct AgentFacts {
     pub source_reason: Option<String>,
     /// Abilities of the source, each at most once.
     pub abilities: Vec<Ability>,
+    /// Missing abilities that the source gains while a client needs them.
+    pub on_demand: Vec<Ability>,
     /// Reasons for missing abilities, as text. Not every missing ability has one.
     pub blind: Vec<(Ability, String)>,
     /// Observed object that no longer exists, as text; traffic there is invisible.
@@ -175,6 +177,7 @@ impl AgentFacts {
             source,
             source_reason: None,
             abilities: source.abilities().to_vec(),
+            on_demand: Vec::new(),
             blind: Vec::new(),
             gone: None,
             attached_anew: 0,

@@ -44,6 +44,8 @@ pub struct Facts {
     pub libraries: Vec<LibraryFacts>,
     /// Why some process may send without being seen; `None` = all are covered.
     pub uncovered: Option<String>,
+    /// Whether probes are attached on demand and not needed.
+    pub is_resting: bool,
 }
 
 struct Shared {
@@ -66,6 +68,7 @@ impl Facts {
         Self {
             libraries: Vec::new(),
             uncovered: Some(RESTING.to_owned()),
+            is_resting: true,
         }
     }
 }
@@ -76,6 +79,7 @@ impl Default for Facts {
         Self {
             libraries: Vec::new(),
             uncovered: Some("processes have not been inspected yet".to_owned()),
+            is_resting: false,
         }
     }
 }
@@ -257,6 +261,7 @@ fn facts(attachments: &Attachments<Probe>, processes: &Processes) -> Facts {
     Facts {
         libraries: attachments.facts(),
         uncovered: uncovered(attachments, processes),
+        is_resting: false,
     }
 }
 

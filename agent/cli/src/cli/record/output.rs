@@ -7,13 +7,13 @@ use std::sync::{Arc, Mutex};
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::anyhow;
-use ros2probe::client::Outcome;
+use ros2probe::client::{Agent, Outcome};
 use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::recording::{
     Activity, Finished, GraphSnapshot, Recorder, shortfalls, unobserved_lines,
 };
 
-use super::super::notes::{SILENT, is_sampled, sampled};
+use super::super::notes::{SILENT, Sampling, is_sampled};
 use super::graph_cache::{GraphCache, locked};
 
 /// Exit code of a conversion whose bag lacks messages of the capture.
@@ -23,6 +23,9 @@ const INCOMPLETE: u8 = 3;
 pub(super) struct RecordingOutput<'a> {
     /// Source of reasons for silent topics, if available.
     graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
+    /// The agent of a live recording.
+    agent: Option<&'a Agent>,
+    sampling: Sampling,
     begun: Instant,
     sampled: BTreeSet<String>,
     topics: usize,
@@ -34,9 +37,13 @@ pub(super) struct RecordingOutput<'a> {
 }
 
 impl<'a> RecordingOutput<'a> {
-    pub(super) fn new(graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>) -> Self {
+    /// `live`: the agent of a live recording, and its facts.
+    pub(super) fn new(live: Option<(&'a Agent, Arc<Mutex<GraphCache<'a>>>)>) -> Self {
+        let (agent, graph_cache) = live.unzip();
         Self {
             graph_cache,
+            agent,
+            sampling: agent.map_or(Sampling::Nothing, Sampling::at),
             begun: Instant::now(),
             sampled: BTreeSet::new(),
             topics: 0,
@@ -75,11 +82,14 @@ impl<'a> RecordingOutput<'a> {
     pub(super) fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
         let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
-        self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
+        if matches!(self.sampling, Sampling::Sampled(_)) {
+            self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
+        }
     }
 
     fn print_sampled(&mut self, topics: Vec<String>) {
-        if let Some(text) = sampled(&topics, "not every message will be in the bag") {
+        let consequence = "not every message will be in the bag";
+        if let Some(text) = self.sampling.text(&topics, consequence) {
             self.clear();
             log("WARN", &text);
         }
@@ -113,8 +123,15 @@ impl<'a> RecordingOutput<'a> {
 
     fn recording(&mut self, recorder: &Recorder<'_>) {
         self.explain(recorder);
-        let new = recorder.sampled().difference(&self.sampled);
-        self.print_sampled(new.cloned().collect());
+        let new: Vec<_> = recorder
+            .sampled()
+            .difference(&self.sampled)
+            .cloned()
+            .collect();
+        let is_known = |agent| self.sampling.is_known(agent, self.begun);
+        if !new.is_empty() && self.agent.is_none_or(is_known) {
+            self.print_sampled(new);
+        }
         let report = recorder.report();
         if report.topics.len() > self.topics {
             self.clear();
