@@ -543,6 +543,20 @@ impl LiveSource {
         cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
     }
 
+    /// Returns what is not observed yet after the start, as a sentence; `None` if all is. Processes
+    /// that ran before the agent may use a library that is still to be attached to.
+    #[must_use]
+    pub fn pending(&self) -> Option<String> {
+        let exact = self.exact.as_ref().map(|exact| exact.facts().has_inspected);
+        let inside = self.inside().map(|facts| facts.has_inspected);
+        let sources = [("capture.shm.exact", exact), ("capture.inside", inside)];
+        let mut pending = sources.iter().filter(|(_, done)| *done == Some(false));
+        let (key, _) = pending.next()?;
+        Some(format!(
+            "{key}: the running processes have not been inspected yet"
+        ))
+    }
+
     /// Returns how often the host hook was attached to a recreated control group.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {

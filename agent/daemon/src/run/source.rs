@@ -239,6 +239,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         dropped: None,
     }));
     let gone = live.gone();
+    let pending = live.pending();
     let counters = live.counters().unwrap_or_default();
     let value = |wanted: Counter| {
         counters
@@ -267,6 +268,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         on_demand: on_demand(live),
         blind: blind(live),
         gone,
+        pending,
         attached_anew: live.attached_anew(),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
