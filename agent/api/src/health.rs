@@ -183,6 +183,8 @@ pub struct Ability {
     pub ability: Cow<'static, str>,
     /// Whether the agent has the ability.
     pub able: bool,
+    /// The agent gains the ability while a client needs it (`capture.shm.exact: auto`).
+    pub on_demand: bool,
     /// Why the agent lacks the ability; null if it is simply not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(nullable = false))]

@@ -116,6 +116,11 @@ impl FilterReader {
         &mut self.filter
     }
 
+    /// Returns the buffer in which records wait for their turn.
+    pub const fn order_mut(&mut self) -> &mut ReorderBuffer {
+        &mut self.order
+    }
+
     /// Returns the connections of Zenoh.
     #[must_use]
     pub const fn streams(&self) -> &Streams {
@@ -235,7 +240,8 @@ fn deliver(
     most: usize,
 ) -> bool {
     for _ in 0..most {
-        let Some(Next::Kernel(record) | Next::Walked(record)) = order.next(clocks, until) else {
+        let next = order.next(clocks, until);
+        let Some(Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) = next else {
             return true;
         };
         observer.input(Input::Record(&record));

@@ -39,6 +39,7 @@ pub mod inside;
 pub mod interfaces;
 pub mod kernel_types;
 pub mod live;
+pub mod mappings;
 pub mod netns;
 pub mod owners;
 pub mod pcap;

@@ -308,6 +308,8 @@ impl LiveSource {
             settle = filter_reader::SETTLE_NANOSECONDS;
         }
         self.leave_exact_mode(&clocks, observer);
+        // What was polled must not overtake what uprobes saw before.
+        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.poll(&clocks, observer);
             settle = filter_reader::SETTLE_NANOSECONDS;
@@ -316,9 +318,6 @@ impl LiveSource {
             let at_sockets = self.host.as_ref().map(|host| host.reader().streams());
             wire.poll(&clocks, at_sockets, observer)?;
             settle = settle.max(wire_tap::SETTLE_NANOSECONDS);
-        }
-        if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.poll(&clocks, observer);
         }
         for round in self.inside.iter().flat_map(Inside::take) {
             observer.input(Input::Inside(round.report));
@@ -380,14 +379,20 @@ impl LiveSource {
         if let Some(host) = &mut self.host {
             host.drain(&clocks, observer);
         }
+        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.drain(&clocks, observer);
         }
         for wire in &mut self.wires {
             wire.drain(&clocks, observer);
         }
+    }
+
+    /// Passes what was polled in shared memory to the model, or to the uprobes' buffer.
+    fn take_polled(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            shared_memory.poll(&clocks, observer);
+            let order = self.exact.as_mut().and_then(Uprobe::order_mut);
+            shared_memory.poll(clocks, order, observer);
         }
     }
 
@@ -555,6 +560,20 @@ impl LiveSource {
     pub fn gone(&self) -> Option<String> {
         let cgroup = self.host.as_ref().and_then(HostTap::detached);
         cgroup.or_else(|| self.wires.iter().find_map(WireTap::gone))
+    }
+
+    /// Returns what is not observed yet after the start, as a sentence; `None` if all is. Processes
+    /// that ran before the agent may use a library that is still to be attached to.
+    #[must_use]
+    pub fn pending(&self) -> Option<String> {
+        let exact = self.exact.as_ref().map(|exact| exact.facts().has_inspected);
+        let inside = self.inside().map(|facts| facts.has_inspected);
+        let sources = [("capture.shm.exact", exact), ("capture.inside", inside)];
+        let mut pending = sources.iter().filter(|(_, done)| *done == Some(false));
+        let (key, _) = pending.next()?;
+        Some(format!(
+            "{key}: the running processes have not been inspected yet"
+        ))
     }
 
     /// Returns how often the host hook was attached to a recreated control group.

@@ -8,6 +8,9 @@
 //! A full socket buffer is reported after its datagram but must be counted before it: such records
 //! precede all records of their time or later. For a captured datagram the kernel reports only the
 //! token. The datagram's records are then passed twice, first as not delivered.
+//!
+//! While a uprobe sees messages in their senders, records from polling shared memory wait here, too.
+//! A message is polled after it was sent, so its own record comes first.
 
 use std::collections::{HashSet, VecDeque};
 
@@ -22,6 +25,8 @@ use super::system::Clocks;
 /// Most waiting records of captured datagrams: some 2.5 MB. A malicious datagram has two thousand
 /// records.
 const MAX_WALKED: usize = 16_384;
+/// Most waiting records of polled messages: some 2 MB, as many as the polling thread keeps.
+const MAX_POLLED: usize = 16_384;
 /// Capacity for records that is kept while none wait; memory beyond it is freed after a burst.
 const KEPT: usize = 512;
 /// How much later than the report of its drop a captured datagram may be read.
@@ -35,6 +40,8 @@ pub struct ReorderBuffer {
     /// Records with [`flag::SOCKET_FULL`], sorted by time in the kernel's clock.
     socket_full: VecDeque<Record>,
     walked: VecDeque<Walked>,
+    /// Records of polled messages, with the time in the kernel's clock.
+    polled: VecDeque<(u64, Record)>,
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: VecDeque<(u64, u32)>,
     undelivered_tokens: HashSet<u32>,
@@ -60,6 +67,8 @@ pub enum Next {
     Kernel(Record),
     /// Found in a captured datagram.
     Walked(Record),
+    /// Polled in shared memory.
+    Polled(Record),
 }
 
 impl ReorderBuffer {
@@ -94,6 +103,17 @@ impl ReorderBuffer {
         None
     }
 
+    /// Accepts a record of a polled message, with its time in the wall clock and the same time in
+    /// the kernel's clock as `at`; returns it if too many wait.
+    #[must_use]
+    pub fn polled(&mut self, at: u64, record: Record) -> Option<Record> {
+        if self.polled.len() >= MAX_POLLED {
+            return Some(record);
+        }
+        self.polled.push_back((at, record));
+        None
+    }
+
     /// Passes the announcements in a captured datagram to the model. The datagram's records of user
     /// data wait for their turn; `at` is its time in the kernel's clock. `complete` adds to each
     /// record what the bytes do not contain.
@@ -105,12 +125,7 @@ impl ReorderBuffer {
         complete: impl Fn(&mut Record),
         observer: &mut Observer,
     ) {
-        let mut found = std::mem::take(&mut self.found);
-        observer.input(Input::Announcements {
-            envelope,
-            payload,
-            records: &mut found,
-        });
+        let mut found = self.announcements(envelope, payload, 0, observer);
         for mut record in found.drain(..) {
             complete(&mut record);
             if let Some(record) = self.walked(at, record) {
@@ -118,6 +133,41 @@ impl ReorderBuffer {
             }
         }
         self.found = found;
+    }
+
+    /// As [`Self::datagram`], for a message that was polled in shared memory.
+    pub fn polled_message(
+        &mut self,
+        at: u64,
+        envelope: &Envelope,
+        payload: &[u8],
+        observer: &mut Observer,
+    ) {
+        let mut found = self.announcements(envelope, payload, flag::SHM, observer);
+        for record in found.drain(..) {
+            if let Some(record) = self.polled(at, record) {
+                observer.input(Input::Record(&record));
+            }
+        }
+        self.found = found;
+    }
+
+    /// Passes the announcements to the model, and returns the records of user data.
+    fn announcements(
+        &mut self,
+        envelope: &Envelope,
+        payload: &[u8],
+        flags: u16,
+        observer: &mut Observer,
+    ) -> Vec<Record> {
+        let mut found = std::mem::take(&mut self.found);
+        observer.input(Input::Announcements {
+            envelope,
+            payload,
+            flags,
+            records: &mut found,
+        });
+        found
     }
 
     /// Returns the number of waiting records of the kernel's ring.
@@ -131,8 +181,10 @@ impl ReorderBuffer {
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|walked| walked.at);
+        let polled = self.polled.front().map(|(at, _)| *at);
         let socket_full = self.socket_full.front().map(|record| record.time);
-        let oldest = kernel.into_iter().chain(walked).chain(socket_full).min();
+        let queues = [kernel, walked, polled, socket_full];
+        let oldest = queues.into_iter().flatten().min();
         if oldest.is_none_or(|oldest| oldest > until) {
             self.forget_undelivered(until);
             self.give_back();
@@ -147,6 +199,13 @@ impl ReorderBuffer {
         }
         if kernel == oldest {
             return self.kernel.pop_front().map(of_kernel);
+        }
+        if walked != oldest {
+            let (at, mut record) = self.polled.pop_front()?;
+            if clocks.step != 0 {
+                record.time = clocks.calendar(at).0;
+            }
+            return Some(Next::Polled(record));
         }
         let walked = self.walked.front_mut()?;
         let record = walked.record;
@@ -176,6 +235,9 @@ impl ReorderBuffer {
         }
         if self.walked.is_empty() && self.walked.capacity() > KEPT {
             self.walked = VecDeque::new();
+        }
+        if self.polled.is_empty() && self.polled.capacity() > KEPT {
+            self.polled = VecDeque::new();
         }
     }
 
@@ -248,7 +310,7 @@ mod tests {
     fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
         std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
-                let (Next::Kernel(record) | Next::Walked(record)) = next;
+                let (Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) = next;
                 let age = clocks.now.nanoseconds_since(Timestamp(record.time));
                 assert!(age >= SETTLE.cast_signed(), "{age}");
                 let number = record.sequence_number.cast_signed();
@@ -333,6 +395,21 @@ mod tests {
     }
 
     #[test]
+    fn a_polled_message_overtakes_none_that_its_sender_was_seen_to_send_before() {
+        let mut order = ReorderBuffer::default();
+        // 199 and 200 are read at once, 171 and 198 pass the ring.
+        for (number, at) in [(170, 1), (199, 40), (200, 44)] {
+            let (at, record) = captured(number, at);
+            assert!(order.polled(at, record).is_none());
+        }
+        for (number, at) in [(171, 5), (198, 38), (199, 39)] {
+            walked(&mut order, captured(number, at));
+        }
+        let all = [170, 171, 198, 199, 199, 200];
+        assert_eq!(numbers(&mut order, &clocks(200)), all);
+    }
+
+    #[test]
     fn a_clock_that_was_set_holds_nothing_up() {
         let mut order = ReorderBuffer::default();
         let (_, back) = captured(1, 3_600_000);
@@ -364,5 +441,10 @@ mod tests {
             order.walked(at, record).is_some()
         });
         assert_eq!(refused.count(), 20_000 - MAX_WALKED);
+        let refused = (0..20_000).filter(|number| {
+            let (at, record) = captured(*number, 1);
+            order.polled(at, record).is_some()
+        });
+        assert_eq!(refused.count(), 20_000 - MAX_POLLED);
     }
 }

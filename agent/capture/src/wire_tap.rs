@@ -417,7 +417,7 @@ impl FrameAssembly {
         while let Some(next) = self.order.next(clocks, until) {
             let record = match next {
                 Next::Kernel(record) => record,
-                Next::Walked(record) => {
+                Next::Walked(record) | Next::Polled(record) => {
                     observer.input(Input::Record(&record));
                     continue;
                 }

@@ -19,10 +19,14 @@ pub struct AgentFacts {
     pub source_reason: Option<String>,
     /// Abilities of the source, each at most once.
     pub abilities: Vec<Ability>,
+    /// Missing abilities that the source gains while a client needs them.
+    pub on_demand: Vec<Ability>,
     /// Reasons for missing abilities, as text. Not every missing ability has one.
     pub blind: Vec<(Ability, String)>,
     /// Observed object that no longer exists, as text; traffic there is invisible.
     pub gone: Option<String>,
+    /// What is not observed yet after the start, as text.
+    pub pending: Option<String>,
     /// Number of times the host hook was attached again to a recreated control group.
     pub attached_anew: u64,
     /// Time at which these facts were collected.
@@ -175,8 +179,10 @@ impl AgentFacts {
             source,
             source_reason: None,
             abilities: source.abilities().to_vec(),
+            on_demand: Vec::new(),
             blind: Vec::new(),
             gone: None,
+            pending: None,
             attached_anew: 0,
             at,
             capture_progress: at,

@@ -203,7 +203,8 @@ impl State {
     /// Returns the reason if it does not.
     pub fn ready(&self, now: Instant) -> Result<(), String> {
         self.progresses(now)?;
-        self.agent.gone.clone().map_or(Ok(()), Err)
+        let unseen = self.agent.gone.as_ref().or(self.agent.pending.as_ref());
+        unseen.map_or(Ok(()), |reason| Err(reason.clone()))
     }
 
     /// Checks whether the capture works, even if its target no longer exists.
@@ -289,6 +290,11 @@ mod tests {
         assert!(state.progresses(later).is_err());
         state.agent.gone = None;
         assert_eq!(state.ready(start), Ok(()));
+        // Breakpoints that are still to be set are missing as well.
+        let pending = "capture.inside: not inspected yet".to_owned();
+        state.agent.pending = Some(pending.clone());
+        assert_eq!(state.ready(start), Err(pending));
+        assert_eq!(state.progresses(start), Ok(()));
     }
 
     #[test]

@@ -487,6 +487,7 @@ fn brought(observer: &mut Observer, kind: u8, now: u64, content: &[u8]) {
             observer.input(Input::Announcements {
                 envelope: &envelope,
                 payload: content,
+                flags: 0,
                 records: &mut records,
             });
             for record in &records {

@@ -7,6 +7,10 @@
 //! time; beyond, they are dispatched, and a late retransmission follows out of order. Samples never
 //! wait without a gap, without a reliable reader, or if all readers are on other hosts, whose
 //! ACKNACKs are not seen.
+//!
+//! Samples of every writer also wait while uprobes take over from polling: a message that both views
+//! may have seen last arrives behind later ones. The readers do not wait for it, so these samples
+//! keep their own times.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -44,6 +48,9 @@ pub struct Progress {
     pub reliable: bool,
     /// Whether the writer has readers that acknowledge, or new ones that may.
     pub acknowledged: bool,
+    /// Whether the first missing sample is one that this host did not see, and that readers may
+    /// have.
+    pub unseen: bool,
 }
 
 /// A sample and the subscriptions that receive it.
@@ -65,6 +72,8 @@ pub struct InOrder {
     incarnation: Option<u32>,
     /// The missing number, and since when it is waited for.
     hole: (SequenceNumber, Timestamp),
+    /// Whether readers may have the missing number.
+    is_hole_unseen: bool,
     /// Time of the last dispatched sample.
     last: Timestamp,
     /// Numbers that were counted before the writer's announcement but not dispatched.
@@ -94,6 +103,7 @@ impl InOrder {
             bytes: _,
             incarnation: _,
             hole: _,
+            is_hole_unseen: _,
             last: _,
             earlier,
             announced: _,
@@ -192,6 +202,7 @@ impl InOrder {
         if self.hole.0 != complete {
             self.hole = (complete, now);
         }
+        self.is_hole_unseen = progress.unseen;
         let is_late = self.hole.1 + GAP_TIMEOUT <= now;
         if is_late || self.waiting.len() > WAITING || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
@@ -213,7 +224,8 @@ impl InOrder {
         let came = queued.sample.time;
         // Its reader may have received the lower number through unobserved shared memory, and then
         // it did not wait.
-        let now = if queued.sample.sampled { came } else { now };
+        let is_own = queued.sample.sampled || self.is_hole_unseen;
+        let now = if is_own { came } else { now };
         // Players sort by time, so samples that waited for the same retransmission are one
         // nanosecond apart.
         let after = match came < now.max(self.last) {

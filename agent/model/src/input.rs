@@ -53,6 +53,8 @@ pub enum Input<'a> {
         envelope: &'a Envelope,
         /// The RTPS message.
         payload: &'a [u8],
+        /// Flags of its records that the bytes do not contain.
+        flags: u16,
         /// Receives the records of user data, which the caller sorts among others.
         records: &'a mut Vec<Record>,
     },

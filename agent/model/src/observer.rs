@@ -186,8 +186,9 @@ impl Observer {
             Input::Announcements {
                 envelope,
                 payload,
+                flags,
                 records,
-            } => self.walk(envelope, payload, None, 0, |observer, record| {
+            } => self.walk(envelope, payload, None, flags, |observer, record| {
                 if record.writer().entity.is_builtin() {
                     observer.count(record);
                 } else {

@@ -4,6 +4,8 @@
 //! The output queue is bounded; samples without room are counted and reported. Requests for samples
 //! never change a measurement.
 
+mod request_begin;
+
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,6 +19,7 @@ use super::journal::Missing;
 use super::selection::RequestIds;
 use super::size::{Size, largest};
 use super::writer::Counted;
+use request_begin::RequestBegin;
 
 /// Largest number of entries in the output queue; one round of the capture thread has far fewer.
 const WAITING: usize = 65_536;
@@ -32,8 +35,8 @@ struct WantedWriter {
     to: Arc<[u64]>,
     payloads: Arc<[u64]>,
     arrivals: Arc<[u64]>,
-    /// Each request id, and the first number for that request.
-    begins: Vec<(u64, SequenceNumber)>,
+    /// Where each request begins.
+    begins: Vec<RequestBegin>,
     /// Time since which payloads are requested.
     since: Timestamp,
     /// Number of the first sample that was dispatched with its payload.
@@ -195,14 +198,13 @@ impl Payloads {
         let known = before.as_ref().filter(|known| *known.topic == topic);
         let topic = known.map_or_else(|| Arc::new(topic), |known| Arc::clone(&known.topic));
         let begins = |id: &u64| {
-            let earlier = self
-                .unknown_writers
-                .get(&writer)
-                .map(|earlier| &earlier.begins);
-            let known = before.iter().map(|before| &before.begins);
-            let known = known.chain(earlier).flatten();
-            let known = known.copied().find(|(known, _)| known == id);
-            known.unwrap_or((*id, next))
+            let known = before.iter().flat_map(|before| &before.begins);
+            let known = known.copied().find(|known| known.id == *id);
+            let earlier = self.unknown_writers.get(&writer);
+            let mut earlier = earlier.iter().flat_map(|earlier| &earlier.begins);
+            let earlier = earlier.find(|(known, _)| known == id);
+            let number = earlier.map_or(next, |(_, number)| *number);
+            known.unwrap_or_else(|| RequestBegin::new(*id, number, now))
         };
         let begins = requested.ids.iter().map(begins).collect();
         let was_deep = before.as_ref().filter(|before| !before.payloads.is_empty());
@@ -279,6 +281,9 @@ impl Payloads {
             Some(_) => &interested.to,
             None => &interested.arrivals,
         };
+        for begin in &mut interested.begins {
+            begin.arrived(to, counted.number);
+        }
         let queued = QueuedSample {
             to: Arc::clone(to),
             sample: Sample {
@@ -416,7 +421,7 @@ impl Payloads {
         let forgone = order.forgone(progress, now);
         let mut queued = Vec::new();
         let skip = order.turn(progress, now, room, &mut |each| queued.push(each));
-        self.unannounced(writer, &forgone);
+        self.unannounced(writer, &forgone, now);
         queued
             .into_iter()
             .for_each(|queued| self.give_queued(queued));
@@ -435,14 +440,14 @@ impl Payloads {
         interested
             .order
             .give_all(now, &mut |each| queued.push(each));
-        self.unannounced(writer, &forgone);
+        self.unannounced(writer, &forgone, now);
         queued
             .into_iter()
             .for_each(|queued| self.give_queued(queued));
     }
 
-    /// Reports samples that will not arrive.
-    pub fn missing(&mut self, missing: &Missing) {
+    /// Reports samples that will not arrive, at `now`.
+    pub fn missing(&mut self, missing: &Missing, now: Timestamp) {
         let Missing {
             writer,
             first,
@@ -455,7 +460,7 @@ impl Payloads {
         if reason == MissedReason::Incomplete {
             self.assembly.forget(writer, first);
         }
-        for missed in interested.missed(writer, (first, last), reason) {
+        for missed in interested.missed(writer, (first, last), (reason, now), self.payload_delay) {
             self.give(missed, 0);
         }
     }
@@ -488,8 +493,8 @@ impl Payloads {
         };
         interested.order.announced(earlier.numbers, now);
         if let Some((first, last, samples)) = earlier.before {
-            let reason = MissedReason::Unannounced;
-            let mut missed = interested.missed(writer, (first, last), reason);
+            let reason = (MissedReason::Unannounced, now);
+            let mut missed = interested.missed(writer, (first, last), reason, self.payload_delay);
             for dispatches in &mut missed {
                 if let SampleOutcome::Missed(missed) = &mut dispatches.outcome {
                     missed.samples = missed.samples.min(samples);
@@ -500,14 +505,15 @@ impl Payloads {
     }
 
     /// Reports samples that will not be retransmitted.
-    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber]) {
+    fn unannounced(&mut self, writer: Guid, numbers: &[SequenceNumber], now: Timestamp) {
         let Some(interested) = self.writers.get(&writer) else {
             return;
         };
+        let (reason, delay) = ((MissedReason::Unannounced, now), self.payload_delay);
         let runs = numbers.chunk_by(|before, after| before.precedes(*after));
         let missed: Vec<_> = runs
             .filter_map(|run| Some((*run.first()?, *run.last()?)))
-            .flat_map(|run| interested.missed(writer, run, MissedReason::Unannounced))
+            .flat_map(|run| interested.missed(writer, run, reason, delay))
             .collect();
         missed.into_iter().for_each(|missed| self.give(missed, 0));
     }
@@ -553,14 +559,18 @@ impl WantedWriter {
         &self,
         writer: Guid,
         (first, last): (SequenceNumber, SequenceNumber),
-        reason: MissedReason,
+        (reason, now): (MissedReason, Timestamp),
+        payload_delay: Duration,
     ) -> Vec<Dispatch> {
         let mut missed: Vec<(SequenceNumber, Vec<u64>)> = Vec::new();
-        for (id, begin) in &self.begins {
-            let first = first.max(*begin);
+        for begin in &self.begins {
+            let Some(from) = begin.misses_from(reason, now, payload_delay) else {
+                continue;
+            };
+            let first = first.max(from);
             match missed.iter_mut().find(|(known, _)| *known == first) {
-                Some((_, to)) => to.push(*id),
-                None if first <= last => missed.push((first, vec![*id])),
+                Some((_, to)) => to.push(begin.id),
+                None if first <= last => missed.push((first, vec![begin.id])),
                 None => {}
             }
         }

@@ -349,20 +349,25 @@ impl Writer {
     /// Returns how far its samples are decided. `acknowledged` states whether readers acknowledge.
     pub fn progress(&mut self, acknowledged: bool, now: Timestamp) -> Progress {
         let waits = self.traits.reliable && acknowledged;
-        let reliable = self.traits.reliable && !self.is_sampled(now);
+        let is_sampled = self.is_sampled(now);
+        let reliable = self.traits.reliable && !is_sampled;
         // While a sample is waited for in shared memory, its retransmission may pass there, too.
+        // After the sampled view ended, samples of any writer may arrive behind later ones.
         let unseen = self.sampled.as_ref().and_then(|sampled| sampled.unseen());
-        let unseen = unseen.filter(|_| waits).unwrap_or(SequenceNumber(u64::MAX));
+        let unseen = unseen.filter(|_| waits || !is_sampled);
+        let unseen = unseen.unwrap_or(SequenceNumber(u64::MAX));
         let sequence = self.reception.sequence_mut();
         if !waits {
             sequence.skip(sequence.next());
         }
+        let complete = sequence.complete();
         Progress {
             incarnation: sequence.incarnation(),
-            complete: sequence.complete().min(unseen),
+            complete: complete.min(unseen),
             awaited: sequence.awaited(),
             reliable,
             acknowledged,
+            unseen: unseen < complete,
         }
     }
 

@@ -24,6 +24,7 @@ use self::programs::{Attached, Programs, Tables};
 use self::table::{ProcessTable, Round};
 use crate::error_chain::in_words;
 use crate::filter::FilterError;
+use crate::mappings::{MappingEvents, UNCONCERNED};
 use crate::settings::InsideChoice;
 use crate::shm::directories::Scope;
 use crate::system::{Clocks, wait};
@@ -59,6 +60,8 @@ pub struct Facts {
     pub has_callbacks: bool,
     /// Libraries in use.
     pub libraries: Vec<LibraryFacts>,
+    /// Whether the processes that ran before this source have been inspected.
+    pub has_inspected: bool,
     /// Why nothing is attached at present; `None` = the libraries in use are.
     pub detached: Option<String>,
     /// Counters of the programs.
@@ -182,6 +185,7 @@ impl Shared {
 fn follow(shared: &Shared, mut work: Work) {
     let mut processes = Processes::new(work.scope.clone(), is_library);
     let mut table = ProcessTable::new(work.has_callbacks);
+    let mut mappings = MappingEvents::open_or_warn("capture.inside");
     let mut detached_at = None::<Instant>;
     let mut last = Instant::now();
     while !shared.stop.load(Ordering::Acquire) {
@@ -217,20 +221,75 @@ fn follow(shared: &Shared, mut work: Work) {
         }
         shared.report(Facts {
             has_callbacks: work.has_callbacks,
+            has_inspected: true,
             libraries: work.attachments.facts(),
             detached: detached_at.map(|_| {
                 format!("all processes together made more than {MAX_HITS} calls per second")
             }),
             counters: counters(&work.tables),
         });
+        let end = now + EVERY;
         // Announcements are read in between: their ring could overflow before the next round.
-        loop {
-            let rest = EVERY.saturating_sub(now.elapsed());
-            if rest.is_zero() || !matches!(wait(&[work.tables.descriptor()], rest), Ok(Some(_))) {
-                break;
+        let mut gathers_until = now;
+        while let Some(event) = next_event(&mappings, &work.tables, gathers_until, end) {
+            if event == Event::Announced {
+                table.drain(&mut work.tables, &Clocks::read());
+                gathers_until = Instant::now() + GATHER;
+                continue;
             }
-            table.drain(&mut work.tables, &Clocks::read());
-            std::thread::sleep(EVERY.saturating_sub(now.elapsed()).min(GATHER));
+            let new = mappings.as_mut().map(|mappings| mappings.take(is_library));
+            let new = new.unwrap_or_default();
+            if new.is_incomplete {
+                processes.find(true);
+            } else if new.processes.is_empty() {
+                std::thread::sleep(UNCONCERNED);
+                continue;
+            }
+            processes.inspect(&new.processes);
+            if detached_at.is_none() {
+                work.attachments.follow(&processes, Instant::now());
+            }
+        }
+    }
+}
+
+/// What ends a wait between two rounds.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Event {
+    /// A process mapped a file.
+    Mapped,
+    /// Many announcements wait.
+    Announced,
+}
+
+/// Waits until `end` for the next event, for announcements only from `gathers_until` on; returns
+/// `None` at the end.
+fn next_event(
+    mappings: &Option<MappingEvents>,
+    tables: &Tables,
+    gathers_until: Instant,
+    end: Instant,
+) -> Option<Event> {
+    loop {
+        let now = Instant::now();
+        let is_gathering = now < gathers_until;
+        let until = if is_gathering {
+            end.min(gathers_until)
+        } else {
+            end
+        };
+        let timeout = until.saturating_duration_since(now);
+        if timeout.is_zero() {
+            return None;
+        }
+        let announced = (!is_gathering).then(|| tables.descriptor());
+        let mapped = mappings.iter().flat_map(MappingEvents::descriptors);
+        let descriptors: Vec<_> = announced.into_iter().chain(mapped).collect();
+        match wait(&descriptors, timeout) {
+            Ok(Some(0)) if !is_gathering => return Some(Event::Announced),
+            Ok(Some(_)) => return Some(Event::Mapped),
+            Ok(None) if is_gathering => {}
+            Ok(None) | Err(_) => return None,
         }
     }
 }

@@ -40,8 +40,11 @@ pub struct MessageClassifier {
     capture_left: i64,
     records_left: i64,
     refilled: u64,
-    /// The last captured message announces endpoints or nodes, and more announcements may follow.
+    /// The last captured message announces endpoints or perhaps nodes, and more announcements may
+    /// follow.
     pub announces: bool,
+    /// It belongs to a writer of discovery.
+    pub is_builtin: bool,
     /// It belongs to a writer whose messages are captured whole: a participant's nodes, or samples
     /// that are read.
     pub is_wanted: bool,
@@ -57,6 +60,7 @@ impl Default for MessageClassifier {
             records_left: RECORDS_PER_SECOND,
             refilled: 0,
             announces: false,
+            is_builtin: false,
             is_wanted: false,
         }
     }
@@ -126,6 +130,7 @@ impl MessageClassifier {
                     let is_sample = walk.record.is_sample();
                     let writer = walk.record.writer().entity;
                     self.announces = is_sample && writer != EntityId::SPDP_WRITER;
+                    self.is_builtin = writer.is_builtin();
                     self.is_wanted = self.interest.contains_key(&walk.record.writer);
                     records.truncate(first);
                     return MessageVerdict::Captured;

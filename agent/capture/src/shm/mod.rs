@@ -37,6 +37,7 @@ use self::directories::{Name, ShmDirectories, ShmDirectoryId};
 use self::inbox::{Inbox, Item};
 use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
+use super::reorder_buffer::ReorderBuffer;
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
 use crate::threads::{Spawn, Task};
 use ros2probe_model::input::Input;
@@ -133,24 +134,46 @@ impl SharedMemory {
         self.shared.inbox.descriptor()
     }
 
-    /// Passes everything found since the last call to the model.
-    pub fn poll(&self, clocks: &Clocks, observer: &mut Observer) {
+    /// Passes everything found since the last call to the model. With `order`, records of user data
+    /// wait there for their turn.
+    pub fn poll(
+        &self,
+        clocks: &Clocks,
+        mut order: Option<&mut ReorderBuffer>,
+        observer: &mut Observer,
+    ) {
         for item in self.shared.inbox.take() {
             match item {
                 Item::Record(record) => {
-                    let time = clocks.stamped(Timestamp(record.time)).0;
-                    observer.input(Input::Record(&Record { time, ..record }));
+                    let time = clocks.stamped(Timestamp(record.time));
+                    let record = Record {
+                        time: time.0,
+                        ..record
+                    };
+                    let at = clocks.monotonic_of(time);
+                    let record = match &mut order {
+                        Some(order) => order.polled(at, record),
+                        None => Some(record),
+                    };
+                    if let Some(record) = record {
+                        observer.input(Input::Record(&record));
+                    }
                 }
                 Item::Message { time, port, bytes } => {
+                    let time = clocks.stamped(Timestamp(time));
                     let envelope = Envelope {
-                        time: clocks.stamped(Timestamp(time)).0,
+                        time: time.0,
                         destination_port: port,
                         ..Envelope::default()
                     };
-                    observer.input(Input::SharedMemory {
-                        envelope: &envelope,
-                        payload: &bytes,
-                    });
+                    let (envelope, payload) = (&envelope, &*bytes);
+                    match &mut order {
+                        Some(order) => {
+                            let at = clocks.monotonic_of(time);
+                            order.polled_message(at, envelope, payload, observer);
+                        }
+                        None => observer.input(Input::SharedMemory { envelope, payload }),
+                    }
                 }
                 Item::Uncertain(time) => {
                     observer.input(Input::SharedMemoryGap(clocks.stamped(Timestamp(time))));

@@ -10,6 +10,7 @@ use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use ros2probe_wire::record::{Record, flag};
+use ros2probe_wire::{EntityId, Guid, GuidPrefix};
 
 use super::cell::{Descriptor, SegmentId};
 use super::classifier::{MessageClassifier, MessageVerdict};
@@ -29,6 +30,10 @@ const MAX_SEGMENTS: usize = 512;
 /// Most messages read per poll; the rest of a flood is read in the next.
 const MAX_PER_POLL: usize = 2048;
 const MAX_PER_URGENT_POLL: usize = 64;
+/// Most ports read per urgent poll: what is announced to all participants is in every port.
+const PORTS_PER_URGENT_POLL: usize = 8;
+/// Bytes of a message in which the announcement of a participant's nodes begins.
+const BEGIN: usize = 4096;
 /// Silence after which a port is polled less often, and that interval.
 const SILENT_AFTER: u64 = 2_000_000_000;
 const SILENT_EVERY: u64 = 10_000_000;
@@ -261,14 +266,19 @@ impl Tap {
         } else {
             MAX_PER_POLL
         };
-        let mut announced = 0;
+        let most_ports = match self.is_hurried && !self.misses_nothing {
+            true => PORTS_PER_URGENT_POLL,
+            false => usize::MAX,
+        };
+        let (mut announced, mut polled) = (0, 0);
         let ports = self.ports.len();
         let first = std::mem::take(&mut self.turn);
         for step in 0..ports {
             let index = (first + step) % ports;
             if self.ports.get(index).is_some_and(|open| open.due <= now) {
                 announced += self.poll_port(index, now, found);
-                if announced >= most {
+                polled += 1;
+                if announced >= most || polled >= most_ports {
                     // A flood at one port must not starve the others.
                     self.turn = index + 1;
                     break;
@@ -395,7 +405,9 @@ impl Tap {
             self.counters.captured += 1;
             // Samples that are read do not indicate a new participant.
             let is_news = !(self.misses_nothing && self.classifier.is_wanted);
-            self.met |= self.classifier.announces && is_news;
+            self.met |= is_news
+                && self.classifier.announces
+                && (self.classifier.is_builtin || may_announce_nodes(&bytes));
             self.counters.captured_bytes += bytes.len() as u64;
             found.push(Item::Message {
                 time: reading.calendar,
@@ -581,6 +593,18 @@ impl Tap {
         let name = Name::Segment(generation, id).file_name();
         directory.is_some_and(|directory| locks.is_abandoned(&directory.path.join(name)))
     }
+}
+
+/// Returns whether a sample in this message may announce the nodes of its participant: it begins
+/// with the participant's GUID.
+fn may_announce_nodes(message: &[u8]) -> bool {
+    let Some(prefix) = message.get(8..20).and_then(|bytes| bytes.try_into().ok()) else {
+        return false;
+    };
+    let participant = Guid::new(GuidPrefix(prefix), EntityId::PARTICIPANT).to_bytes();
+    let begin = message.get(20..message.len().min(BEGIN));
+    let mut guids = begin.unwrap_or_default().windows(participant.len());
+    guids.any(|bytes| *bytes == participant)
 }
 
 #[cfg(test)]

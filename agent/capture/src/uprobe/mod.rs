@@ -19,6 +19,7 @@ use std::path::{Path, PathBuf};
 use self::search::{Facts, LibrarySearch};
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::filter_reader::FilterReader;
+use super::reorder_buffer::ReorderBuffer;
 use super::shm::directories::Scope;
 use super::system::Clocks;
 use crate::threads::Spawn;
@@ -145,6 +146,13 @@ impl Uprobe {
     /// programs are attached on demand.
     pub fn want(&self, wanted: bool) {
         self.search.want(wanted);
+    }
+
+    /// Returns the buffer in which records from polling wait for their turn; `None` while no process
+    /// is observed.
+    pub fn order_mut(&mut self) -> Option<&mut ReorderBuffer> {
+        let is_attached = self.was_attached || self.search.is_attached();
+        is_attached.then(|| self.reader.order_mut())
     }
 
     /// Passes the messages found to the model and, after the programs are detached, that no more

@@ -3,7 +3,7 @@
 //! Reads `/proc/<pid>/maps` of new processes, of young ones for a while, and of the others
 //! occasionally: a library may be loaded late. Reads no process memory.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::fs::{self, File};
 use std::io::{self, Read as _};
 use std::path::PathBuf;
@@ -170,6 +170,28 @@ impl Processes {
             };
             process.met = met.saturating_add(1);
             self.known.insert(pid, process);
+        }
+    }
+
+    /// Visits processes that have just mapped a library, if they are in scope.
+    pub fn inspect(&mut self, pids: &BTreeSet<u32>) {
+        let is_in_scope: Box<dyn Fn(&u32) -> bool> = match &self.scope {
+            Scope::AllProcesses => Box::new(|_| true),
+            scope => {
+                let processes = scope.processes();
+                Box::new(move |pid| processes.contains(pid))
+            }
+        };
+        for pid in pids.iter().filter(|pid| is_in_scope(pid)) {
+            if let Ok(use_of_it) = Use::read(*pid, self.is_library) {
+                let process = Process {
+                    // It may load further libraries.
+                    met: 0,
+                    use_of_it,
+                    is_closed: false,
+                };
+                self.known.insert(*pid, process);
+            }
         }
     }
 

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeSet;
 use std::io;
-use std::os::fd::AsFd as _;
+use std::os::fd::AsFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -16,6 +16,7 @@ use super::attachments::{Attachments, LibraryFacts, Refusal, installed};
 use super::library;
 use super::processes::{Mapped, Processes, is_library};
 use crate::filter::{Probe, Probes};
+use crate::mappings::{MappingEvents, UNCONCERNED};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
 use crate::threads::{Spawn, Task};
@@ -44,6 +45,10 @@ pub struct Facts {
     pub libraries: Vec<LibraryFacts>,
     /// Why some process may send without being seen; `None` = all are covered.
     pub uncovered: Option<String>,
+    /// Whether the running processes have been inspected, or need not be.
+    pub has_inspected: bool,
+    /// Whether probes are attached on demand and not needed.
+    pub is_resting: bool,
 }
 
 struct Shared {
@@ -66,6 +71,8 @@ impl Facts {
         Self {
             libraries: Vec::new(),
             uncovered: Some(RESTING.to_owned()),
+            has_inspected: true,
+            is_resting: true,
         }
     }
 }
@@ -76,6 +83,8 @@ impl Default for Facts {
         Self {
             libraries: Vec::new(),
             uncovered: Some("processes have not been inspected yet".to_owned()),
+            has_inspected: false,
+            is_resting: false,
         }
     }
 }
@@ -122,7 +131,13 @@ impl LibrarySearch {
         let thread = std::thread::Builder::new().name("exact".to_owned());
         let shared = Arc::clone(&self.shared);
         let work = Box::new(move || follow(&shared, attachments, scope));
-        self.thread = Some(spawn(Task::Probes, thread, work)?);
+        let spawned = spawn(Task::Probes, thread, work);
+        if spawned.is_err() {
+            let facts = self.shared.facts.lock();
+            // Nothing will be inspected, so there is nothing to wait for.
+            facts.unwrap_or_else(PoisonError::into_inner).has_inspected = true;
+        }
+        self.thread = Some(spawned?);
         Ok(())
     }
 
@@ -169,8 +184,12 @@ impl Drop for LibrarySearch {
 }
 
 /// The thread's main function.
-fn follow(shared: &Shared, mut attachments: Attachments<Probe>, scope: Scope) {
-    let mut processes = Processes::new(scope.clone(), is_library);
+fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
+    let mut followed = Followed {
+        processes: Processes::new(scope.clone(), is_library),
+        attachments,
+        mappings: MappingEvents::open_or_warn("capture.shm.exact"),
+    };
     let mut shared_memory = ShmDirectories::new(scope);
     // Without inotify, a starting participant is noticed within a second.
     let mut watch = DirectoryWatch::new().ok();
@@ -182,7 +201,7 @@ fn follow(shared: &Shared, mut attachments: Attachments<Probe>, scope: Scope) {
                 // Polling of shared memory resumes before the probes are detached.
                 shared.report(Facts::resting());
                 std::thread::sleep(OVERLAP);
-                attachments.clear();
+                followed.attachments.clear();
                 shared.attached.store(false, Ordering::Release);
                 tracing::info!("no longer attached: no samples are read");
             }
@@ -198,15 +217,13 @@ fn follow(shared: &Shared, mut attachments: Attachments<Probe>, scope: Scope) {
             asked_all = Some(now);
         }
         // New processes come first.
-        processes.find(false);
-        attachments.follow(&processes, now);
+        followed.find(false, now);
         if all {
-            processes.find(true);
-            attachments.follow(&processes, now);
+            followed.find(true, now);
         }
-        shared.report(facts(&attachments, &processes));
+        shared.report(followed.facts());
         let Some(watch) = &mut watch else {
-            std::thread::park_timeout(EVERY);
+            followed.wait_attaching(None, EVERY, shared);
             continue;
         };
         shared_memory.find();
@@ -219,9 +236,69 @@ fn follow(shared: &Shared, mut attachments: Attachments<Probe>, scope: Scope) {
             watch.add(new);
         }
         watched = directories;
-        std::thread::sleep(GATHER);
-        somebody_came = matches!(wait(&[watch.as_fd()], EVERY), Ok(Some(0)))
-            && watch.created(|name| Name::parse(name).is_some());
+        followed.wait_attaching(None, GATHER, shared);
+        let is_created = followed.wait_attaching(Some(watch), EVERY, shared);
+        somebody_came = is_created && watch.created(|name| Name::parse(name).is_some());
+    }
+}
+
+/// The processes, and the libraries that they use.
+struct Followed {
+    processes: Processes,
+    attachments: Attachments<Probe>,
+    mappings: Option<MappingEvents>,
+}
+
+impl Followed {
+    fn find(&mut self, all: bool, now: Instant) {
+        self.processes.find(all);
+        self.attachments.follow(&self.processes, now);
+    }
+
+    fn facts(&self) -> Facts {
+        facts(&self.attachments, &self.processes)
+    }
+
+    /// Waits until a file is created, at most `limit`, and returns whether one was. Attaches to
+    /// libraries that processes map in that time.
+    fn wait_attaching(
+        &mut self,
+        watch: Option<&DirectoryWatch>,
+        limit: Duration,
+        shared: &Shared,
+    ) -> bool {
+        let end = Instant::now() + limit;
+        loop {
+            let rest = end.saturating_duration_since(Instant::now());
+            if rest.is_zero() {
+                return false;
+            }
+            let created = watch.map(AsFd::as_fd);
+            let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
+            let descriptors: Vec<_> = created.into_iter().chain(mapped).collect();
+            match wait(&descriptors, rest) {
+                Ok(Some(0)) if watch.is_some() => return true,
+                Ok(Some(_)) => self.attach_mapped(shared),
+                Ok(None) | Err(_) => return false,
+            }
+        }
+    }
+
+    fn attach_mapped(&mut self, shared: &Shared) {
+        let new = self
+            .mappings
+            .as_mut()
+            .map(|mappings| mappings.take(is_library));
+        let new = new.unwrap_or_default();
+        if new.is_incomplete {
+            self.processes.find(true);
+        } else if new.processes.is_empty() {
+            std::thread::sleep(UNCONCERNED);
+            return;
+        }
+        self.processes.inspect(&new.processes);
+        self.attachments.follow(&self.processes, Instant::now());
+        shared.report(self.facts());
     }
 }
 
@@ -257,6 +334,8 @@ fn facts(attachments: &Attachments<Probe>, processes: &Processes) -> Facts {
     Facts {
         libraries: attachments.facts(),
         uncovered: uncovered(attachments, processes),
+        has_inspected: true,
+        is_resting: false,
     }
 }
 

@@ -41,6 +41,7 @@ pub(crate) struct Notes<'a> {
     are_parts: bool,
     /// Consequence of sampling for this verb.
     consequence: &'static str,
+    sampling: Sampling,
     heard: HashSet<String>,
     sampled: HashSet<String>,
     begun: Instant,
@@ -78,13 +79,17 @@ impl<'a> Notes<'a> {
             names: names.to_vec(),
             are_parts: false,
             consequence,
+            sampling: match is_replay {
+                // A network capture contains no shared memory.
+                true => Sampling::Nothing,
+                false => Sampling::at(agent),
+            },
             heard: HashSet::new(),
             sampled: HashSet::new(),
             begun: Instant::now(),
             is_explained: false,
         };
-        // A network capture contains no shared memory.
-        if !is_replay && samples_shared_memory(agent) {
+        if matches!(notes.sampling, Sampling::Sampled(_)) {
             let topics = notes.topics();
             let topics = topics.iter().filter(|topic| is_sampled(topic));
             let topics: Vec<String> = topics.map(|topic| topic.name.clone()).collect();
@@ -108,7 +113,8 @@ impl<'a> Notes<'a> {
 
     /// Records the arrival of a message.
     pub(crate) fn received(&mut self, topic: &str, sampled: bool) {
-        if sampled && !self.sampled.contains(topic) {
+        let is_new = sampled && !self.sampled.contains(topic);
+        if is_new && self.sampling.is_known(self.agent, self.begun) {
             self.print_sampled(&[topic.to_owned()]);
         }
         if !self.heard.contains(topic) {
@@ -213,9 +219,11 @@ impl<'a> Notes<'a> {
                  off in Cyclone DDS, or count them with `capture.inside: topics`"
             }
             ReasonCode::SharedMemory => {
-                return Some(format!(
-                    "publisher and subscriber use shared memory, and none was seen there: {SWITCH}"
-                ));
+                let text = "publisher and subscriber use shared memory, and none was seen there";
+                return Some(match &self.sampling {
+                    Sampling::Sampled(remedy) => format!("{text}: {remedy}"),
+                    Sampling::Nothing | Sampling::OnDemand => text.to_owned(),
+                });
             }
             ReasonCode::AgentNotReady
             | ReasonCode::NoMatchedSubscriber
@@ -226,8 +234,7 @@ impl<'a> Notes<'a> {
     }
 
     fn print_sampled(&mut self, topics: &[String]) {
-        let consequence = self.consequence;
-        if let Some(text) = sampled(topics, consequence) {
+        if let Some(text) = self.sampling.text(topics, self.consequence) {
             eprintln!("rp: {}", visible(&text));
         }
         self.sampled.extend(topics.iter().cloned());
@@ -286,17 +293,65 @@ impl Missing {
     }
 }
 
-/// Returns whether the agent sees messages in shared memory only as samples.
-pub(crate) fn samples_shared_memory(agent: &Agent) -> bool {
-    let Ok(Health { abilities, .. }) = agent.get("/health") else {
-        return false;
-    };
-    let able = |name: &str| {
-        abilities
-            .iter()
-            .any(|each| each.ability == name && each.able)
-    };
-    able("shared_memory") && !able("shared_memory_exact")
+/// How the agent sees messages in shared memory.
+pub(crate) enum Sampling {
+    /// It sees each one, or none is there.
+    Nothing,
+    /// It is about to see each one, since a client reads them.
+    OnDemand,
+    /// It sees samples, with the remedy or the reason.
+    Sampled(String),
+}
+
+impl Sampling {
+    /// Returns how this agent sees them at present.
+    pub(crate) fn at(agent: &Agent) -> Self {
+        let health = agent.get("/health");
+        health.map_or(Self::Nothing, |health: Health| Self::of(&health))
+    }
+
+    fn of(health: &Health) -> Self {
+        let ability = |name: &str| health.abilities.iter().find(|each| each.ability == name);
+        let exact = ability("shared_memory_exact");
+        let is_read = ability("shared_memory").is_some_and(|each| each.able);
+        match exact {
+            _ if !is_read => Self::Nothing,
+            Some(exact) if exact.able => Self::Nothing,
+            Some(exact) if exact.on_demand => Self::OnDemand,
+            // It is configured, so the remedy would be none.
+            exact => {
+                let reason = exact.and_then(|exact| exact.reason.clone());
+                Self::Sampled(reason.unwrap_or_else(|| SWITCH.to_owned()))
+            }
+        }
+    }
+
+    /// Returns whether sampled messages show a lasting state. They do not while breakpoints attach
+    /// after `begun`.
+    pub(crate) fn is_known(&mut self, agent: &Agent, begun: Instant) -> bool {
+        if matches!(self, Self::OnDemand) {
+            if begun.elapsed() < SILENT {
+                return false;
+            }
+            *self = match Self::at(agent) {
+                Self::OnDemand => Self::Nothing,
+                known => known,
+            };
+        }
+        true
+    }
+
+    /// Text about sampled topics: the consequence, and the remedy or the reason. `None` if the
+    /// topics are not sampled.
+    pub(crate) fn text(&self, topics: &[String], consequence: &str) -> Option<String> {
+        let Self::Sampled(remedy) = self else {
+            return None;
+        };
+        let names = few(topics);
+        let verb = if topics.len() == 1 { "is" } else { "are" };
+        let text = format!("{names} {verb} sampled in shared memory; {consequence}; {remedy}");
+        (!topics.is_empty()).then_some(text)
+    }
 }
 
 /// Returns whether all messages of a topic pass through shared memory.
@@ -315,14 +370,6 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
          {:.1} Hz (`rp top`, `rp inside`)",
         measured.messages, measured.rate_hertz
     ))
-}
-
-/// Text about sampled topics: the consequence and the remedy. `None` without a topic.
-pub(crate) fn sampled(topics: &[String], consequence: &str) -> Option<String> {
-    let names = few(topics);
-    let verb = if topics.len() == 1 { "is" } else { "are" };
-    let text = format!("{names} {verb} sampled in shared memory; {consequence}; {SWITCH}");
-    (!topics.is_empty()).then_some(text)
 }
 
 fn few(names: &[String]) -> String {
@@ -378,13 +425,36 @@ mod tests {
     #[test]
     fn a_long_list_of_sampled_topics_is_one_line() {
         let names: Vec<String> = (0..10).map(|number| format!("/t{number}")).collect();
-        let text = sampled(&names, "not every message is printed").unwrap();
+        let sampling = Sampling::Sampled(SWITCH.to_owned());
+        let text = sampling.text(&names, NOT_ALL_PRINTED).unwrap();
         assert!(text.starts_with("/t0, /t1, "), "{text}");
         assert!(
             text.contains("/t7 and 2 more are sampled in shared memory; not every"),
             "{text}"
         );
         assert!(text.contains("capture.shm.exact"), "{text}");
-        assert_eq!(sampled(&[], ""), None);
+        assert_eq!(sampling.text(&[], ""), None);
+    }
+
+    #[test]
+    fn what_is_configured_is_not_recommended() {
+        let text = |exact: &str| {
+            let health = format!(
+                r#"{{"abilities":[{{"ability":"shared_memory","able":true}},
+                    {{"ability":"shared_memory_exact",{exact}}}]}}"#
+            );
+            let health: Health = serde_json::from_str(&health).unwrap();
+            Sampling::of(&health).text(&["/imu".to_owned()], NOT_ALL_PRINTED)
+        };
+        let off = text(r#""able":false"#).unwrap();
+        assert!(off.ends_with(SWITCH), "{off}");
+        let resting = r#""able":false,"on_demand":true,"reason":"no client reads samples""#;
+        assert_eq!(text(resting), None);
+        assert_eq!(text(r#""able":true"#), None);
+        let failed = text(r#""able":false,"reason":"uprobes need CAP_SYS_ADMIN""#).unwrap();
+        assert!(
+            failed.ends_with("printed; uprobes need CAP_SYS_ADMIN"),
+            "{failed}"
+        );
     }
 }

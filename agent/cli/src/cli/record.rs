@@ -26,7 +26,6 @@ use ros2probe_daemon::recording::{
 use ros2probe_message::{Library, Sources as Places};
 
 use super::UserError;
-use super::notes::samples_shared_memory;
 use graph_cache::{GraphCache, locked};
 use keys::{Keys, read_keys};
 use output::{RecordingOutput, log, report};
@@ -216,10 +215,9 @@ impl Record {
         let recorder = Recorder::new(writer, filter, domain_id, before, sources);
         let mut recorder = self.begun(recorder);
         let is_live = self.target.replay.is_none();
-        let mut output = RecordingOutput::new(is_live.then(|| Arc::clone(&graph_cache)));
-        if is_live && samples_shared_memory(&agent) {
-            output.sampled(&recorder, &locked(&graph_cache).graph);
-        }
+        let live = is_live.then(|| (&agent, Arc::clone(&graph_cache)));
+        let mut output = RecordingOutput::new(live);
+        output.sampled(&recorder, &locked(&graph_cache).graph);
         let opened = samples.opened().topics.iter();
         recorder.declare(opened.filter_map(|topic| {
             let message_type = topic.types.first()?;

@@ -6,6 +6,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
+use ros2probe_api::inside::Inside;
 use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
@@ -98,6 +99,50 @@ fn a_chain_by_causality_takes_as_long_as_its_processes_say() -> Result<()> {
     }
     ensure!(chain.bottleneck == Some(0), "{chain:?}");
     Ok(())
+}
+
+/// Images of containers: each has a library of its own, which is in no usual place.
+const IMAGES: usize = 4;
+/// Time from the start of a process to its first call; rclcpp takes longer.
+const LOADING: Duration = Duration::from_millis(150);
+
+#[test]
+fn a_library_of_another_inode_is_observed_from_the_first_call_on() -> Result<()> {
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let agent = agent(&host, directory.path())?;
+    let mut images = Vec::new();
+    for image in 0..IMAGES {
+        let program = TracedProgram::build(248, &[])?;
+        let (node, topic) = (format!("node{image}"), format!("/topic{image}"));
+        let arguments = ["/in", &topic, &node];
+        let mut process = Process::start(&host.inside(), program.program(), arguments)?;
+        std::thread::sleep(LOADING);
+        process.write_line("init")?;
+        process.wait_for("init", PATIENCE)?;
+        process.write_line(&format!("publish {MESSAGES}"))?;
+        process.wait_for("publish", PATIENCE)?;
+        images.push((process, program));
+    }
+    agent.scrape_until("all processes are observed", |page| {
+        page.sum("ros2probe_inside_processes", &[]) >= IMAGES as f64
+    })?;
+    let socket = directory.path().join("api.sock");
+    let mut text = String::new();
+    wait_until("all messages and all names are known", || {
+        text = run(&format!("{RP} inside --json --socket {}", socket.display()))?;
+        let inside: Inside<'_> = serde_json::from_str(&text)?;
+        let is_known = |image| {
+            let (topic, node) = (format!("/topic{image}"), format!("/robot1/node{image}"));
+            inside.publishers.iter().any(|publisher| {
+                publisher.topic == topic
+                    && publisher.owner.node.as_deref() == Some(&*node)
+                    && publisher.published_messages == MESSAGES as u64
+            })
+        };
+        Ok((0..IMAGES).all(is_known))
+    })
+    .with_context(|| text.clone())
 }
 
 fn agent<'n>(host: &'n Namespace, directory: &Path) -> Result<Agent<'n>> {

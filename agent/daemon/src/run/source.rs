@@ -239,6 +239,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         dropped: None,
     }));
     let gone = live.gone();
+    let pending = live.pending();
     let counters = live.counters().unwrap_or_default();
     let value = |wanted: Counter| {
         counters
@@ -264,8 +265,10 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         refused_updates: live.refused_updates(),
         source_reason: live.without_host().map(str::to_owned),
         abilities: abilities(live),
+        on_demand: on_demand(live),
         blind: blind(live),
         gone,
+        pending,
         attached_anew: live.attached_anew(),
         pieces_dropped: value(Counter::PiecesLost),
         contended: value(Counter::Contended),
@@ -387,6 +390,15 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
         abilities.push(Ability::Inside);
     }
     abilities
+}
+
+/// Missing abilities that this source gains while a client needs them.
+fn on_demand(live: &LiveSource) -> Vec<Ability> {
+    let is_resting = live.exact().is_some_and(|facts| facts.is_resting);
+    is_resting
+        .then_some(Ability::SharedMemoryExact)
+        .into_iter()
+        .collect()
 }
 
 /// Reasons for missing abilities, if known.

@@ -138,7 +138,7 @@ impl Observer {
     /// Reports missing samples to the subscriptions.
     pub(super) fn report_missing(&mut self) {
         for missing in self.journal.take_missing() {
-            self.payloads.missing(&missing);
+            self.payloads.missing(&missing, self.clock);
         }
     }
 }

@@ -13,7 +13,7 @@ use ros2probe_testing::model::forge::Message;
 use ros2probe_testing::model::host::{
     ALICE, BOB, CapturePoint, Host, MILLISECOND, READER, START, WRITER,
 };
-use ros2probe_wire::record::kind;
+use ros2probe_wire::record::{flag, kind};
 use ros2probe_wire::{Guid, GuidPrefix, Record};
 
 fn request(host: &mut Host, depth: Depth) {
@@ -417,4 +417,122 @@ fn a_sample_before_the_announcement_never_repeated_is_unannounced() {
         }
         assert_eq!(dora.host.measurement().lost, 0);
     }
+}
+
+/// Messages in shared memory while uprobes take over from polling.
+struct Handover {
+    host: Host,
+    alice: CapturePoint,
+}
+
+impl Handover {
+    /// Starts with polled samples `1..=to`, 4 ms apart, of a writer without a waiting reader.
+    fn new(depth: Depth, to: u64) -> Self {
+        let mut host = Host::new();
+        host.writer(false);
+        let alice = host.reader(BOB, 7411);
+        let mut handover = Self { host, alice };
+        for number in 1..=to {
+            handover.polled(number);
+            handover.host.wait(4);
+            if number == 1 {
+                request(&mut handover.host, depth);
+                handover.host.observer.drain();
+            }
+        }
+        handover
+    }
+
+    fn polled(&mut self, number: u64) {
+        self.put(number, flag::SHM);
+    }
+
+    fn seen_in_its_process(&mut self, number: u64) {
+        self.put(number, flag::SHM | flag::EXACT);
+    }
+
+    fn put(&mut self, number: u64, flags: u16) {
+        let record = self.host.record(self.alice, kind::DATA, number);
+        self.host.put(Record {
+            flags,
+            socket: 0,
+            ..record
+        });
+    }
+}
+
+#[test]
+fn a_writer_keeps_its_order_and_its_times_while_breakpoints_attach() {
+    let mut handover = Handover::new(Depth::Arrivals, 2);
+    given(&mut handover.host);
+    // 3 was sent before the breakpoint was there, and is polled behind 4.
+    handover.seen_in_its_process(4);
+    handover.host.wait(1);
+    handover.seen_in_its_process(5);
+    assert_eq!(given(&mut handover.host), []);
+    handover.host.wait(1);
+    handover.polled(3);
+    handover.polled(4);
+    // Of the two views of 4, the first one counts. Times neither decrease nor jump to a later one.
+    assert_eq!(given(&mut handover.host), [(3, 10), (4, 10), (5, 10)]);
+    handover.host.wait(10);
+    handover.seen_in_its_process(6);
+    assert_eq!(given(&mut handover.host), [(6, 20)]);
+    assert_eq!(handover.host.measurement().messages, 6);
+}
+
+#[test]
+fn what_neither_view_saw_while_breakpoints_attach_is_named_once_and_holds_nothing_up_for_long() {
+    let mut handover = Handover::new(Depth::Arrivals, 2);
+    given(&mut handover.host);
+    for number in [5, 6, 7] {
+        handover.seen_in_its_process(number);
+        handover.host.wait(4);
+    }
+    assert_eq!(given(&mut handover.host), []);
+    handover.host.wait(500);
+    let (mut numbers, mut times, mut reported) = (Vec::new(), Vec::new(), Vec::new());
+    for dispatch in handover.host.observer.drain().samples {
+        match dispatch.outcome {
+            SampleOutcome::Sample(sample) => {
+                numbers.push(sample.sequence_number.0);
+                times.push((sample.time.0 - START) / MILLISECOND);
+            }
+            SampleOutcome::Missed(missed) => {
+                reported.push((missed.reason, missed.first.0, missed.last.0));
+            }
+        }
+    }
+    // They waited for nothing that a reader waits for, and have their own times.
+    assert_eq!((numbers, times), (vec![5, 6, 7], vec![8, 12, 16]));
+    assert_eq!(reported, [(MissedReason::NotCaptured, 3, 4)]);
+    handover.host.wait(10_000);
+    assert_eq!(missed(&mut handover.host), []);
+    assert_eq!(handover.host.measurement().lost, 0);
+}
+
+#[test]
+fn what_polling_noticed_only_after_a_subscription_began_is_not_missing_from_it() {
+    let mut handover = Handover::new(Depth::Arrivals, 1);
+    // 2 to 7 were sent before the subscription, and polling missed them.
+    handover.host.wait(600);
+    handover.seen_in_its_process(8);
+    handover.host.wait(4);
+    handover.seen_in_its_process(9);
+    handover.host.wait(1_000);
+    let dispatches = handover.host.observer.drain().samples;
+    let reported: Vec<_> = dispatches
+        .iter()
+        .filter(|dispatch| matches!(dispatch.outcome, SampleOutcome::Missed(_)))
+        .collect();
+    assert_eq!(dispatches.len() - reported.len(), 2, "{dispatches:?}");
+    assert!(reported.is_empty(), "{reported:?}");
+    // Later ones are.
+    handover.host.wait(20_000);
+    handover.polled(12);
+    handover.host.wait(1_000);
+    assert_eq!(
+        missed(&mut handover.host),
+        [(MissedReason::NotCaptured, 10, 11)]
+    );
 }

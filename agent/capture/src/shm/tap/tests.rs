@@ -492,3 +492,47 @@ fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_ot
     }
     assert_eq!(host.tap.segments.len(), MAX_SEGMENTS);
 }
+
+#[test]
+fn user_data_of_an_unknown_writer_is_no_announcement_and_its_participant_s_nodes_are() {
+    let mut host = Host::new();
+    let (mut port, mut segment) = (host.port(7411), host.segment(1));
+    host.poll_after(SECOND);
+    host.tap.take_discovery_seen();
+    let mut data = sample(1);
+    data[44..48].copy_from_slice(&[0, 0, 9, 3]);
+    let mut names = data.clone();
+    names.extend([9; 12]);
+    names.extend([0, 0, 1, 0xc1]);
+    for (message, announces) in [(data, false), (names, true)] {
+        port.push(segment.put(&message));
+        let found = host.find_after(MILLISECOND);
+        assert!(matches!(found[..], [Item::Message { .. }]), "{found:?}");
+        assert_eq!(host.tap.take_discovery_seen(), announces);
+    }
+}
+
+#[test]
+fn an_urgent_poll_reads_a_few_ports_and_the_next_ones_read_the_others() {
+    let mut host = Host::new();
+    let mut segment = host.segment(1);
+    let mut ports: Vec<_> = (0..24).map(|index| host.port(7411 + 2 * index)).collect();
+    host.poll_after(SECOND);
+    host.tap.is_hurried = true;
+    for round in 1..=5 {
+        for (port, number) in ports.iter_mut().zip(100 * round..) {
+            port.push(segment.put(&sample(number)));
+        }
+        let mut found = Vec::new();
+        for _ in 0..24 / PORTS_PER_URGENT_POLL {
+            let few = host.poll_after(1);
+            assert_eq!(few.len(), PORTS_PER_URGENT_POLL);
+            found.extend(few);
+        }
+        found.sort_unstable();
+        assert_eq!(
+            found,
+            (100 * round..).take(24).map(u64::from).collect::<Vec<_>>()
+        );
+    }
+}

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::anyhow;
-use ros2probe::client::Outcome;
+use ros2probe::client::{Agent, Outcome};
 use ros2probe_api::participants::UnknownWriter;
 use ros2probe_api::recordings::FilterOptions;
 use ros2probe_daemon::escape::visible;
@@ -16,7 +16,7 @@ use ros2probe_daemon::recording::{
     Activity, Finished, GraphSnapshot, Recorder, shortfalls, unobserved_lines,
 };
 
-use super::super::notes::{SILENT, is_sampled, sampled};
+use super::super::notes::{SILENT, Sampling, is_sampled};
 use super::graph_cache::{GraphCache, locked};
 
 /// Interval at which writers without a known topic are requested, and at which they are reported
@@ -31,6 +31,9 @@ const INCOMPLETE: u8 = 3;
 pub(super) struct RecordingOutput<'a> {
     /// Source of reasons for silent topics, if available.
     graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>,
+    /// The agent of a live recording.
+    agent: Option<&'a Agent>,
+    sampling: Sampling,
     begun: Instant,
     sampled: BTreeSet<String>,
     topics: usize,
@@ -109,10 +112,14 @@ fn may_record_more(options: &FilterOptions, is_known: impl Fn(&str) -> bool) -> 
 }
 
 impl<'a> RecordingOutput<'a> {
-    pub(super) fn new(graph_cache: Option<Arc<Mutex<GraphCache<'a>>>>) -> Self {
+    /// `live`: the agent of a live recording, and its facts.
+    pub(super) fn new(live: Option<(&'a Agent, Arc<Mutex<GraphCache<'a>>>)>) -> Self {
+        let (agent, graph_cache) = live.unzip();
         Self {
             unknown_writers: UnknownWriters::new(graph_cache.clone()),
             graph_cache,
+            agent,
+            sampling: agent.map_or(Sampling::Nothing, Sampling::at),
             begun: Instant::now(),
             sampled: BTreeSet::new(),
             topics: 0,
@@ -151,11 +158,14 @@ impl<'a> RecordingOutput<'a> {
     pub(super) fn sampled(&mut self, recorder: &Recorder<'_>, graph: &GraphSnapshot) {
         let topics = graph.topics.iter();
         let topics = topics.filter(|topic| is_sampled(topic) && recorder.takes(topic));
-        self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
+        if matches!(self.sampling, Sampling::Sampled(_)) {
+            self.print_sampled(topics.map(|topic| topic.name.clone()).collect());
+        }
     }
 
     fn print_sampled(&mut self, topics: Vec<String>) {
-        if let Some(text) = sampled(&topics, "not every message will be in the bag") {
+        let consequence = "not every message will be in the bag";
+        if let Some(text) = self.sampling.text(&topics, consequence) {
             self.clear();
             log("WARN", &text);
         }
@@ -196,8 +206,15 @@ impl<'a> RecordingOutput<'a> {
             self.clear();
             log("WARN", &text);
         }
-        let new = recorder.sampled().difference(&self.sampled);
-        self.print_sampled(new.cloned().collect());
+        let new: Vec<_> = recorder
+            .sampled()
+            .difference(&self.sampled)
+            .cloned()
+            .collect();
+        let is_known = |agent| self.sampling.is_known(agent, self.begun);
+        if !new.is_empty() && self.agent.is_none_or(is_known) {
+            self.print_sampled(new);
+        }
         let report = recorder.report();
         if report.topics.len() > self.topics {
             self.clear();

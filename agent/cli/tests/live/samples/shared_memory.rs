@@ -73,6 +73,59 @@ fn on_demand_every_sample_is_seen_and_the_last_reader_removes_the_breakpoint() -
     observed.wait_for_view("sampled")
 }
 
+/// A best-effort writer has no reader that waits for a lower number. While it sends, polling ends
+/// and breakpoints begin.
+#[test]
+fn while_breakpoints_attach_samples_keep_their_order_and_none_is_missing_unnamed() -> Result<()> {
+    let host = Host::with_its_own_fast_dds()?;
+    let observed = host.observe("exact: auto")?;
+    let stream = Stream {
+        rate: 250.0,
+        reliable: false,
+        ..in_shared_memory(320, 1500)
+    };
+    let (mut publisher, _subscriber) = host.known_pair(&observed, &stream)?;
+    publisher.go()?;
+    std::thread::sleep(Duration::from_secs(1));
+    let client = observed.client()?;
+    let mut lines = open(&client, "topic=/points&payload=true", "/points")?;
+    let (mut numbers, mut times, mut missed) = (Vec::new(), Vec::new(), Vec::new());
+    while numbers.last() != Some(&stream.count) {
+        let line = match lines.line_within(PATIENCE)? {
+            Next::Line(line) => line,
+            Next::End => bail!("the stream ended"),
+            Next::Nothing => bail!("not even a clock"),
+        };
+        match serde_json::from_slice(&line)? {
+            Line::Sample(sample) => {
+                lines.bytes(sample.payload_bytes.context("no payload")? as usize)?;
+                numbers.push(sample.sequence_number);
+                times.push(sample.time_ns);
+            }
+            Line::Missed(facts) => {
+                missed.extend(facts.first_sequence_number..=facts.last_sequence_number);
+            }
+            _ => {}
+        }
+    }
+    ensure!(numbers.is_sorted(), "{numbers:?}");
+    ensure!(times.is_sorted(), "{times:?}");
+    println!(
+        "{} samples from {}, missed {missed:?}",
+        numbers.len(),
+        numbers[0]
+    );
+    // Samples that arrived and missing ones that are named are together those that were sent.
+    let first = numbers[0];
+    numbers.extend(missed);
+    numbers.sort_unstable();
+    ensure!(
+        numbers.iter().copied().eq(first..=stream.count),
+        "{numbers:?}"
+    );
+    Ok(())
+}
+
 /// A host with its own `/dev/shm`.
 struct Host {
     network: Namespace,

@@ -177,6 +177,7 @@ fn abilities(agent: &AgentFacts) -> Vec<health::Ability> {
         health::Ability {
             ability: ability.label().into(),
             able: agent.abilities.contains(&ability),
+            on_demand: agent.on_demand.contains(&ability),
             reason: reason.map(|(_, reason)| reason.clone()),
         }
     };

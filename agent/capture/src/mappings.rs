@@ -1,0 +1,290 @@
+//! Notices which processes map a library, at that moment.
+//!
+//! The kernel writes a record for each executable mapping of every process into a ring for each CPU
+//! (`PERF_RECORD_MMAP`, perf_event_open(2)). It needs the privileges of uprobes, and changes nothing
+//! in the processes. Processes are identified as in the agent's PID namespace.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::os::fd::{AsFd, AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
+use std::ptr::{self, NonNull};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use crate::error_chain::in_words;
+
+/// Pause after mappings of other files: a machine that starts programs without end costs little.
+pub const UNCONCERNED: Duration = Duration::from_millis(2);
+
+/// Pages of records in each ring, a power of two: some 250 mappings, about two starts of a node.
+const PAGES: usize = 8;
+/// Most CPUs with a ring.
+const MAX_CPUS: usize = 1024;
+/// Offsets in the ring's first page, `struct perf_event_mmap_page`.
+const HEAD: usize = 1024;
+const TAIL: usize = 1032;
+/// `PERF_TYPE_SOFTWARE` and `PERF_COUNT_SW_DUMMY`: an event that never occurs.
+const SOFTWARE: u64 = 1;
+const DUMMY: u64 = 9;
+/// Bits of `struct perf_event_attr`: records of executable mappings, and a wake-up after some bytes.
+const RECORD_MAPPINGS: u64 = 1 << 8;
+const WAKE_BY_BYTES: u64 = 1 << 14;
+/// `PERF_FLAG_FD_CLOEXEC`.
+const CLOSE_ON_EXEC: libc::c_ulong = 1 << 3;
+/// Types of records.
+const MAPPED: u32 = 1;
+const LOST: u32 = 2;
+/// Bytes of a record before the name of the mapped file: the header, two ids, three numbers.
+const BEFORE_NAME: usize = 40;
+/// Most bytes of a record: its length has 16 bits.
+const MAX_RECORD: usize = u16::MAX as usize;
+
+/// The rings of all CPUs.
+pub struct MappingEvents {
+    rings: Vec<Ring>,
+    record: Vec<u8>,
+}
+
+/// Processes that mapped a library since the last call.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct NewMappings {
+    /// Ids of the processes.
+    pub processes: BTreeSet<u32>,
+    /// Whether the kernel had no room for some records, so that processes may be missing.
+    pub is_incomplete: bool,
+}
+
+impl MappingEvents {
+    /// Opens a ring for each CPU that is online.
+    ///
+    /// # Errors
+    /// Fails without the privileges, or if the kernel has no such events.
+    pub fn open() -> io::Result<Self> {
+        let online = fs::read_to_string("/sys/devices/system/cpu/online")?;
+        let rings = cpus(&online).take(MAX_CPUS).map(Ring::open);
+        Ok(Self {
+            rings: rings.collect::<io::Result<_>>()?,
+            record: Vec::new(),
+        })
+    }
+
+    /// Opens the rings for the configuration key `key`. Without them, its thread finds a library at
+    /// its next round.
+    #[must_use]
+    pub fn open_or_warn(key: &str) -> Option<Self> {
+        let opened = Self::open();
+        if let Err(error) = &opened {
+            let reason = in_words(error);
+            tracing::warn!(
+                reason,
+                "{key}: a library outside of the usual places is attached up to a second late"
+            );
+        }
+        opened.ok()
+    }
+
+    /// Returns descriptors that are readable when a process mapped a file.
+    pub fn descriptors(&self) -> impl Iterator<Item = BorrowedFd<'_>> {
+        self.rings.iter().map(|ring| ring.event.as_fd())
+    }
+
+    /// Takes all records. `is_library`: whether a file of this name is of interest.
+    pub fn take(&mut self, is_library: impl Fn(&str) -> bool) -> NewMappings {
+        let mut new = NewMappings::default();
+        for ring in &self.rings {
+            ring.take(&mut self.record, |kind, record| match kind {
+                MAPPED => new.processes.extend(process(record, &is_library)),
+                LOST => new.is_incomplete = true,
+                _ => {}
+            });
+        }
+        new
+    }
+}
+
+/// The ring of one CPU.
+struct Ring {
+    event: OwnedFd,
+    start: NonNull<u8>,
+    /// Bytes of a page, and of all records.
+    page: usize,
+    size: usize,
+}
+
+// SAFETY: the mapping is owned, and accessed only through this value; it is bound to no thread.
+unsafe impl Send for Ring {}
+
+impl Ring {
+    fn open(cpu: i32) -> io::Result<Self> {
+        // The first 64 bytes of `struct perf_event_attr`, PERF_ATTR_SIZE_VER0: type and size, config,
+        // period, types of samples and of reads, flags, bytes before a wake-up, address.
+        let attributes: [u64; 8] = [
+            SOFTWARE | 64 << 32,
+            DUMMY,
+            0,
+            0,
+            0,
+            RECORD_MAPPINGS | WAKE_BY_BYTES,
+            1,
+            0,
+        ];
+        let (every_process, no_group): (libc::pid_t, libc::c_int) = (-1, -1);
+        // SAFETY: `attributes` has the size that it states, and outlives the call.
+        let descriptor = unsafe {
+            libc::syscall(
+                libc::SYS_perf_event_open,
+                attributes.as_ptr(),
+                every_process,
+                cpu,
+                no_group,
+                CLOSE_ON_EXEC,
+            )
+        };
+        let descriptor = i32::try_from(descriptor).unwrap_or(-1);
+        if descriptor < 0 {
+            return Err(io::Error::last_os_error());
+        }
+        // SAFETY: a new descriptor without another owner.
+        let event = unsafe { OwnedFd::from_raw_fd(descriptor) };
+        // SAFETY: sysconf accesses no memory of this process.
+        let page = unsafe { libc::sysconf(libc::_SC_PAGESIZE) };
+        let page = usize::try_from(page).map_err(io::Error::other)?;
+        // SAFETY: a new mapping at an address of the kernel's choice touches no memory in use.
+        let start = unsafe {
+            libc::mmap(
+                ptr::null_mut(),
+                page * (1 + PAGES),
+                libc::PROT_READ | libc::PROT_WRITE,
+                libc::MAP_SHARED,
+                event.as_raw_fd(),
+                0,
+            )
+        };
+        if start == libc::MAP_FAILED {
+            return Err(io::Error::last_os_error());
+        }
+        let start = NonNull::new(start.cast()).ok_or(io::ErrorKind::InvalidData)?;
+        Ok(Self {
+            event,
+            start,
+            page,
+            size: page * PAGES,
+        })
+    }
+
+    /// Passes the type and the bytes of each new record, and frees its place.
+    fn take(&self, record: &mut Vec<u8>, mut with: impl FnMut(u32, &[u8])) {
+        let head = self.position(HEAD).load(Ordering::Acquire);
+        let mut tail = self.position(TAIL).load(Ordering::Relaxed);
+        while tail < head {
+            let mut header = [0; 8];
+            self.copy(tail, &mut header);
+            let [a, b, c, d, _, _, e, f] = header;
+            let (kind, length) = (u32::from_ne_bytes([a, b, c, d]), u16::from_ne_bytes([e, f]));
+            record.resize(usize::from(length).min(MAX_RECORD), 0);
+            self.copy(tail, record);
+            with(kind, record);
+            // A length of 0 would never end.
+            tail += u64::from(length).max(8);
+        }
+        self.position(TAIL).store(tail, Ordering::Release);
+    }
+
+    /// Copies bytes that the kernel has written and not yet been given back.
+    fn copy(&self, from: u64, into: &mut [u8]) {
+        let size = self.size as u64;
+        for (offset, byte) in (from..).zip(into) {
+            let place = self.page + usize::try_from(offset % size).unwrap_or(0);
+            let place = self.start.as_ptr().wrapping_add(place);
+            // SAFETY: the place is in the mapping, behind its first page. The kernel writes only
+            // behind the head.
+            *byte = unsafe { place.read() };
+        }
+    }
+
+    /// Returns one of the positions in the first page.
+    fn position(&self, offset: usize) -> &AtomicU64 {
+        let place = self.start.as_ptr().wrapping_add(offset).cast();
+        // SAFETY: both are in the first page, aligned to eight bytes, and changed by the kernel and
+        // by this value only, as the protocol prescribes.
+        unsafe { AtomicU64::from_ptr(place) }
+    }
+}
+
+impl Drop for Ring {
+    fn drop(&mut self) {
+        // SAFETY: mapped by `open` with this length, and no borrow of it is left.
+        unsafe { libc::munmap(self.start.as_ptr().cast(), self.page + self.size) };
+    }
+}
+
+/// Returns the process of a record, if the mapped file is of interest.
+fn process(record: &[u8], is_library: impl Fn(&str) -> bool) -> Option<u32> {
+    let process = record.get(8..12)?.try_into().ok().map(u32::from_ne_bytes)?;
+    let path = record.get(BEFORE_NAME..)?.split(|byte| *byte == 0).next()?;
+    let name = path.rsplit(|byte| *byte == b'/').next()?;
+    // The kernel gives no id to a process outside of the agent's PID namespace.
+    let is_known = process != 0 && process != u32::MAX;
+    (is_known && is_library(std::str::from_utf8(name).ok()?)).then_some(process)
+}
+
+/// Returns the numbers of a list such as `0-3,5`.
+fn cpus(list: &str) -> impl Iterator<Item = i32> {
+    list.trim().split(',').flat_map(|range| {
+        let (first, last) = range.split_once('-').unwrap_or((range, range));
+        let ends = first.parse().ok().zip(last.parse().ok());
+        ends.into_iter().flat_map(|(first, last)| first..=last)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::{Duration, Instant};
+
+    use super::*;
+    use crate::system::wait;
+
+    #[test]
+    fn cpus_are_those_of_the_list() {
+        assert_eq!(cpus("0-3,5\n").collect::<Vec<_>>(), [0, 1, 2, 3, 5]);
+        assert_eq!(cpus("0\n").collect::<Vec<_>>(), [0]);
+        assert_eq!(cpus("").count(), 0);
+    }
+
+    #[test]
+    fn a_record_that_is_cut_off_names_no_process() {
+        let mut record = [0; 64];
+        record[8..12].copy_from_slice(&7_u32.to_ne_bytes());
+        record[BEFORE_NAME..BEFORE_NAME + 9].copy_from_slice(b"/l/lib.so");
+        let is_library = |name: &str| name == "lib.so";
+        assert_eq!(process(&record, is_library), Some(7));
+        for end in 0..BEFORE_NAME + 9 {
+            assert_eq!(process(&record[..end], is_library), None);
+        }
+        record[8..12].copy_from_slice(&[0; 4]);
+        assert_eq!(process(&record, is_library), None);
+    }
+
+    #[test]
+    fn a_process_that_maps_a_library_is_noticed_at_once_and_others_are_not() {
+        let mut events = MappingEvents::open()
+            .expect("records of all processes need root: run the tests with sudo");
+        let is_library = |name: &str| name.starts_with("libc.so") || name.starts_with("libc-");
+        events.take(is_library);
+        // More starts than a ring has room for.
+        for _ in 0..50 {
+            let mut child = std::process::Command::new("true").spawn().unwrap();
+            let began = Instant::now();
+            let mut found = false;
+            while !found && began.elapsed() < Duration::from_secs(20) {
+                let descriptors: Vec<_> = events.descriptors().collect();
+                wait(&descriptors, Duration::from_millis(100)).unwrap();
+                found = events.take(is_library).processes.contains(&child.id());
+            }
+            child.wait().unwrap();
+            assert!(found, "{}", child.id());
+        }
+        assert_eq!(events.take(|_| false).processes, BTreeSet::new());
+    }
+}
