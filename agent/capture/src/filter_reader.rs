@@ -10,11 +10,11 @@ use std::os::fd::BorrowedFd;
 use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 use ros2probe_wire::walk::Envelope;
-use ros2probe_wire::{Reason, Record};
+use ros2probe_wire::{Reason, Record, Timestamp};
 
 use super::filter::Filter;
 use super::piece_assembler::PieceAssembler;
-use super::reorder_buffer::{Next, ReorderBuffer};
+use super::reorder_buffer::{Next, ReorderBuffer, Segment};
 use super::system::Clocks;
 use super::zenoh::{Chunk, Streams};
 use ros2probe_model::input::Input;
@@ -89,12 +89,17 @@ impl FilterReader {
         self.take_stalled(stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
         let settled = settled.min(recorded).min(captured);
-        while !deliver(&mut self.order, clocks, settled, observer, RECORDS_BETWEEN) {
+        loop {
+            let waiting = (&mut self.order, &mut self.streams);
+            if deliver(waiting, clocks, settled, observer, RECORDS_BETWEEN) {
+                break;
+            }
             self.take_records();
         }
         self.pieces.advance(clocks.monotonic);
+        let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(clocks.now, |report| observer.input(Input::Zenoh(report)));
+            .advance(now, |report| observer.input(Input::Zenoh(report)));
     }
 
     /// Passes everything that still waits to the model, at the end.
@@ -102,7 +107,8 @@ impl FilterReader {
         self.take_records();
         self.take_datagrams(clocks, u64::MAX, observer);
         self.take_stalled(clocks.monotonic);
-        deliver(&mut self.order, clocks, u64::MAX, observer, usize::MAX);
+        let waiting = (&mut self.order, &mut self.streams);
+        deliver(waiting, clocks, u64::MAX, observer, usize::MAX);
     }
 
     /// Returns the kernel programs' maps.
@@ -182,7 +188,8 @@ impl FilterReader {
     fn take_datagrams(&mut self, clocks: &Clocks, before: u64, observer: &mut Observer) -> u64 {
         while let Some((piece, bytes)) = self.fresh.pop_front_if(|(piece, _)| piece.time <= before)
         {
-            decode_datagram(&piece, &bytes, clocks, &mut self.order, observer);
+            let waiting = (&mut self.order, &mut self.streams);
+            decode_datagram(&piece, &bytes, clocks, waiting, observer);
         }
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
@@ -211,8 +218,9 @@ impl FilterReader {
                     });
                     continue;
                 }
-                self.streams
-                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+                if let Some(oldest) = self.order.segment(piece.time, &chunk) {
+                    read_segment(&mut self.streams, &oldest, observer);
+                }
                 continue;
             }
             let Some((piece, bytes)) = self.pieces.piece(&piece, bytes) else {
@@ -220,7 +228,8 @@ impl FilterReader {
             };
             self.datagrams += 1;
             if piece.time <= before && self.fresh.is_empty() {
-                decode_datagram(&piece, &bytes, clocks, &mut self.order, observer);
+                let waiting = (&mut self.order, &mut self.streams);
+                decode_datagram(&piece, &bytes, clocks, waiting, observer);
                 continue;
             }
             // Queued behind those that wait: overtaking them would let a sample count by duplicate
@@ -231,32 +240,43 @@ impl FilterReader {
     }
 }
 
-/// Passes records up to `until` to the model, at most this many; returns whether that was all.
+/// Passes records and segments up to `until` to the model, at most this many; returns whether that
+/// was all.
 fn deliver(
-    order: &mut ReorderBuffer,
+    (order, streams): (&mut ReorderBuffer, &mut Streams),
     clocks: &Clocks,
     until: u64,
     observer: &mut Observer,
     most: usize,
 ) -> bool {
     for _ in 0..most {
-        let next = order.next(clocks, until);
-        let Some(Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) = next else {
-            return true;
-        };
-        observer.input(Input::Record(&record));
+        match order.next(clocks, until) {
+            Some(Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) => {
+                observer.input(Input::Record(&record));
+            }
+            Some(Next::Segment(segment)) => read_segment(streams, &segment, observer),
+            None => return true,
+        }
     }
     false
+}
+
+/// Reads a segment of Zenoh, and passes what it completes to the model.
+fn read_segment(streams: &mut Streams, segment: &Segment, observer: &mut Observer) {
+    streams.chunk(&segment.chunk(), |report| {
+        observer.input(Input::Zenoh(report));
+    });
 }
 
 fn decode_datagram(
     piece: &Piece,
     bytes: &[u8],
     clocks: &Clocks,
-    order: &mut ReorderBuffer,
+    (order, streams): (&mut ReorderBuffer, &mut Streams),
     observer: &mut Observer,
 ) {
-    deliver(order, clocks, piece.time, observer, usize::MAX);
+    let waiting = (&mut *order, streams);
+    deliver(waiting, clocks, piece.time, observer, usize::MAX);
     let envelope = Envelope {
         time: clocks.calendar(piece.time).0,
         destination: zerocopy::transmute!(piece.destination),

@@ -11,6 +11,9 @@
 //!
 //! While a uprobe sees messages in their senders, records from polling shared memory wait here, too.
 //! A message is polled after it was sent, so its own record comes first.
+//!
+//! Segments of Zenoh wait with the records, since the model's clock is that of the records. What
+//! they contain is read at their turn.
 
 use std::collections::{HashSet, VecDeque};
 
@@ -21,12 +24,15 @@ use ros2probe_wire::record::{Body, flag};
 use ros2probe_wire::walk::Envelope;
 
 use super::system::Clocks;
+use super::zenoh::Chunk;
 
 /// Most waiting records of captured datagrams: some 2.5 MB. A malicious datagram has two thousand
 /// records.
 const MAX_WALKED: usize = 16_384;
 /// Most waiting records of polled messages: some 2 MB, as many as the polling thread keeps.
 const MAX_POLLED: usize = 16_384;
+/// Most bytes of waiting segments of Zenoh.
+const MAX_SEGMENT_BYTES: usize = 8 << 20;
 /// Capacity for records that is kept while none wait; memory beyond it is freed after a burst.
 const KEPT: usize = 512;
 /// How much later than the report of its drop a captured datagram may be read.
@@ -42,6 +48,8 @@ pub struct ReorderBuffer {
     walked: VecDeque<Walked>,
     /// Records of polled messages, with the time in the kernel's clock.
     polled: VecDeque<(u64, Record)>,
+    segments: VecDeque<Segment>,
+    segment_bytes: usize,
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
     undelivered: VecDeque<(u64, u32)>,
     undelivered_tokens: HashSet<u32>,
@@ -60,8 +68,17 @@ struct Walked {
     no_room_said: bool,
 }
 
-/// The next record in order, with its time in the wall clock.
-#[derive(Clone, Copy, Debug)]
+/// A segment of a connection of Zenoh, or a part of one.
+#[derive(Debug)]
+pub struct Segment {
+    /// Its time in the kernel's clock.
+    at: u64,
+    chunk: Chunk<'static>,
+    bytes: Box<[u8]>,
+}
+
+/// The next record or segment in order, with its time in the wall clock.
+#[derive(Debug)]
 pub enum Next {
     /// Written by the kernel program.
     Kernel(Record),
@@ -69,6 +86,23 @@ pub enum Next {
     Walked(Record),
     /// Polled in shared memory.
     Polled(Record),
+    /// Of a connection of Zenoh.
+    Segment(Segment),
+}
+
+impl Segment {
+    /// Returns the segment with its bytes.
+    #[must_use]
+    pub fn chunk(&self) -> Chunk<'_> {
+        Chunk {
+            bytes: &self.bytes,
+            ..self.chunk
+        }
+    }
+
+    const fn size(&self) -> usize {
+        size_of::<Self>() + self.bytes.len()
+    }
 }
 
 impl ReorderBuffer {
@@ -112,6 +146,29 @@ impl ReorderBuffer {
         }
         self.polled.push_back((at, record));
         None
+    }
+
+    /// Accepts a segment of Zenoh, with its time in the wall clock and the same time in the kernel's
+    /// clock as `at`; returns the oldest one if too many bytes wait.
+    #[must_use]
+    pub fn segment(&mut self, at: u64, chunk: &Chunk<'_>) -> Option<Segment> {
+        let segment = Segment {
+            at,
+            chunk: chunk.without_bytes(),
+            bytes: chunk.bytes.into(),
+        };
+        self.segment_bytes += segment.size();
+        self.segments.push_back(segment);
+        if self.segment_bytes > MAX_SEGMENT_BYTES {
+            return self.take_segment();
+        }
+        None
+    }
+
+    fn take_segment(&mut self) -> Option<Segment> {
+        let segment = self.segments.pop_front()?;
+        self.segment_bytes = self.segment_bytes.saturating_sub(segment.size());
+        Some(segment)
     }
 
     /// Passes the announcements in a captured datagram to the model. The datagram's records of user
@@ -176,14 +233,15 @@ impl ReorderBuffer {
         self.kernel.len() + self.socket_full.len()
     }
 
-    /// Removes and returns the oldest record, if it is not younger than `until` in the kernel's
+    /// Removes and returns the oldest record or segment, if it is not younger than `until` in the kernel's
     /// clock.
     pub fn next(&mut self, clocks: &Clocks, until: u64) -> Option<Next> {
         let kernel = self.kernel.front().map(|record| record.time);
         let walked = self.walked.front().map(|walked| walked.at);
         let polled = self.polled.front().map(|(at, _)| *at);
         let socket_full = self.socket_full.front().map(|record| record.time);
-        let queues = [kernel, walked, polled, socket_full];
+        let segment = self.segments.front().map(|segment| segment.at);
+        let queues = [kernel, walked, polled, socket_full, segment];
         let oldest = queues.into_iter().flatten().min();
         if oldest.is_none_or(|oldest| oldest > until) {
             self.forget_undelivered(until);
@@ -199,6 +257,13 @@ impl ReorderBuffer {
         }
         if kernel == oldest {
             return self.kernel.pop_front().map(of_kernel);
+        }
+        if segment == oldest {
+            let mut segment = self.take_segment()?;
+            if clocks.step != 0 {
+                segment.chunk.time = clocks.calendar(segment.at);
+            }
+            return Some(Next::Segment(segment));
         }
         if walked != oldest {
             let (at, mut record) = self.polled.pop_front()?;
@@ -239,6 +304,9 @@ impl ReorderBuffer {
         if self.polled.is_empty() && self.polled.capacity() > KEPT {
             self.polled = VecDeque::new();
         }
+        if self.segments.is_empty() && self.segments.capacity() > KEPT {
+            self.segments = VecDeque::new();
+        }
     }
 
     /// Forgets reports older than a second before `until`, whose records have arrived.
@@ -252,10 +320,12 @@ impl ReorderBuffer {
 
 #[cfg(test)]
 mod tests {
+    use ros2probe_model::zenoh::StreamId;
     use ros2probe_wire::Timestamp;
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::zenoh::Before;
     use ros2probe_wire::time::MILLISECOND;
 
     const SETTLE: u64 = 80 * MILLISECOND;
@@ -310,7 +380,10 @@ mod tests {
     fn numbers(order: &mut ReorderBuffer, clocks: &Clocks) -> Vec<i64> {
         std::iter::from_fn(|| order.next(clocks, clocks.monotonic.saturating_sub(SETTLE)))
             .map(|next| {
-                let (Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) = next;
+                let (Next::Kernel(record) | Next::Walked(record) | Next::Polled(record)) = next
+                else {
+                    panic!("{next:?}")
+                };
                 let age = clocks.now.nanoseconds_since(Timestamp(record.time));
                 assert!(age >= SETTLE.cast_signed(), "{age}");
                 let number = record.sequence_number.cast_signed();
@@ -431,6 +504,69 @@ mod tests {
         while order.next(&clocks(900), 900 * MILLISECOND).is_some() {}
         assert!(order.kernel.capacity() <= KEPT);
         assert!(order.walked.capacity() <= KEPT);
+    }
+
+    fn segment(number: u32, milliseconds: u64, bytes: &[u8]) -> (u64, Chunk<'_>) {
+        let clocks = clocks(milliseconds);
+        let chunk = Chunk {
+            time: clocks.now,
+            stream: StreamId::default(),
+            sequence_number: number,
+            syn: false,
+            end: false,
+            is_boundary: true,
+            before: Before::Unknown,
+            bytes,
+            length: 4,
+        };
+        (clocks.monotonic, chunk)
+    }
+
+    #[test]
+    fn segments_of_zenoh_are_not_ahead_of_records() {
+        let mut order = ReorderBuffer::default();
+        for (number, milliseconds) in [(1, 10), (2, 30), (3, 110)] {
+            let (at, chunk) = segment(number, milliseconds, b"four");
+            assert!(order.segment(at, &chunk).is_none());
+        }
+        order.kernel(of_the_kernel(9, 20));
+        walked(&mut order, captured(10, 40));
+        let clocks = clocks(150);
+        let mut numbers = Vec::new();
+        while let Some(next) = order.next(&clocks, clocks.monotonic - SETTLE) {
+            numbers.push(match next {
+                Next::Kernel(record) | Next::Walked(record) => record.sequence_number,
+                Next::Segment(segment) => {
+                    let chunk = segment.chunk();
+                    let age = clocks.now.nanoseconds_since(chunk.time);
+                    assert!(age >= SETTLE.cast_signed() && chunk.bytes == b"four");
+                    chunk.sequence_number.into()
+                }
+            });
+        }
+        assert_eq!(numbers, [1, 9, 2, 10]);
+        assert_eq!(order.segments.len(), 1);
+    }
+
+    #[test]
+    fn segments_beyond_the_cap_are_passed_on_before_their_turn_in_their_order() {
+        let mut order = ReorderBuffer::default();
+        let bytes = vec![0; 10_000];
+        let mut early = Vec::new();
+        for number in 0..1000 {
+            let (at, chunk) = segment(number, 1, &bytes);
+            let passed = order.segment(at, &chunk);
+            early.extend(passed.map(|passed| passed.chunk().sequence_number));
+            assert!(order.segment_bytes <= MAX_SEGMENT_BYTES);
+        }
+        let count = u32::try_from(early.len()).unwrap();
+        assert!(
+            count > 100 && early == Vec::from_iter(0..count),
+            "{early:?}"
+        );
+        let clocks = clocks(900);
+        while order.next(&clocks, clocks.monotonic).is_some() {}
+        assert_eq!((order.segment_bytes, order.segments.capacity()), (0, 0));
     }
 
     #[test]

@@ -17,7 +17,7 @@ use ros2probe_wire::{Reason, Record, Timestamp, WireError};
 use super::filter::{Filter, FilterError, FilterSettings, ports};
 use super::interfaces::{Change, Interface, Interfaces, InterfacesError, Selection};
 use super::reattach::{Identity, identity};
-use super::reorder_buffer::{Next, ReorderBuffer};
+use super::reorder_buffer::{Next, ReorderBuffer, Segment as Waiting};
 use super::ring::{self, Ring, RingError, RingFrame};
 use super::system::Clocks;
 use super::zenoh::{Chunk, Streams, flow, flow_of};
@@ -208,7 +208,7 @@ impl WireTap {
         let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
         self.frames.take_stalled(&mut self.filter, stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
-        self.frames.deliver(clocks, settled, observer);
+        self.frames.deliver(clocks, settled, at_sockets, observer);
         self.frames.advance(clocks, observer);
         Ok(())
     }
@@ -217,7 +217,7 @@ impl WireTap {
     pub fn drain(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.frames.take_records(&mut self.filter);
         self.frames.take_stalled(&mut self.filter, clocks.monotonic);
-        self.frames.deliver(clocks, u64::MAX, observer);
+        self.frames.deliver(clocks, u64::MAX, None, observer);
     }
 
     /// Returns the kernel filter.
@@ -412,13 +412,23 @@ impl FrameAssembly {
         }
     }
 
-    /// Passes the records up to a time of the filter's clock to the model.
-    fn deliver(&mut self, clocks: &Clocks, until: u64, observer: &mut Observer) {
+    /// Passes the records and segments up to a time of the filter's clock to the model.
+    fn deliver(
+        &mut self,
+        clocks: &Clocks,
+        until: u64,
+        at_sockets: Option<&Streams>,
+        observer: &mut Observer,
+    ) {
         while let Some(next) = self.order.next(clocks, until) {
             let record = match next {
                 Next::Kernel(record) => record,
                 Next::Walked(record) | Next::Polled(record) => {
                     observer.input(Input::Record(&record));
+                    continue;
+                }
+                Next::Segment(segment) => {
+                    self.read_segment(&segment, at_sockets, observer);
                     continue;
                 }
             };
@@ -441,8 +451,24 @@ impl FrameAssembly {
     fn advance(&mut self, clocks: &Clocks, observer: &mut Observer) {
         self.ahead.advance(clocks.now);
         self.reassembly.advance(clocks.now);
+        let now = Timestamp(clocks.now.0.saturating_sub(SETTLE_NANOSECONDS));
         self.streams
-            .advance(clocks.now, |report| observer.input(Input::Zenoh(report)));
+            .advance(now, |report| observer.input(Input::Zenoh(report)));
+    }
+
+    /// Reads a segment of Zenoh, and passes what it completes to the model.
+    fn read_segment(
+        &mut self,
+        segment: &Waiting,
+        at_sockets: Option<&Streams>,
+        observer: &mut Observer,
+    ) {
+        let chunk = segment.chunk();
+        if at_sockets.is_some_and(|streams| streams.follows_flow(&chunk.stream.flow)) {
+            return;
+        }
+        self.streams
+            .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
     }
 
     fn frame(
@@ -456,7 +482,7 @@ impl FrameAssembly {
         let time = clocks.stamped(captured.time);
         let since = time.nanoseconds_since(clocks.now);
         let at = clocks.monotonic.saturating_add_signed(since);
-        self.deliver(clocks, at, observer);
+        self.deliver(clocks, at, at_sockets, observer);
         let packet = frame::parse_cooked(
             captured.protocol,
             captured.packet_type,
@@ -519,8 +545,9 @@ impl FrameAssembly {
                     return Ok(());
                 }
                 let chunk = Chunk::of_segment(segment, time, stream);
-                self.streams
-                    .chunk(&chunk, |report| observer.input(Input::Zenoh(report)));
+                if let Some(oldest) = self.order.segment(at, &chunk) {
+                    self.read_segment(&oldest, at_sockets, observer);
+                }
             }
             Payload::Other(_) => {}
         }

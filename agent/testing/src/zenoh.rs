@@ -79,6 +79,22 @@ pub fn undeclare_token(id: u32) -> Vec<u8> {
     [vec![0x1e, 0x07], vle(id.into())].concat()
 }
 
+/// INTEREST in all present and future aliases and tokens of a key.
+pub fn interest(id: u32, key: &str) -> Vec<u8> {
+    [
+        vec![0x79],
+        vle(id.into()),
+        vec![0x39, 0],
+        sized(key.as_bytes()),
+    ]
+    .concat()
+}
+
+/// D_FINAL: the end of the answer to an INTEREST.
+pub fn answer_end(interest: u32) -> Vec<u8> {
+    [vec![0x3e], vle(interest.into()), vec![0x1a]].concat()
+}
+
 /// RESPONSE with a key, as the server of a service sends it.
 pub fn response(key: &str, gid: [u8; 16], number: u64, payload: &[u8]) -> Vec<u8> {
     let head = [vec![0x3b, 1, 0], sized(key.as_bytes()), vec![0x04]].concat();

@@ -52,6 +52,24 @@ pub struct Chunk<'a> {
     pub length: u32,
 }
 
+impl Chunk<'_> {
+    /// Returns the chunk without its bytes, which the caller keeps.
+    #[must_use]
+    pub const fn without_bytes(&self) -> Chunk<'static> {
+        Chunk {
+            time: self.time,
+            stream: self.stream,
+            sequence_number: self.sequence_number,
+            syn: self.syn,
+            end: self.end,
+            is_boundary: self.is_boundary,
+            before: self.before,
+            bytes: &[],
+            length: self.length,
+        }
+    }
+}
+
 /// What is known of missing bytes before a chunk.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Before {

@@ -139,6 +139,7 @@ impl Observer {
             });
             self.topics.expire(now, self.settings.topic_grace);
             self.link_sessions();
+            self.end_unreachable_sessions(now);
             self.receivers.tidy(&self.discovery);
             self.discovery
                 .locate(|prefix| self.receivers.is_local(prefix));

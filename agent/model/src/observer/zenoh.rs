@@ -80,6 +80,12 @@ impl Observer {
         }
     }
 
+    /// Ends the sessions of Zenoh that a router no longer reaches.
+    pub(super) fn end_unreachable_sessions(&mut self, now: Timestamp) {
+        self.zenoh.end_unreachable(self.wall_clock.wall_time(now));
+        self.change_zenoh_graph(now);
+    }
+
     /// Names writers of Zenoh in changed verdicts as the wire does, by their gid. Readers have no
     /// place there.
     pub(super) fn zenoh_interest(&mut self, interest: &mut Vec<(Guid, Option<Verdict>)>) {

@@ -51,7 +51,7 @@ impl Zenoh {
                 Ok(Message::Fragment(fragment)) => {
                     self.fragment(place, &fragment, wants_bytes, show);
                 }
-                Ok(Message::Close(_)) => self.leave(stream),
+                Ok(Message::Close(_)) => self.leave(stream, place.time),
                 Ok(Message::Oam(_) | Message::KeepAlive | Message::Frame(_) | Message::Join(_)) => {
                 }
                 // The capture left out the end of the batch on purpose.

@@ -3,12 +3,18 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
-use ros2probe_wire::GuidPrefix;
 use ros2probe_wire::zenoh::ZenohId;
+use ros2probe_wire::{GuidPrefix, Timestamp};
 
 use super::stream::{Flow, StreamId, Unseen};
 use super::stream_state::StreamState;
 use super::{MAX_DIRECTIONS, MAX_UNSEEN, Zenoh};
+
+/// Lease that rmw_zenoh configures.
+const LEASE: Duration = Duration::from_secs(60);
+/// Part of its lease after which a sender is silent. It sends several times in each lease, and the
+/// other end closes the connection after all of it.
+const SILENT: f64 = 0.9;
 
 impl Zenoh {
     /// Returns the other direction, seen at the same place or, on the loopback interface, at the
@@ -51,8 +57,8 @@ impl Zenoh {
                 let oldest = oldest.map(|(id, _)| *id)?;
                 self.begin(&oldest);
             }
-            let mut direction = Box::<StreamState>::default();
-            direction.sender = self.remembered.take(stream.flow);
+            let sender = self.remembered.take(stream.flow);
+            let direction = Box::new(StreamState::new(stream, sender));
             self.directions.insert(*stream, direction);
             self.flows.insert(stream.flow, *stream);
         }
@@ -73,11 +79,20 @@ impl Zenoh {
     }
 
     /// Records that the sender leaves the connection. If it is the first to do so and has no other
-    /// connection, its session has ended. Its declarations end with the connection.
-    pub(super) fn leave(&mut self, stream: &StreamId) {
+    /// connection, its session has ended. Its declarations end with the connection. If the other end
+    /// has been silent for its lease, that one has left first.
+    pub(super) fn leave(&mut self, stream: &StreamId, now: Timestamp) {
+        if let Some(silent) = self.silent_end(stream, now)
+            && let Some(direction) = self.directions.get_mut(&silent)
+        {
+            // Nothing will be seen of it.
+            direction.has_ended = true;
+            self.leave(&silent, now);
+        }
         if self.remembered.sender(stream.flow).is_some() {
             self.direction(stream);
         }
+        self.note_cut(stream, now);
         let Some(direction) = self.directions.get_mut(stream) else {
             return;
         };
@@ -92,9 +107,7 @@ impl Zenoh {
         if let Some(session) = session {
             let mut others = self.directions.iter();
             let is_open = others.any(|(id, direction)| {
-                direction.session() == Some(session)
-                    && !direction.has_left
-                    && self.opposite(id).is_none_or(|other| !other.has_left)
+                direction.session() == Some(session) && self.is_open(id, direction)
             });
             if !is_open && !self.remembered.has(session) {
                 self.graph.end(session);
@@ -108,11 +121,25 @@ impl Zenoh {
         }
     }
 
+    /// Returns the other direction if its sender has been silent for its lease.
+    fn silent_end(&self, stream: &StreamId, now: Timestamp) -> Option<StreamId> {
+        if self.directions.get(stream)?.has_left {
+            return None;
+        }
+        let (place, other) = match self.directions.get_key_value(&stream.reversed()) {
+            Some((place, other)) => (place, &**other),
+            None => self.elsewhere(stream)?,
+        };
+        let lease = other.lease.unwrap_or(LEASE);
+        let is_silent = other.last_seen + lease.mul_f64(SILENT) <= now;
+        (is_silent && !other.has_left).then_some(*place)
+    }
+
     /// Records that the sender has closed the connection.
-    pub(super) fn end(&mut self, stream: &StreamId) {
+    pub(super) fn end(&mut self, stream: &StreamId, now: Timestamp) {
         let connection = stream.flow.connection();
         self.unseen.retain(|(_, other)| *other != connection);
-        self.leave(stream);
+        self.leave(stream, now);
         let Some(direction) = self.directions.get_mut(stream) else {
             return;
         };

@@ -42,9 +42,13 @@ impl Zenoh {
         let Some(key) = self.resolve(stream, key) else {
             return;
         };
+        let router = self.passing_router(stream);
         let directions = &self.directions;
         let lease = |session| lease(directions, session);
         let token = self.graph.declare(&key.key, *stream, lease);
+        if let (Some(token), Some(router)) = (&token, router) {
+            self.revision += u64::from(self.graph.pass_on(token, router));
+        }
         if let Some(token) = token
             && let Some(direction) = self.directions.get_mut(stream)
             && direction.tokens.len() < MAX_TOKENS

@@ -24,6 +24,8 @@ use crate::size::Size;
 pub(super) const MAX_TOKENS: usize = 32_768;
 /// Most connections that declare one token.
 pub(super) const MAX_DECLARERS: usize = 64;
+/// Most routers that are remembered to pass on the tokens of sessions.
+pub(super) const MAX_PASSING_ROUTERS: usize = 256;
 /// Least time between two announcements of a session that discovery has forgotten.
 const REPEAT: Duration = Duration::from_secs(1);
 
@@ -76,8 +78,10 @@ pub struct Graph {
     tokens: HashMap<Arc<str>, TokenState>,
     sessions: BTreeMap<ZenohId, SessionState>,
     writers: HashMap<Gid, WriterState>,
-    /// Sessions from saved state, until they end.
-    restored: BTreeSet<ZenohId>,
+    /// Sessions from saved state with their domains, until they end.
+    restored: BTreeMap<ZenohId, DomainId>,
+    /// Sessions behind other routers, by the router that passes on their tokens.
+    passages: BTreeMap<ZenohId, BTreeSet<ZenohId>>,
     servers: BTreeMap<Arc<str>, BTreeMap<ZenohId, Guid>>,
     changed: BTreeSet<ZenohId>,
     changes: Vec<GraphChange>,
@@ -108,7 +112,7 @@ impl Graph {
 
     /// Returns whether this session has nodes or endpoints.
     pub fn has(&self, session: ZenohId) -> bool {
-        self.sessions.contains_key(&session) || self.restored.contains(&session)
+        self.sessions.contains_key(&session) || self.restored.contains_key(&session)
     }
 
     /// Returns the sessions with tokens, or from saved state.
@@ -116,11 +120,14 @@ impl Graph {
         self.sessions
             .keys()
             .copied()
-            .chain(self.restored.iter().copied())
+            .chain(self.restored.keys().copied())
     }
 
-    /// Learns a writer that discovery knows from saved state.
+    /// Learns an endpoint that discovery knows from saved state.
     pub fn restore(&mut self, guid: Guid, endpoint: &Endpoint, session: Option<ZenohId>) {
+        if let Some(session) = session {
+            self.restored.insert(session, endpoint.domain_id);
+        }
         if !guid.entity.is_writer() || self.writers.len() >= MAX_TOKENS {
             return;
         }
@@ -129,7 +136,6 @@ impl Graph {
         let Some(session) = session else {
             return;
         };
-        self.restored.insert(session);
         let topic = DdsTopic::parse(endpoint.topic.as_str());
         if let Ok(Demangled::ServiceReply(service)) = topic.map(|topic| topic.demangle()) {
             let key = service_key(endpoint.domain_id, service.as_str());
@@ -237,7 +243,11 @@ impl Graph {
     /// Removes a session with everything that it has.
     pub fn end(&mut self, session: ZenohId) {
         let state = self.sessions.remove(&session);
-        let was_restored = self.restored.remove(&session);
+        let was_restored = self.restored.remove(&session).is_some();
+        for sessions in self.passages.values_mut() {
+            sessions.remove(&session);
+        }
+        self.passages.retain(|_, sessions| !sessions.is_empty());
         if state.is_none() && !was_restored {
             return;
         }
@@ -254,6 +264,83 @@ impl Graph {
         self.changes.push(GraphChange::ParticipantGone(guid));
     }
 
+    /// Records that a router passes on this token of a session behind another router. Returns
+    /// whether that is new.
+    pub fn pass_on(&mut self, token: &str, router: ZenohId) -> bool {
+        let Some(session) = self.tokens.get(token).map(|token| token.session) else {
+            return false;
+        };
+        let has_room = self.passages.len() < MAX_PASSING_ROUTERS;
+        if !has_room && !self.passages.contains_key(&router) {
+            return false;
+        }
+        self.passages.entry(router).or_default().insert(session)
+    }
+
+    /// Returns whether a router passes on tokens of sessions behind other routers.
+    pub fn passes_on(&self, router: ZenohId) -> bool {
+        self.passages.contains_key(&router)
+    }
+
+    /// Returns the sessions of which a router passes on tokens.
+    pub fn passed_on_by(&self, router: ZenohId) -> BTreeSet<ZenohId> {
+        self.passages.get(&router).cloned().unwrap_or_default()
+    }
+
+    /// Removes a router that passes on tokens, and returns the sessions that no other one passes on.
+    pub fn pass_no_longer(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
+        let mut sessions = self.passages.remove(&router).unwrap_or_default();
+        for others in self.passages.values() {
+            sessions.retain(|session| !others.contains(session));
+        }
+        sessions
+    }
+
+    /// Returns the routers that pass on tokens, with the sessions.
+    pub const fn passages(&self) -> &BTreeMap<ZenohId, BTreeSet<ZenohId>> {
+        &self.passages
+    }
+
+    /// Restores saved routers with the restored sessions of which they pass on tokens.
+    pub fn restore_passages(&mut self, passages: BTreeMap<ZenohId, BTreeSet<ZenohId>>) {
+        for (router, mut sessions) in passages.into_iter().take(MAX_PASSING_ROUTERS) {
+            sessions.retain(|session| self.restored.contains_key(session));
+            if !sessions.is_empty() {
+                self.passages.insert(router, sessions);
+            }
+        }
+    }
+
+    /// Returns the connections that declare tokens of a session.
+    pub fn declarers(&self, session: ZenohId) -> impl Iterator<Item = &StreamId> {
+        let session = self.sessions.get(&session);
+        let tokens = session.into_iter().flat_map(|session| &session.tokens);
+        let tokens = tokens.filter_map(|text| self.tokens.get(text));
+        tokens.flat_map(|token| &token.declarers)
+    }
+
+    /// Removes what no connection declares of a session of this domain.
+    pub fn keep_declared(&mut self, session: ZenohId, domain: DomainId) {
+        let Some(state) = self.sessions.get(&session) else {
+            if self.restored.get(&session) == Some(&domain) {
+                self.end(session);
+            }
+            return;
+        };
+        if state.domain != domain {
+            return;
+        }
+        let is_declared = |text: &&Arc<str>| {
+            let token = self.tokens.get(*text);
+            token.is_some_and(|token| !token.declarers.is_empty())
+        };
+        let texts = state.tokens.iter();
+        let gone: Vec<_> = texts.filter(|text| !is_declared(text)).cloned().collect();
+        for text in gone {
+            self.remove(&text);
+        }
+    }
+
     /// Returns the size and cap of each table.
     pub fn sizes(&self) -> Vec<Size> {
         // The destructuring makes a new table fail to compile until it is listed here.
@@ -262,11 +349,13 @@ impl Graph {
             sessions,
             writers,
             restored,
+            passages,
             servers,
             changed,
             changes,
             refused: _,
         } = self;
+        let passed_on = passages.values().map(BTreeSet::len).max();
         let declarers = tokens.values().map(TokenState::declarers).max();
         let of_sessions = || sessions.values().map(SessionState::lists);
         let (mut nodes, mut ends, mut texts) = (0, 0, 0);
@@ -287,6 +376,12 @@ impl Graph {
             Size::new("zenoh.sessions.tokens", texts, MAX_TOKENS),
             Size::new("zenoh.writers", writers.len(), 2 * MAX_TOKENS),
             Size::new("zenoh.restored", restored.len(), MAX_TOKENS),
+            Size::new("zenoh.passages", passages.len(), MAX_PASSING_ROUTERS),
+            Size::new(
+                "zenoh.passages.sessions",
+                passed_on.unwrap_or(0),
+                2 * MAX_TOKENS,
+            ),
             Size::new("zenoh.servers", servers.len(), MAX_TOKENS),
             Size::new("zenoh.servers.sessions", serving, MAX_TOKENS),
             Size::new("zenoh.changed", changed.len(), MAX_TOKENS),

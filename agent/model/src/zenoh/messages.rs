@@ -3,12 +3,13 @@
 
 use ros2probe_wire::Guid;
 use ros2probe_wire::zenoh::{
-    Attachment, Bytes, Gid, Key, Mapping, NetworkMessage, Put, Request, Response, ResponseBody,
-    Sample, WhatAmI, WireExpr, ZenohId,
+    Attachment, Bytes, Declaration, Gid, Interest, Key, Mapping, NetworkMessage, Put, Request,
+    Response, ResponseBody, Sample, WireExpr, ZenohId,
 };
 
 use super::endpoints::unknown_guid;
 use super::graph::service_key;
+use super::routers::domain_of_graph;
 use super::stream::StreamId;
 use super::stream_state::{Alias, resolve};
 use super::{Place, Shown, Zenoh, ZenohSample};
@@ -28,12 +29,16 @@ impl Zenoh {
             }
             NetworkMessage::Declare(declare) => {
                 self.declaration(place.stream, declare.declaration);
+                if let (Declaration::Final, Some(interest)) =
+                    (declare.declaration, declare.interest)
+                {
+                    self.compare_answer(place.stream, interest);
+                }
             }
+            NetworkMessage::Interest(interest) => self.interest(place.stream, interest),
             NetworkMessage::Request(request) => self.request(place, request, show),
             NetworkMessage::Response(response) => self.response(place, response, show),
-            NetworkMessage::ResponseFinal(_)
-            | NetworkMessage::Interest(_)
-            | NetworkMessage::Oam(_) => {}
+            NetworkMessage::ResponseFinal(_) | NetworkMessage::Oam(_) => {}
         }
     }
 
@@ -44,6 +49,16 @@ impl Zenoh {
             Mapping::Receiver => self.opposite(stream),
         };
         resolve(expression, table.map(|direction| &direction.aliases))
+    }
+
+    /// Notes that a session wants to know the graph.
+    fn interest(&mut self, stream: &StreamId, interest: &Interest<'_>) {
+        let key = interest.key.filter(|_| interest.is_current);
+        let key = key.and_then(|key| self.resolve(stream, key));
+        let domain = key.and_then(|alias| domain_of_graph(&alias.key));
+        if let (Some(domain), Some(direction)) = (domain, self.directions.get_mut(stream)) {
+            direction.asked = Some((interest.id, domain));
+        }
     }
 
     /// Shows a sample of a topic.
@@ -138,15 +153,9 @@ impl Zenoh {
         attachment: &Attachment,
         payload: Bytes<'a>,
     ) -> ZenohSample<'a> {
-        let receiver = self.opposite(place.stream);
-        let restored = || self.remembered.sender(place.stream.flow.reversed());
-        let side = receiver
-            .and_then(|receiver| receiver.sender)
-            .or_else(restored);
-        let session = receiver
-            .and_then(|receiver| receiver.session())
-            .or(side.map(|side| side.zid));
-        let is_router = side.is_some_and(|side| side.whatami == WhatAmI::Router);
+        let session = self.receiver(place.stream).map(|side| side.zid);
+        let session = session.or_else(|| self.opposite(place.stream)?.session());
+        let is_router = self.is_for_router(place.stream);
         ZenohSample {
             writer,
             number: attachment.sequence_number,

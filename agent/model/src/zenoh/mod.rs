@@ -18,6 +18,7 @@ mod messages;
 mod processes;
 mod remembered;
 mod replies;
+mod routers;
 mod session_state;
 mod stream;
 mod stream_state;
@@ -32,8 +33,8 @@ use crate::route::Destination;
 use crate::size::{Size, largest};
 pub use endpoints::unknown_guid;
 pub use facts::{Counters, ZenohFacts};
-use graph::Graph;
 pub use graph::GraphChange;
+use graph::{Graph, MAX_PASSING_ROUTERS};
 pub use processes::Holder;
 pub use remembered::ZenohMemory;
 use remembered::{MAX_REMEMBERED, Remembered};
@@ -101,6 +102,10 @@ pub struct Zenoh {
     pub graph: Graph,
     replies: Replies,
     remembered: Remembered,
+    /// Routers of which a connection that may lead to another router ended, with the time.
+    cut: BTreeMap<ZenohId, Timestamp>,
+    /// Time of the first report.
+    began: Timestamp,
     unseen: BTreeSet<(Unseen, Flow)>,
     chain_bytes: usize,
     counters: Counters,
@@ -131,9 +136,12 @@ impl Zenoh {
     ) {
         let (stream, time) = (report.stream, report.time);
         self.remembered.expire(time);
+        if self.began == Timestamp(0) {
+            self.began = time;
+        }
         match report.event {
             StreamEvent::Begin => self.begin(stream),
-            StreamEvent::End => self.end(stream),
+            StreamEvent::End => self.end(stream, time),
             StreamEvent::Gap => {
                 self.counters.gaps += 1;
                 show(Shown::Missed(stream.flow.destination));
@@ -207,7 +215,7 @@ impl Zenoh {
             .chain(senders.values().map(|side| side.zid))
             .collect();
         relayed.extend(self.graph.sessions());
-        ZenohMemory::new(&senders, &(&relayed - &connected))
+        ZenohMemory::new(&senders, &(&relayed - &connected), self.graph.passages())
     }
 
     /// Returns a number that increases with the connections of [`Self::memory`].
@@ -232,6 +240,7 @@ impl Zenoh {
                 self.graph.restore(*guid, endpoint, session);
             }
         }
+        self.graph.restore_passages(memory.passages());
     }
 
     /// Returns the size and cap of each table.
@@ -244,6 +253,8 @@ impl Zenoh {
             graph,
             replies,
             remembered,
+            cut,
+            began: _,
             unseen,
             chain_bytes,
             counters: _,
@@ -258,6 +269,8 @@ impl Zenoh {
             Size::new("zenoh.directions", directions.len(), MAX_DIRECTIONS),
             Size::new("zenoh.flows", flows.len(), MAX_DIRECTIONS),
             Size::new("zenoh.chains.bytes", *chain_bytes, MAX_CHAIN_BYTES),
+            // Each of these routers passes on a session.
+            Size::new("zenoh.cut", cut.len(), MAX_PASSING_ROUTERS),
             Size::new("zenoh.unseen", unseen.len(), MAX_UNSEEN),
             Size::new("zenoh.remembered", saved, MAX_REMEMBERED),
             Size::new("zenoh.relayed", relayed, MAX_REMEMBERED),

@@ -39,6 +39,7 @@ impl Zenoh {
         if self.directions.values().all(|each| each.sender.is_some()) {
             return changes;
         }
+        changes.extend(self.find_routers(&holder));
         let holder = |stream: &StreamId| stream.outgoing.then(|| holder(stream.socket)).flatten();
         let mut to_routers: HashMap<u32, usize> = HashMap::new();
         for (stream, direction) in &self.directions {
@@ -52,7 +53,7 @@ impl Zenoh {
         let sessions = self.graph.sessions();
         let sessions: HashMap<_, _> = sessions.map(|zid| (zid.guid_prefix(), zid)).collect();
         for (stream, direction) in &mut self.directions {
-            if direction.sender.is_some() {
+            if direction.sender.is_some() || direction.is_router {
                 continue;
             }
             let linked = holder(stream).and_then(|holder| {

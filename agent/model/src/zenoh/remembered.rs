@@ -28,6 +28,15 @@ pub struct ZenohMemory {
     /// Sessions without a connection of their own, which only routers declare.
     #[serde(default)]
     relayed: Vec<String>,
+    /// Routers that pass on the tokens of sessions behind other routers.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    passages: Vec<RememberedPassage>,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct RememberedPassage {
+    router: String,
+    sessions: Vec<String>,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -57,7 +66,15 @@ pub(super) struct Remembered {
 }
 
 impl ZenohMemory {
-    pub(super) fn new(senders: &BTreeMap<Flow, Side>, relayed: &BTreeSet<ZenohId>) -> Self {
+    pub(super) fn new(
+        senders: &BTreeMap<Flow, Side>,
+        relayed: &BTreeSet<ZenohId>,
+        passages: &BTreeMap<ZenohId, BTreeSet<ZenohId>>,
+    ) -> Self {
+        let texts = |sessions: &BTreeSet<ZenohId>| {
+            let sessions = sessions.iter().take(MAX_REMEMBERED);
+            sessions.map(ZenohId::to_string).collect()
+        };
         let connections =
             senders
                 .iter()
@@ -70,12 +87,25 @@ impl ZenohMemory {
                 });
         Self {
             connections: connections.collect(),
-            relayed: relayed
+            relayed: texts(relayed),
+            passages: passages
                 .iter()
-                .take(MAX_REMEMBERED)
-                .map(ZenohId::to_string)
+                .map(|(router, sessions)| RememberedPassage {
+                    router: router.to_string(),
+                    sessions: texts(sessions),
+                })
                 .collect(),
         }
+    }
+
+    /// Returns the routers that pass on tokens. Invalid entries are skipped.
+    pub(super) fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
+        let read = |passage: &RememberedPassage| {
+            let sessions = passage.sessions.iter().take(MAX_REMEMBERED);
+            let sessions = sessions.filter_map(|session| ZenohId::parse(session));
+            Some((ZenohId::parse(&passage.router)?, sessions.collect()))
+        };
+        self.passages.iter().filter_map(read).collect()
     }
 }
 
@@ -196,7 +226,7 @@ mod tests {
         };
         let senders: BTreeMap<_, _> = (0..5000).map(sender).collect();
         let relayed: BTreeSet<_> = (5000..10_000).map(zid).collect();
-        let mut memory = ZenohMemory::new(&senders, &relayed);
+        let mut memory = ZenohMemory::new(&senders, &relayed, &BTreeMap::new());
         assert_eq!(memory.connections.len(), MAX_REMEMBERED);
         assert_eq!(memory.relayed.len(), MAX_REMEMBERED);
         memory.relayed.push(zid(1).to_string());

@@ -5,8 +5,10 @@ use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
-use ros2probe_wire::zenoh::{Fragment, Key, Lane, PORT, Resolution, Side, WireExpr, ZenohId};
+use ros2probe_wire::zenoh::{
+    Fragment, Key, Lane, PORT, Resolution, Side, WhatAmI, WireExpr, ZenohId,
+};
+use ros2probe_wire::{DomainId, Timestamp};
 
 use super::stream::StreamId;
 use crate::size::Size;
@@ -59,6 +61,16 @@ pub(super) struct StreamState {
     /// Source of all publications so far, and their number, if the INIT was missed.
     presumed: Option<(ZenohId, u32)>,
     is_ambiguous: bool,
+    /// Whether the addresses are those of a router, which passes on publications of others.
+    may_be_router: bool,
+    /// Whether the sender is a router, if the INIT was missed and its id is unknown.
+    pub(super) is_router: bool,
+    /// Whether a router holds the socket that receives.
+    pub(super) is_for_router: bool,
+    /// That router, if its id is known.
+    pub(super) receiver: Option<Side>,
+    /// The last INTEREST of the sender in the graph of a domain, with its number.
+    pub(super) asked: Option<(u32, DomainId)>,
     pub(super) lease: Option<Duration>,
     pub(super) aliases: HashMap<u16, Alias>,
     /// Tokens that the sender declares.
@@ -104,14 +116,39 @@ impl Alias {
 }
 
 impl StreamState {
+    /// Creates the state of a direction of which nothing was seen; `sender` is from saved state.
+    pub(super) fn new(stream: &StreamId, sender: Option<Side>) -> Self {
+        let (from, to) = (stream.flow.source.port, stream.flow.destination.port);
+        Self {
+            sender,
+            may_be_router: from == PORT || to == PORT && !stream.is_loopback(),
+            ..Self::default()
+        }
+    }
+
     /// Returns the session that sends, as far as is known.
     pub(super) fn session(&self) -> Option<ZenohId> {
         let presumed = self.presumed.filter(|(_, count)| *count >= PRESUMED);
-        let presumed = presumed.filter(|_| !self.is_ambiguous);
+        let is_certain = !self.is_ambiguous && !self.may_be_router && !self.is_router;
+        let presumed = presumed.filter(|_| is_certain);
         self.sender
             .map(|side| side.zid)
             .or(self.linked)
             .or(presumed.map(|(zid, _)| zid))
+    }
+
+    /// Returns whether the sender is a router, as far as the direction shows.
+    pub(super) fn is_of_router(&self, stream: &StreamId) -> bool {
+        match (self.sender, self.linked) {
+            (Some(side), _) => side.whatami == WhatAmI::Router,
+            (None, Some(_)) => false,
+            (None, None) => self.is_router || self.is_ambiguous || stream.flow.source.port == PORT,
+        }
+    }
+
+    /// Returns the source of the first publication, if the INIT was missed.
+    pub(super) fn source(&self) -> Option<ZenohId> {
+        self.presumed.map(|(source, _)| source)
     }
 
     /// Returns whether no other session's publication was seen.
@@ -222,6 +259,11 @@ impl StreamState {
             linked: _,
             presumed: _,
             is_ambiguous: _,
+            may_be_router: _,
+            is_router: _,
+            is_for_router: _,
+            receiver: _,
+            asked: _,
             lease: _,
             aliases,
             tokens,

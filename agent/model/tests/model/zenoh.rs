@@ -1,6 +1,7 @@
 //! Sessions of Zenoh: what appears, what ends, and what hostile senders cannot do.
 
 mod processes;
+mod routers;
 
 use std::ops::Range;
 
@@ -410,6 +411,27 @@ fn a_token_that_everybody_declares_remembers_so_many() {
     }
     bounded(&observer);
     assert_eq!(participants(&observer, START), 1);
+}
+
+#[test]
+fn routers_that_pass_on_tokens_are_bounded() {
+    let mut observer = observer();
+    for number in 0..400_u16 {
+        let mut router = ROUTER;
+        router[..2].copy_from_slice(&number.to_le_bytes());
+        connect(&mut observer, number, TALKER, (router, Role::Router));
+        let [_, back] = connection(number);
+        let token = publisher(LATE, 10, "/chatter");
+        let declared = [declare_token(1, &token)];
+        send(&mut observer, &back, START, &frame(1, &declared));
+        for stream in connection(number) {
+            report(&mut observer, &stream, START, StreamEvent::End);
+        }
+        bounded(&observer);
+    }
+    let sizes = observer.sizes();
+    let routers = sizes.iter().find(|size| size.table == "zenoh.passages");
+    assert_eq!(routers.map(|size| size.entries), Some(256));
 }
 
 #[test]

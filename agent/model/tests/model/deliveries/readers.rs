@@ -23,7 +23,7 @@ fn stranger(host: &mut Host, prefix: GuidPrefix, port: u16) -> CapturePoint {
 /// Sends a sample that some sockets receive and others lose in reassembly.
 fn send(host: &mut Host, number: u64, sockets: &[CapturePoint]) {
     for (place, socket) in (0..).zip(sockets) {
-        if (number + place) % 5 == 0 {
+        if (number + place).is_multiple_of(5) {
             continue;
         }
         let record = host.record(*socket, kind::DATA, number);
@@ -32,7 +32,7 @@ fn send(host: &mut Host, number: u64, sockets: &[CapturePoint]) {
             ..record
         });
     }
-    if number % 5 == 0 {
+    if number.is_multiple_of(5) {
         host.put(Record {
             flags: flag::NOT_REASSEMBLED,
             socket: 0,

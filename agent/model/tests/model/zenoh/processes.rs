@@ -28,7 +28,7 @@ fn at_socket(stream: StreamId, socket: u64) -> StreamId {
 }
 
 /// Reports the process that holds a socket.
-fn hold(observer: &mut Observer, cookie: u64, process: u32) {
+pub(super) fn hold(observer: &mut Observer, cookie: u64, process: u32) {
     observer.input(Input::Socket(SocketFacts {
         cookie,
         process_id: Some(process),

@@ -1,0 +1,245 @@
+//! Routers: which senders are routers although their INIT was missed, and which sessions only a
+//! router passes on.
+//!
+//! A router declares to a peer, and to another router, the tokens of sessions behind further
+//! routers only. Those sessions end with the last connection that the router has to another router.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use ros2probe_wire::zenoh::{PORT, Side, WhatAmI, ZenohId};
+use ros2probe_wire::{DomainId, Timestamp};
+
+use super::Zenoh;
+use super::processes::{Holder, OwnerChange};
+use super::stream::StreamId;
+use super::stream_state::StreamState;
+
+/// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that is older
+/// than the agent has been seen after this time.
+const ALL_SEEN: Duration = Duration::from_secs(35);
+/// Time in which another connection of a router may replace one that ended.
+const REPLACED: Duration = Duration::from_secs(1);
+
+impl Zenoh {
+    /// Learns from the processes that hold the sockets which ends of connections are routers. One
+    /// router runs in a process, and no ROS session beside it.
+    pub(super) fn find_routers(
+        &mut self,
+        holder: impl Fn(u64) -> Option<Holder>,
+    ) -> Vec<OwnerChange> {
+        let mut changes = Vec::new();
+        let known = self.graph.sessions().map(ZenohId::guid_prefix);
+        let known: BTreeSet<_> = known.collect();
+        let mut routers: BTreeMap<u32, Option<Side>> = BTreeMap::new();
+        let mut sessions = BTreeSet::new();
+        let mut forwards: BTreeMap<u32, [BTreeSet<ZenohId>; 2]> = BTreeMap::new();
+        for (stream, direction) in &self.directions {
+            let Some(holder) = holder(stream.socket).filter(|_| !direction.has_left) else {
+                continue;
+            };
+            let process = holder.process_id;
+            if holder
+                .session
+                .is_some_and(|session| known.contains(&session))
+            {
+                sessions.insert(process);
+            }
+            if stream.outgoing && direction.is_of_router(stream) {
+                let known = routers.entry(process).or_default();
+                *known = known.or(direction.sender);
+            }
+            if let Some(source) = direction.source() {
+                let [sent, received] = forwards.entry(process).or_default();
+                let side = if stream.outgoing { sent } else { received };
+                side.insert(source);
+            }
+        }
+        for (process, [sent, received]) in forwards {
+            // A session does not receive what it publishes.
+            if !sent.is_disjoint(&received) {
+                sessions.remove(&process);
+                routers.entry(process).or_default();
+            }
+        }
+        for (stream, direction) in &mut self.directions {
+            let process = holder(stream.socket).map(|holder| holder.process_id);
+            let process = process.filter(|process| !sessions.contains(process));
+            let router = process.and_then(|process| routers.get(&process));
+            let Some(router) = router else {
+                continue;
+            };
+            if !stream.outgoing {
+                direction.is_for_router = true;
+                direction.receiver = *router;
+            } else if direction.sender.is_none() {
+                let before = direction.owner(stream);
+                direction.is_router = true;
+                direction.linked = None;
+                direction.sender = *router;
+                self.revision += u64::from(router.is_some());
+                let after = direction.owner(stream);
+                if before != after {
+                    changes.push(OwnerChange {
+                        socket: stream.socket,
+                        before,
+                        after,
+                    });
+                }
+            }
+        }
+        changes
+    }
+
+    /// Returns whether the receiver at the end of a direction is a router, as far as is known. A
+    /// message to it is no delivery.
+    pub(super) fn is_for_router(&self, stream: &StreamId) -> bool {
+        let own = self.directions.get(stream);
+        let opposite = self.opposite(stream);
+        if let Some(side) = self.receiver(stream) {
+            return side.whatami == WhatAmI::Router;
+        }
+        if own.is_some_and(|own| own.is_for_router)
+            || opposite.is_some_and(|opposite| opposite.is_router)
+        {
+            return true;
+        }
+        if opposite.is_some_and(|opposite| opposite.session().is_some()) {
+            return false;
+        }
+        // Sessions listen on other ports, and connect to the router of their own host.
+        stream.flow.destination.port == PORT
+            || stream.flow.source.port == PORT && !stream.is_loopback()
+    }
+
+    /// Returns the receiver of a direction, if an INIT, saved state or its process shows it.
+    pub(super) fn receiver(&self, stream: &StreamId) -> Option<Side> {
+        let opposite = self.opposite(stream).and_then(|opposite| opposite.sender);
+        let own = || self.directions.get(stream)?.receiver;
+        opposite
+            .or_else(own)
+            .or_else(|| self.remembered.sender(stream.flow.reversed()))
+    }
+
+    /// Returns the router that passes on the tokens of other routers' sessions in this direction.
+    pub(super) fn passing_router(&self, stream: &StreamId) -> Option<ZenohId> {
+        let sender = self.directions.get(stream)?.sender?;
+        let receiver = self.receiver(stream)?;
+        match (sender.whatami, receiver.whatami) {
+            (WhatAmI::Router, WhatAmI::Peer) => Some(sender.zid),
+            (WhatAmI::Router, WhatAmI::Router) => Some(receiver.zid),
+            _ => None,
+        }
+    }
+
+    /// Records the end of a connection that may lead from a router to another one.
+    pub(super) fn note_cut(&mut self, stream: &StreamId, now: Timestamp) {
+        for router in self.ends_of_link(stream) {
+            if self.graph.passes_on(router) {
+                self.cut.insert(router, now);
+            }
+        }
+    }
+
+    /// Ends the sessions that a router no longer reaches.
+    pub fn end_unreachable(&mut self, now: Timestamp) {
+        let is_due = |at: Timestamp| at + REPLACED <= now;
+        if now < self.began + ALL_SEEN || !self.cut.values().any(|at| is_due(*at)) {
+            return;
+        }
+        let due = self.cut.extract_if(.., |_, at| is_due(*at));
+        let due: Vec<_> = due.map(|(router, _)| router).collect();
+        for router in due {
+            let mut streams = self.directions.keys();
+            if streams.any(|stream| self.is_link_of(router, stream)) {
+                // Which sessions are behind that one is not known.
+                continue;
+            }
+            for session in self.graph.pass_no_longer(router) {
+                if !self.has_other_way(session, router) {
+                    self.graph.end(session);
+                    self.revision += 1;
+                }
+            }
+        }
+    }
+
+    /// Ends what a router has passed on before, and does not list in its whole answer to a new
+    /// session.
+    pub(super) fn compare_answer(&mut self, stream: &StreamId, interest: u32) {
+        let asked = self.opposite(stream).and_then(|opposite| opposite.asked);
+        let Some((_, domain)) = asked.filter(|(id, _)| *id == interest) else {
+            return;
+        };
+        let is_peer = |side: Side| side.whatami == WhatAmI::Peer;
+        let to_peer = self.receiver(stream).is_some_and(is_peer);
+        let Some(router) = self.passing_router(stream).filter(|_| to_peer) else {
+            return;
+        };
+        for session in self.graph.passed_on_by(router) {
+            if !self.has_other_way(session, router) {
+                self.graph.keep_declared(session, domain);
+            }
+        }
+    }
+
+    /// Returns whether a session is reached without this router.
+    fn has_other_way(&self, session: ZenohId, router: ZenohId) -> bool {
+        let mut directions = self.directions.iter();
+        let has_own = directions.any(|(stream, direction)| {
+            direction.session() == Some(session) && self.is_open(stream, direction)
+        });
+        let mut declarers = self.graph.declarers(session);
+        self.remembered.has(session)
+            || has_own
+            || declarers.any(|stream| {
+                let declarer = self.directions.get(stream);
+                declarer.is_some_and(|each| each.sender.is_none_or(|side| side.zid != router))
+            })
+    }
+
+    /// Returns whether neither end has left the connection.
+    pub(super) fn is_open(&self, stream: &StreamId, direction: &StreamState) -> bool {
+        !direction.has_left && self.opposite(stream).is_none_or(|other| !other.has_left)
+    }
+
+    fn is_link_of(&self, router: ZenohId, stream: &StreamId) -> bool {
+        let direction = self.directions.get(stream);
+        direction.is_some_and(|direction| self.is_open(stream, direction))
+            && self.ends_of_link(stream).any(|end| end == router)
+    }
+
+    /// Returns the known routers at the ends of a connection that may be one between routers.
+    fn ends_of_link(&self, stream: &StreamId) -> impl Iterator<Item = ZenohId> + use<> {
+        let sender = self.directions.get(stream).and_then(|each| each.sender);
+        let sender = sender.or_else(|| self.remembered.sender(stream.flow));
+        let receiver = self.receiver(stream);
+        let is_session = |side: Option<Side>, session: Option<ZenohId>, is_router: bool| match side
+        {
+            Some(side) => side.whatami != WhatAmI::Router,
+            None => session.is_some() || stream.is_loopback() && !is_router,
+        };
+        let own = self.directions.get(stream);
+        let opposite = self.opposite(stream);
+        let sends = is_session(
+            sender,
+            own.and_then(|each| each.session()),
+            own.is_some_and(|each| each.is_of_router(stream)),
+        );
+        let receives = is_session(
+            receiver,
+            opposite.and_then(|each| each.session()),
+            self.is_for_router(stream),
+        );
+        let ends = [sender, receiver].into_iter().flatten();
+        let routers = ends.filter(|side| side.whatami == WhatAmI::Router);
+        let routers: Vec<_> = routers.map(|side| side.zid).collect();
+        routers.into_iter().filter(move |_| !sends && !receives)
+    }
+}
+
+/// Returns the domain whose tokens a key covers: that of rmw_zenoh's subscription to the graph.
+pub(super) fn domain_of_graph(key: &str) -> Option<DomainId> {
+    let domain = key.strip_prefix("@ros2_lv/")?.strip_suffix("/**")?;
+    domain.parse().ok().map(DomainId)
+}
