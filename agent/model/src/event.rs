@@ -249,7 +249,15 @@ impl Events {
             classes,
             bursts,
         } = self;
-        let losers = bursts.values().map(|burst| burst.losers.len()).max();
+        let losers = |burst: &Burst| {
+            let Burst {
+                at: _,
+                losses: _,
+                losers,
+            } = burst;
+            losers.len()
+        };
+        let losers = bursts.values().map(losers).max();
         let room = MANY + classes.len() * usize::from(MOST);
         vec![
             Size::new("events.waiting", waiting.len(), room),

@@ -438,11 +438,15 @@ impl PreviousTotals {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::loss_share::LossShare;
 
     fn counted(messages: u64, lost: u64, latencies: &[f64]) -> Measurement {
         let mut counted = Measurement {
             messages,
-            lost,
+            loss: LossShare {
+                lost,
+                expected: messages + lost,
+            },
             bytes: messages * 100,
             ..Measurement::default()
         };

@@ -300,10 +300,17 @@ impl Sequence {
     /// Returns the number of missing samples that may still arrive.
     #[must_use]
     pub fn undecided(&self) -> u64 {
-        let is_open =
-            |number: &SequenceNumber| !self.received.get(*number) && !self.excused.get(*number);
-        let undecided = self.settled.max(self.floor()).until(self.next);
-        undecided.filter(is_open).count() as u64
+        let mut number = self.settled.max(self.floor());
+        let mut undecided = 0;
+        while number < self.next {
+            let first = number.0 % 64;
+            let bits = (self.next - number).min(64 - first);
+            let mask = (u64::MAX >> (64 - bits)) << first;
+            let decided = self.received.word(number) | self.excused.word(number);
+            undecided += u64::from((!decided & mask).count_ones());
+            number += bits;
+        }
+        undecided
     }
 
     /// Returns the time at which this number was detected as missing, if remembered.

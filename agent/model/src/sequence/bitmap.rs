@@ -32,6 +32,12 @@ impl Bitmap {
         self.words.get(word).is_some_and(|word| word & mask != 0)
     }
 
+    /// Returns the word with this number's bit, which is the bit `number % 64`.
+    pub(super) fn word(&self, number: SequenceNumber) -> u64 {
+        let (word, _) = self.place(number);
+        self.words.get(word).copied().unwrap_or(u64::MAX)
+    }
+
     pub(super) fn set(&mut self, number: SequenceNumber) {
         let (word, mask) = self.place(number);
         if let Some(word) = self.words.get_mut(word) {

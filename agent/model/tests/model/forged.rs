@@ -54,6 +54,7 @@ impl Run {
         let mut host = Host::new();
         host.writer(self.reliable);
         let bob = host.reader(BOB, 7411);
+        host.subscribe_with(BOB, 2, self.reliable);
         for index in 0..1000 {
             if index == self.forged_at {
                 forgery(&mut host, bob);
@@ -368,6 +369,7 @@ fn a_jump_of_fragmented_messages_counts_each_once() {
         let mut host = Host::new();
         host.writer(reliable);
         let bob = host.reader(BOB, 7411);
+        host.subscribe_with(BOB, 2, reliable);
         for number in (1..=20).chain(1021..=1040) {
             for start in [1, 6] {
                 host.wait(5);

@@ -66,6 +66,14 @@ fn talking() -> (Observer, [u8; 16]) {
     (observer, Gid::of_token(&token).0)
 }
 
+/// Announces a subscription of the session that accepted this connection.
+fn subscribe(observer: &mut Observer, port: u16, session: [u8; 16]) {
+    let token = publisher(session, 11, "/chatter").replace("/MP/", "/MS/");
+    let [_, back] = connection(port);
+    let declared = [declare_token(1, &token)];
+    send(observer, &back, START, &frame(7, &declared));
+}
+
 fn chatter(snapshot: &Snapshot) -> Option<&TopicFacts> {
     let mut topics = snapshot.topics.iter();
     topics.find(|topic| *topic.name == *"/chatter")
@@ -84,6 +92,7 @@ fn participants(observer: &Observer, at: u64) -> usize {
 #[test]
 fn a_message_on_two_connections_counts_once_and_reaches_the_peer_only() {
     let (mut observer, gid) = talking();
+    subscribe(&mut observer, 1001, LISTENER);
     for number in 1..=10 {
         let batch = frame(8, &[push(3, gid, number, b"\0\x01\0\0\x06\0\0\0hello\0")]);
         for port in [1000, 1001] {
@@ -95,13 +104,16 @@ fn a_message_on_two_connections_counts_once_and_reaches_the_peer_only() {
     let snapshot = observer.snapshot(Timestamp(START + SECOND));
     let received = chatter(&snapshot).unwrap().received.as_deref().unwrap();
     assert_eq!((received.messages, received.duplicates), (10, 0));
-    assert_eq!(snapshot.participants.len(), 1);
+    // The router is no subscriber.
+    assert_eq!(received.unmatched, 0);
+    assert_eq!(snapshot.participants.len(), 2);
 }
 
 /// Returns the losses of the topic and of its receivers, after the talker has sent ten messages a
 /// second. Those with a `missing` number did not arrive, and `gap` precedes the number after them.
 fn lost(missing: Range<u64>, gap: Option<StreamEvent<'_>>) -> (u64, u64) {
     let (mut observer, gid) = talking();
+    subscribe(&mut observer, 1001, LISTENER);
     let [there, _] = connection(1001);
     for number in (1..=30).filter(|number| !missing.contains(number)) {
         let at = START + number * SECOND / 10;
@@ -135,6 +147,7 @@ fn what_a_gap_in_the_capture_hides_is_no_loss() {
 #[test]
 fn the_history_that_a_late_subscription_requests_is_delivered_to_it_only() {
     let (mut observer, gid) = talking();
+    subscribe(&mut observer, 1001, LISTENER);
     let [there, _] = connection(1001);
     let payload = b"\0\x01\0\0";
     for number in 1..=5 {
@@ -147,6 +160,7 @@ fn the_history_that_a_late_subscription_requests_is_delivered_to_it_only() {
         );
     }
     connect(&mut observer, 1002, TALKER, (LATE, Role::Peer));
+    subscribe(&mut observer, 1002, LATE);
     let [there, _] = connection(1002);
     for number in 1..=5 {
         let at = START + 2 * SECOND + number;
@@ -183,6 +197,7 @@ fn a_session_ends_with_its_last_connection_and_not_with_the_router() {
 #[test]
 fn a_restarted_agent_knows_who_sends_and_notices_the_end() {
     let (mut before, gid) = talking();
+    subscribe(&mut before, 1001, LISTENER);
     let token = publisher(LISTENER, 10, "/status");
     // The listener is silent, and announced by the router only.
     let [_, from_router] = connection(1000);

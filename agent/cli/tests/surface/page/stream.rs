@@ -105,7 +105,7 @@ fn assert_graph(agent: &LocalAgent, first: &[(String, Value)], open: &Value) {
         if !topic["measurement"].is_null() {
             let figures = figures.unwrap();
             assert_eq!(figures[3], topic["measurement"]["messages"], "{topic}");
-            assert_eq!(figures[4], topic["measurement"]["lost_messages"]);
+            assert_eq!(figures[4], topic["measurement"]["subscriber_lost_messages"]);
             let bits = figures[8].as_u64().unwrap();
             let marked = |name: &str| {
                 let place = flags.iter().position(|flag| flag == name).unwrap();
