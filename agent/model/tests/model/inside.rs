@@ -2,6 +2,8 @@
 //! findings, from reports built by hand in virtual time.
 
 mod findings;
+mod queues;
+mod slow;
 mod sources;
 mod sums;
 

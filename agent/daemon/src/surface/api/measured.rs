@@ -86,14 +86,13 @@ pub(super) fn breakdown(facts: &snapshot::Breakdown) -> Breakdown {
 fn distribution(values: &Histogram) -> Option<Distribution> {
     let (minimum, maximum) = values.range()?;
     let count = values.count();
-    let part = |part: f64| values.quantile(part).clamp(minimum, maximum);
     Some(Distribution {
         count,
         mean_seconds: values.sum() / count as f64,
         minimum_seconds: minimum,
-        p50_seconds: part(0.5),
-        p95_seconds: part(0.95),
-        p99_seconds: part(0.99),
+        p50_seconds: values.quantile(0.5)?,
+        p95_seconds: values.quantile(0.95)?,
+        p99_seconds: values.quantile(0.99)?,
         maximum_seconds: maximum,
     })
 }

@@ -323,6 +323,7 @@ fn delivery(facts: &DeliveryFacts) -> Delivery<'_> {
         process: facts.process.as_deref().map(Cow::Borrowed),
         cgroup: facts.cgroup.as_deref().map(Cow::Borrowed),
         delivered: delivered(&facts.delivered),
+        lost_in_reader_queue_messages: facts.lost_in_reader_queue,
     }
 }
 

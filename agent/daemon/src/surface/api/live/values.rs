@@ -119,6 +119,7 @@ impl Figures<'_> {
                 | Diagnosis::SlowCallback { .. }
                 | Diagnosis::ExecutorWait { .. }
                 | Diagnosis::IntraProcessOverflow { .. }
+                | Diagnosis::ReaderQueueOverflow { .. }
                 | Diagnosis::ObservationSuspended { .. }
                 | Diagnosis::RestampingNode { .. }
                 | Diagnosis::SlowChain { .. } => {}
