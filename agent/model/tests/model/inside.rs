@@ -6,6 +6,7 @@ mod queues;
 mod slow;
 mod sources;
 mod sums;
+mod unknown;
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -33,8 +33,8 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
         incomplete_messages: facts.incomplete,
         irrelevant_messages: facts.irrelevant,
         loss_ratio: (sent > 0).then(|| facts.lost as f64 / sent as f64),
-        rate_hertz: facts.rate_hz,
-        bandwidth_bytes_per_second: facts.bandwidth,
+        rate_hertz: Some(facts.rate_hz),
+        bandwidth_bytes_per_second: Some(facts.bandwidth),
         last_message_timestamp_seconds: last_message.map(|time| time.seconds()),
         interarrival: distribution(&facts.interarrival),
         latency: distribution(&facts.source_latency),
@@ -49,6 +49,15 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
             coverage_ratio: sampled.coverage(),
         }),
     }
+}
+
+/// Returns the answer's form of a topic's measurement.
+pub(super) fn topic_measurement(facts: &snapshot::TopicFacts) -> Option<Measurement> {
+    Some(Measurement {
+        rate_hertz: facts.rate_hz(),
+        bandwidth_bytes_per_second: facts.bandwidth(),
+        ..measurement(facts.measurement.as_deref()?)
+    })
 }
 
 /// Returns the answer's form of a delivery's counts.

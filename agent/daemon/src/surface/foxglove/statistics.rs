@@ -40,12 +40,12 @@ const FIGURES: [Figure; 13] = [
     (
         "rate_hertz",
         "Messages per second over the last window.",
-        |second| Some(second.measured.rate_hz),
+        |second| second.topic.rate_hz(),
     ),
     (
         "bandwidth_bytes_per_second",
         "Payload bytes per second over the same window.",
-        |second| Some(second.measured.bandwidth),
+        |second| second.topic.bandwidth(),
     ),
     (
         "messages",
