@@ -1,5 +1,5 @@
-// What processes show from inside: publishers, subscriptions, buffers and callbacks of a topic or a
-// node.
+// What processes show from inside: publishers, subscriptions with their queues, buffers and
+// callbacks of a topic or a node.
 
 import { count, duration, percent, rate } from './format.js';
 import { html, Name } from './ui.js';
@@ -19,6 +19,10 @@ export function tables(inside) {
       (inside.subscriptions ?? []).map((/** @type {any} */ it) => [it.topic, who(it),
         count(it.taken_messages), count(it.failed_takes), rate(it.rate_hertz), half(it.latency),
         most(it.latency)])],
+    ['Reader queues', ['Topic', 'Node', 'Arrived', 'Taken', 'Lost', 'Depth'],
+      (inside.reader_queues ?? []).map((/** @type {any} */ it) => [it.topic, who(it),
+        count(it.arrived_messages), count(it.taken_messages), count(it.lost_messages),
+        count(it.depth)])],
     ['Buffers', ['Topic', 'Node', 'Put in', 'Overwritten', 'Rate', 'Waiting p50', 'p99'],
       (inside.buffers ?? []).map((/** @type {any} */ it) => [it.topic ?? 'unknown', who(it),
         count(it.enqueued_messages), count(it.overwritten_messages), rate(it.rate_hertz),

@@ -52,7 +52,7 @@ export const FLAGS = /** @type {Record<string, [string, string, string]>} */ ({
   definition: ['error', 'definition', 'Endpoints have different definitions of the type.'],
   violated: ['error', 'violated', 'An expectation of a watch is violated.'],
   loss: ['warning', 'loss', 'Messages were lost in the last minute.'],
-  silent: ['warning', 'silent', 'No message in the last 10 s.'],
+  silent: ['warning', 'silent', 'It was sent regularly, and now there is no message for long.'],
   rejected: ['warning', 'rejected', 'limits.topics is reached: the topic is not measured.'],
   unheard: ['note', 'unheard', 'A publisher has no matching subscription.'],
   unfed: ['note', 'unfed', 'A subscription has no matching publisher.'],

@@ -101,6 +101,18 @@ pub enum Diagnosis<'a> {
         /// Share of messages overwritten when the problem appeared.
         overwritten_ratio: f64,
     },
+    /// A process takes its messages too slowly, and the middleware drops some from the queue of its
+    /// subscription.
+    ReaderQueueOverflow {
+        /// Node of the subscription; null when unknown.
+        node: Option<Cow<'a, str>>,
+        /// Its process.
+        process_id: u32,
+        /// Share of messages lost when the problem appeared.
+        lost_ratio: f64,
+        /// Messages that the queue keeps; null if that is not announced.
+        depth: Option<u64>,
+    },
     /// A process exceeds its budget of calls, and the agent no longer counts them.
     ObservationSuspended {
         /// The process.
@@ -143,6 +155,7 @@ impl Diagnosis<'_> {
             Self::SlowCallback { .. } => "slow_callback",
             Self::ExecutorWait { .. } => "executor_wait",
             Self::IntraProcessOverflow { .. } => "intra_process_overflow",
+            Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
             Self::SlowChain { .. } => "slow_chain",

@@ -25,6 +25,8 @@ pub struct Inside<'a> {
     pub publishers: Vec<Publisher<'a>>,
     /// Subscriptions that take from the middleware.
     pub subscriptions: Vec<Subscription<'a>>,
+    /// Queues of these subscriptions, as far as arrivals are known.
+    pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers of subscriptions within a process, in Iron and later.
     pub buffers: Vec<Buffer<'a>>,
     /// Callbacks, in the mode `full`.
@@ -111,7 +113,7 @@ pub struct Durations {
     pub p50_seconds: f64,
     /// 99th percentile.
     pub p99_seconds: f64,
-    /// Largest value; that of its bucket if an earlier one was larger.
+    /// Largest value; an upper bound if several are as large and an earlier one was larger.
     pub maximum_seconds: f64,
 }
 
@@ -168,6 +170,31 @@ pub struct Subscription<'a> {
     pub last_message_timestamp_seconds: f64,
     /// Time from the source timestamp to the take; null without any.
     pub latency: Option<Durations>,
+}
+
+/// The queue of a process's subscriptions with one topic, which the middleware fills.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(default)]
+#[expect(
+    missing_docs,
+    reason = "the document describes the owner where it is declared"
+)]
+pub struct ReaderQueue<'a> {
+    #[serde(flatten)]
+    pub owner: Owner<'a>,
+    /// ROS name of the topic.
+    pub topic: Cow<'a, str>,
+    /// GUID of the only writer whose messages arrive; null if there are several.
+    pub writer: Option<String>,
+    /// Messages that the queue keeps; null if the reader does not announce it.
+    pub depth: Option<u64>,
+    /// Messages that arrived since the agent observes the calls.
+    pub arrived_messages: u64,
+    /// Messages among them that were taken.
+    pub taken_messages: u64,
+    /// Messages among them that were dropped from the queue before they were taken.
+    pub lost_messages: u64,
 }
 
 /// The buffer of a subscription within a process.
@@ -290,6 +317,10 @@ pub struct TopicInside<'a> {
     pub dequeued_messages: u64,
     /// Calls of callbacks for messages of the same process.
     pub intra_process_receptions: u64,
+    /// Messages that arrived at observed processes and were dropped from the queue of a
+    /// subscription before they were taken; null if arrivals and takes of no process can be
+    /// compared.
+    pub lost_in_reader_queue_messages: Option<u64>,
     /// Messages per second over the last window.
     pub rate_hertz: f64,
     /// Unix time of the last message.
@@ -304,6 +335,9 @@ pub struct TopicInside<'a> {
     /// Subscriptions; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub subscriptions: Vec<Subscription<'a>>,
+    /// Queues of these subscriptions; only in the answer about one topic.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers; only in the answer about one topic.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub buffers: Vec<Buffer<'a>>,
@@ -325,6 +359,8 @@ pub struct NodeInside<'a> {
     pub publishers: Vec<Publisher<'a>>,
     /// Subscriptions.
     pub subscriptions: Vec<Subscription<'a>>,
+    /// Queues of these subscriptions.
+    pub reader_queues: Vec<ReaderQueue<'a>>,
     /// Buffers.
     pub buffers: Vec<Buffer<'a>>,
     /// Callbacks.

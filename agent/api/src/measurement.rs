@@ -31,10 +31,12 @@ pub struct Measurement {
     /// Messages that the worst subscriber lost divided by those that it expected; null before the
     /// first.
     pub loss_ratio: Option<f64>,
-    /// Messages per second over the last window.
-    pub rate_hertz: f64,
-    /// Payload bytes per second over the same window.
-    pub bandwidth_bytes_per_second: f64,
+    /// Messages per second over the last window; null if no message can be seen, as those within a
+    /// process.
+    pub rate_hertz: Option<f64>,
+    /// Payload bytes per second over the same window; null if the sizes are unknown, as those of
+    /// messages that only calls inside processes show.
+    pub bandwidth_bytes_per_second: Option<f64>,
     /// Unix time of the last message.
     pub last_message_timestamp_seconds: Option<f64>,
     /// Time between consecutive messages of one writer.

@@ -161,6 +161,9 @@ pub struct Delivery<'a> {
     pub cgroup: Option<Cow<'a, str>>,
     /// Fate of the messages.
     pub delivered: Delivered,
+    /// Delivered messages that the process never took from the queue of its subscription; null if
+    /// its calls are not observed, or other writers fill the same queue.
+    pub lost_in_reader_queue_messages: Option<u64>,
 }
 
 /// State of acknowledgement between a reliable reader and a writer.

@@ -146,8 +146,8 @@ pub struct WatchedTopic {
     pub violations: Vec<Cow<'static, str>>,
     /// Messages counted since the topic is watched.
     pub messages: u64,
-    /// Messages per second over the last window.
-    pub rate_hertz: f64,
+    /// Messages per second over the last window; null if no message can be seen.
+    pub rate_hertz: Option<f64>,
 }
 
 /// State of a topic's expectations.

@@ -20,6 +20,9 @@ pub fn select(inside: &mut Inside<'_>, name: &str) {
         .subscriptions
         .retain(|each| is_own(&each.owner) || each.topic == name);
     inside
+        .reader_queues
+        .retain(|each| is_own(&each.owner) || each.topic == name);
+    inside
         .buffers
         .retain(|each| is_own(&each.owner) || is_topic(each.topic.as_deref()));
     inside
@@ -113,6 +116,18 @@ pub fn text(inside: &Inside<'_>) -> String {
         "MIDDLEWARE",
     ];
     table(&mut out, head, subscriptions);
+    let queues = inside.reader_queues.iter().map(|it| {
+        row([
+            safe(&it.topic),
+            who(&it.owner),
+            it.arrived_messages.to_string(),
+            it.taken_messages.to_string(),
+            it.lost_messages.to_string(),
+            it.depth.map(|depth| depth.to_string()).unwrap_or_default(),
+        ])
+    });
+    let head = ["READER QUEUE", "NODE", "ARRIVED", "TAKEN", "LOST", "DEPTH"];
+    table(&mut out, head, queues);
     let buffers = inside.buffers.iter().map(|it| {
         let capacity = it.capacity.map(|capacity| format!("/{capacity}"));
         row([

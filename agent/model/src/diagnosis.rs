@@ -143,6 +143,18 @@ pub enum Diagnosis {
         /// Overwritten messages of 1000 that entered the queue.
         overwritten_permille: u64,
     },
+    /// A process takes its messages so slowly that the middleware drops some from the queue of its
+    /// subscription.
+    ReaderQueueOverflow {
+        /// Topic.
+        topic: TopicKey,
+        /// The subscription.
+        queue: Owner,
+        /// Lost messages of 1000 that arrived.
+        lost_permille: u64,
+        /// Messages that the queue keeps, if that is announced.
+        depth: Option<u64>,
+    },
     /// A process makes more calls than its budget allows, and they are no longer counted.
     ObservationSuspended {
         /// Domain of the process.
@@ -222,7 +234,7 @@ pub enum Change<'a> {
 
 impl Diagnosis {
     /// All kinds, as label values.
-    pub const KINDS: [&'static str; 14] = [
+    pub const KINDS: [&'static str; 15] = [
         "qos_incompatible",
         "type_conflict",
         "type_hash_conflict",
@@ -234,6 +246,7 @@ impl Diagnosis {
         "slow_callback",
         "executor_wait",
         "intra_process_overflow",
+        "reader_queue_overflow",
         "observation_suspended",
         "restamping_node",
         "slow_chain",
@@ -254,6 +267,7 @@ impl Diagnosis {
             Self::SlowCallback { .. } => "slow_callback",
             Self::ExecutorWait { .. } => "executor_wait",
             Self::IntraProcessOverflow { .. } => "intra_process_overflow",
+            Self::ReaderQueueOverflow { .. } => "reader_queue_overflow",
             Self::ObservationSuspended { .. } => "observation_suspended",
             Self::RestampingNode { .. } => "restamping_node",
             Self::SlowChain { .. } => "slow_chain",
@@ -271,6 +285,7 @@ impl Diagnosis {
             | Self::UnfedSubscriber { topic, .. }
             | Self::HangingCall { topic, .. }
             | Self::IntraProcessOverflow { topic, .. }
+            | Self::ReaderQueueOverflow { topic, .. }
             | Self::RestampingNode { topic, .. }
             | Self::SlowChain { topic, .. } => Some(topic),
             Self::SlowCallback { topic, .. } | Self::ExecutorWait { topic, .. } => topic.as_ref(),
@@ -302,7 +317,9 @@ impl Diagnosis {
             Self::SlowCallback { callback, .. } | Self::ExecutorWait { callback, .. } => {
                 Some(callback)
             }
-            Self::IntraProcessOverflow { queue, .. } => Some(queue),
+            Self::IntraProcessOverflow { queue, .. } | Self::ReaderQueueOverflow { queue, .. } => {
+                Some(queue)
+            }
             _ => None,
         }
     }
@@ -336,7 +353,8 @@ impl Diagnosis {
             Self::ObservationSuspended { domain_id, .. } => (*domain_id, "", None, None),
             Self::SlowCallback { .. }
             | Self::ExecutorWait { .. }
-            | Self::IntraProcessOverflow { .. } => (DomainId(0), "", None, None),
+            | Self::IntraProcessOverflow { .. }
+            | Self::ReaderQueueOverflow { .. } => (DomainId(0), "", None, None),
             Self::RestampingNode { node, .. } => (DomainId(0), node, None, None),
             Self::SlowChain { from, .. } => (DomainId(0), from, None, None),
         }

@@ -387,6 +387,7 @@ pub fn bounded_finding(finding: &Diagnosis) -> Diagnosis {
         | Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
         | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. }
         | Diagnosis::RestampingNode { .. }
         | Diagnosis::SlowChain { .. } => {}

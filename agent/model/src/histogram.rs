@@ -34,12 +34,13 @@ impl Histogram {
     }
 
     /// Creates a histogram from another kind of distribution: `up_to` returns the number of values
-    /// of at most a bound, `range` the smallest and largest value in seconds.
+    /// of at most a bound, `range` the smallest and largest value in seconds. Values just below a
+    /// bound may be counted above it.
     #[must_use]
     pub fn of(up_to: impl Fn(f64) -> u64, count: u64, sum: f64, range: (f64, f64)) -> Self {
         let mut histogram = Self {
             sum,
-            minimum: range.0,
+            minimum: range.0.min(range.1),
             maximum: range.1,
             ..Self::default()
         };
@@ -52,8 +53,11 @@ impl Histogram {
         histogram
     }
 
-    /// Adds a value in seconds.
+    /// Adds a value in seconds. A value that is not finite is ignored.
     pub fn observe(&mut self, seconds: f64) {
+        if !seconds.is_finite() {
+            return;
+        }
         if self.counts.iter().all(|count| *count == 0) {
             (self.minimum, self.maximum) = (seconds, seconds);
         }
@@ -83,8 +87,8 @@ impl Histogram {
         self.maximum = self.maximum.max(other.maximum);
     }
 
-    /// Returns the values added since `earlier`, an older state of this histogram. Its range is
-    /// unknown.
+    /// Returns the values added since `earlier`, an older state of this histogram. Its range is as
+    /// narrow as both states show: exact for a single value, and for a new extreme.
     #[must_use]
     pub fn since(&self, earlier: &Self) -> Self {
         let mut difference = *self;
@@ -96,27 +100,32 @@ impl Histogram {
             *count = count.saturating_sub(before);
         }
         difference.sum -= earlier.sum;
+        let before = earlier.range();
+        let is_least_open = before.is_some_and(|(least, _)| self.minimum >= least);
+        let is_largest_open = before.is_some_and(|(_, largest)| self.maximum <= largest);
+        difference.narrow(is_least_open, is_largest_open);
         difference
     }
 
-    /// Estimates the value below which this share of the values lies, as Prometheus does: values
-    /// are spread evenly within a bucket. Returns `f64::MAX` if it lies above all bounds.
+    /// Estimates the value below which this share of the values lies: values are spread evenly
+    /// between the bounds of a bucket, within the range. Above the last bound it lies between that
+    /// bound and the largest value. Returns `None` if the histogram is empty.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
-    pub fn quantile(&self, part: f64) -> f64 {
+    pub fn quantile(&self, part: f64) -> Option<f64> {
+        let (least, largest) = self.range()?;
         let wanted = self.count() as f64 * part;
-        let (mut lower, mut below) = (0.0, 0.0);
-        for (upper, count) in self.buckets() {
+        let (mut value, mut below) = (largest, 0.0);
+        for (start, end, count) in self.filled() {
             let count = count as f64;
-            if count > 0.0 && below + count >= wanted {
-                if upper.is_infinite() {
-                    return f64::MAX;
-                }
-                return lower + (upper - lower) * (wanted - below) / count;
+            if below + count >= wanted {
+                let (start, end) = (start.max(least), end.min(largest));
+                value = start + (end - start) * ((wanted - below).max(0.0) / count);
+                break;
             }
-            (lower, below) = (upper, below + count);
+            below += count;
         }
-        lower
+        Some(value.max(least).min(largest))
     }
 
     /// Returns the number of values.
@@ -146,6 +155,43 @@ impl Histogram {
             .zip(self.counts.iter().copied())
     }
 
+    /// Moves the range into the buckets in use. Ends that are not exact are narrowed by the sum.
+    #[expect(clippy::cast_precision_loss, reason = "counts far below 2^52")]
+    fn narrow(&mut self, is_least_open: bool, is_largest_open: bool) {
+        let mut filled = self.filled();
+        let Some(lowest) = filled.next() else {
+            return;
+        };
+        let highest = filled.last().unwrap_or(lowest);
+        let mut least = self.minimum.max(lowest.0).min(lowest.1);
+        let mut largest = self.maximum.max(highest.0).min(highest.1);
+        if is_largest_open {
+            // All others are as small as they can be.
+            let start = highest.0.max(least);
+            let all = self
+                .filled()
+                .map(|(start, _, count)| start.max(least) * count as f64);
+            let others = all.sum::<f64>() - start;
+            largest = largest.min((self.sum - others).max(start));
+        }
+        if is_least_open {
+            // All others are as large as they can be.
+            let others = (self.count() - 1) as f64 * largest;
+            least = least.max((self.sum - others).min(lowest.1));
+        }
+        (self.minimum, self.maximum) = (least.min(largest), largest);
+    }
+
+    /// Returns the start, the end and the count of each bucket in use.
+    fn filled(&self) -> impl Iterator<Item = (f64, f64, u64)> + '_ {
+        let starts = [f64::NEG_INFINITY]
+            .into_iter()
+            .chain(self.bounds().iter().copied());
+        let buckets = starts.zip(self.buckets());
+        let all = buckets.map(|(start, (end, count))| (start, end, count));
+        all.filter(|(_, _, count)| *count > 0)
+    }
+
     const fn bounds(&self) -> &'static [f64; 16] {
         if self.fine { &FINE_BOUNDS } else { &BOUNDS }
     }
@@ -153,7 +199,91 @@ impl Histogram {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
+
+    fn of(values: &[f64], is_fine: bool) -> Histogram {
+        let mut histogram = match is_fine {
+            true => Histogram::fine(),
+            false => Histogram::default(),
+        };
+        values.iter().for_each(|value| histogram.observe(*value));
+        histogram
+    }
+
+    /// Fails if a quantile lies outside of the range, or decreases.
+    fn check(histogram: &Histogram) {
+        let Some((least, largest)) = histogram.range() else {
+            assert_eq!((histogram.count(), histogram.quantile(0.5)), (0, None));
+            return;
+        };
+        assert!(least <= largest, "{histogram:?}");
+        let mut before = least;
+        for part in [-1.0, 0.0, 0.01, 0.5, 0.99, 1.0, f64::NAN] {
+            let value = histogram.quantile(part).unwrap();
+            assert!((before..=largest).contains(&value), "{part}: {histogram:?}");
+            before = value;
+        }
+    }
+
+    /// Seconds of any magnitude, and what no clock shows.
+    fn any_seconds() -> impl Strategy<Value = f64> {
+        let usual = (-9.0..9.0_f64).prop_map(|power| 10_f64.powf(power));
+        prop_oneof![6 => usual, 1 => any::<f64>(), 1 => Just(f64::NAN), 1 => Just(f64::INFINITY)]
+    }
+
+    proptest! {
+        #[test]
+        fn no_value_stops_a_quantile(
+            first in prop::collection::vec(any_seconds(), 0..20),
+            then in prop::collection::vec(any_seconds(), 0..20),
+            is_fine: bool,
+        ) {
+            let earlier = of(&first, is_fine);
+            check(&earlier);
+            let mut both = earlier;
+            both.merge(&of(&then, is_fine));
+            check(&both);
+            check(&both.since(&earlier));
+            check(&earlier.since(&both));
+            let finite = then.iter().filter(|value| value.is_finite()).count();
+            prop_assert_eq!(both.since(&earlier).count(), finite as u64);
+        }
+
+        #[test]
+        fn the_range_of_a_difference_holds_all_its_values(
+            first in prop::collection::vec(0.0..100.0_f64, 0..20),
+            then in prop::collection::vec(0.0..100.0_f64, 1..20),
+        ) {
+            let earlier = of(&first, false);
+            let mut both = earlier;
+            both.merge(&of(&then, false));
+            let (least, largest) = both.since(&earlier).range().unwrap();
+            let noise = 1e-9;
+            for value in then {
+                prop_assert!(least - noise <= value && value <= largest + noise, "{value}");
+            }
+        }
+    }
+
+    #[test]
+    fn values_above_the_last_bound_have_quantiles_up_to_the_largest() {
+        let slow = of(&[40.0; 9], false);
+        assert_eq!(slow.quantile(0.5), Some(40.0));
+        let mixed = of(&[20.0, 30.0, 90_000.0], false);
+        let median = mixed.quantile(0.5).unwrap();
+        assert!((10.0..=90_000.0).contains(&median), "{median}");
+        assert_eq!(mixed.quantile(1.0), Some(90_000.0));
+        // One more interval is known exactly, although a longer one came before.
+        let mut later = mixed;
+        later.observe(41.0);
+        let since = later.since(&mixed);
+        assert!(
+            (since.quantile(0.99).unwrap() - 41.0).abs() < 1e-6,
+            "{since:?}"
+        );
+    }
 
     #[test]
     fn a_bound_belongs_to_its_own_bucket() {
@@ -193,7 +323,7 @@ mod tests {
         let difference = histogram.since(&earlier);
         assert_eq!(difference.count(), 3);
         assert!(
-            (0.1..=0.2).contains(&difference.quantile(0.5)),
+            (0.1..=0.2).contains(&difference.quantile(0.5).unwrap()),
             "{difference:?}"
         );
         assert_eq!(earlier.since(&histogram), earlier, "it began anew");

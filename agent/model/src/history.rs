@@ -405,10 +405,12 @@ impl PreviousTotals {
         let count = |all, earlier| u32::try_from(fresh(all, earlier)).unwrap_or(u32::MAX);
         let percentiles = |now: &Histogram, before: &Histogram| {
             let difference = now.since(before);
-            let Some((minimum, maximum)) = now.range().filter(|_| difference.count() > 0) else {
-                return [Bfloat16::NONE; 2];
+            let quantile = |part| {
+                difference
+                    .quantile(part)
+                    .map_or(Bfloat16::NONE, Bfloat16::new)
             };
-            [0.5, 0.99].map(|part| Bfloat16::new(difference.quantile(part).clamp(minimum, maximum)))
+            [0.5, 0.99].map(quantile)
         };
         #[expect(
             clippy::cast_precision_loss,

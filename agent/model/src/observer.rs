@@ -5,6 +5,7 @@
 //! no packets.
 
 mod announcements;
+mod arrivals;
 mod calendar;
 mod calls;
 mod chains;

@@ -183,6 +183,9 @@ pub struct TopicFacts {
     pub observed_pairs: Vec<TransportCount>,
 }
 
+/// Intervals after which a topic counts as sent regularly.
+const REGULAR: u64 = 10;
+
 /// Transport between a writer and a reader, as both announce it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Transport {
@@ -266,6 +269,56 @@ impl TopicFacts {
         let mut observed = self.observed_pairs.iter();
         let own = observed.find(|count| count.transport == transport);
         own.map_or(0, |count| count.pairs)
+    }
+
+    /// Returns the messages per second of the last window. `None` if the topic is not measured, or
+    /// if no message was seen and none can be: all pairs use transports that are not observed.
+    #[must_use]
+    pub fn rate_hz(&self) -> Option<f64> {
+        let measured = self.measurement.as_deref()?;
+        (measured.rate_hz > 0.0 || !self.is_unseen()).then_some(measured.rate_hz)
+    }
+
+    /// Returns the payload bytes per second of the last window. `None` if the rate is unknown, or
+    /// if messages were seen without their size.
+    #[must_use]
+    pub fn bandwidth(&self) -> Option<f64> {
+        let measured = self.measurement.as_deref()?;
+        let rate_hz = self.rate_hz()?;
+        let has_sizes = self.source == Source::Wire && measured.bytes > 0;
+        (rate_hz == 0.0 || has_sizes).then_some(measured.bandwidth)
+    }
+
+    /// Returns whether a measured topic that was sent regularly has not been sent for long: for 10 s
+    /// and five times the longest interval so far. A topic whose messages are events is not silent.
+    #[must_use]
+    pub fn is_silent(&self, now: Timestamp) -> bool {
+        let Some(measured) = self.measurement.as_deref() else {
+            return false;
+        };
+        let (Some(last), Some((_, longest))) =
+            (measured.last_message, measured.interarrival.range())
+        else {
+            return false;
+        };
+        let is_regular = measured.interarrival.count() >= REGULAR;
+        let silence = (now - last).as_secs_f64();
+        self.rate_hz() == Some(0.0) && is_regular && silence >= longest * 5.0
+    }
+
+    /// Returns whether all pairs use transports that the network does not show, and not all of their
+    /// processes are observed.
+    fn is_unseen(&self) -> bool {
+        let is_hidden = |count: &TransportCount| {
+            let is_inner = matches!(
+                count.transport,
+                Transport::SameProcess | Transport::DataSharing | Transport::Iceoryx
+            );
+            is_inner && self.observed_pairs(count.transport) < count.pairs
+        };
+        self.source == Source::Wire
+            && !self.transports.is_empty()
+            && self.transports.iter().all(is_hidden)
     }
 }
 

@@ -96,7 +96,9 @@ pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {
     })
 }
 
-fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transport> {
+/// Returns the transport between this writer and this reader; `None` if one is unknown, or if they
+/// have no protocol in common.
+pub(super) fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transport> {
     let endpoints = discovery.endpoints();
     let (of_writer, of_reader) = (endpoints.get(&writer)?, endpoints.get(&reader)?);
     if writer.prefix.is_zenoh() != reader.prefix.is_zenoh() {
@@ -128,7 +130,8 @@ fn transport(discovery: &Discovery, writer: Guid, reader: Guid) -> Option<Transp
     })
 }
 
-fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
+/// Returns the implementation of a participant.
+pub(super) fn vendor(discovery: &Discovery, prefix: GuidPrefix) -> VendorId {
     let participant = discovery.participants().get(&prefix);
     let [first, second, ..] = prefix.0;
     participant.map_or(VendorId([first, second]), |known| known.proxy.vendor)

@@ -160,6 +160,8 @@ const STATIONS = /** @type {[string, string][]} */ ([
   ['lost_in_socket_buffer_messages', 'in the socket buffer'],
   ['pending_messages', 'or late, not known so far'],
 ]);
+/** The last place: a message is delivered there, and then dropped. */
+const QUEUE = 'in the reader’s queue';
 
 /** Messages sent, lost at each place, and delivered, per subscriber. @param {{details: any}} props */
 function Waterfall({ details }) {
@@ -180,26 +182,33 @@ function Waterfall({ details }) {
   return html`<section aria-labelledby="waterfall">${title}
     <div class="scroll" tabindex="0" role="group" aria-labelledby="waterfall"><table>
     <thead><tr><th scope="col">Publisher → subscriber</th><th scope="col" class="number">Sent</th>
-      ${STATIONS.map(([, name]) => html`<th scope="col" class="number">Lost ${name}</th>`)}
+      ${[...STATIONS.map(([, name]) => name), QUEUE].map((name) => html`<th scope="col"
+        class="number">Lost ${name}</th>`)}
       <th scope="col" class="number">Delivered</th><th scope="col">Share</th></tr></thead>
     <tbody>${received.map((/** @type {any} */ each) => {
-      const { delivered } = each;
+      const { delivered, lost_in_reader_queue_messages: queue } = each;
       const total = delivered.messages + delivered.lost_messages + delivered.pending_messages;
+      const cell = (/** @type {number|null} */ lost) => html`<td class="number ${(lost ?? 0) > 0
+        ? 'bad' : ''}">${(lost ?? 0) > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(
+        lost)}</td>`;
       const who = each.nodes.length ? each.nodes.join(', ')
         : each.process ? `${each.process} ${each.process_id}` : each.subscriber || each.destination;
       return html`<tr key=${`${each.writer} ${each.destination} ${each.subscriber}`}>
         <th scope="row"><${Name} text=${owners.get(each.writer) ?? each.writer} /> → <${Name}
           text=${who} /></th>
         <td class="number">${count(total)}</td>
-        ${STATIONS.map(([key]) => html`<td class="number ${delivered[key] > 0 ? 'bad' : ''}">${
-          delivered[key] > 0 ? html`<${Mark} severity="warning" /> ` : ''}${count(delivered[key])}</td>`)}
-        <td class="number">${count(delivered.messages)}</td>
-        <td><${Bar} delivered=${delivered} total=${total} /></td></tr>`;
-    })}</tbody></table></div></section>`;
+        ${STATIONS.map(([key]) => cell(delivered[key]))}
+        ${cell(queue)}
+        <td class="number">${count(delivered.messages - (queue ?? 0))}</td>
+        <td><${Bar} delivered=${delivered} queue=${queue ?? 0} total=${total} /></td></tr>`;
+    })}</tbody></table></div>
+    ${received.some((/** @type {any} */ each) => each.lost_in_reader_queue_messages == null)
+      && html`<p class="dim">–: the queue is unseen, because the takes of that subscriber are not
+        observed, or not alone (capture.inside).</p>`}</section>`;
 }
 
-/** @param {{delivered: any, total: number}} props */
-function Bar({ delivered, total }) {
+/** @param {{delivered: any, queue: number, total: number}} props */
+function Bar({ delivered, queue, total }) {
   if (!total) return null;
   let x = 0;
   const part = (/** @type {number} */ number, /** @type {string} */ kind) => {
@@ -210,9 +219,10 @@ function Bar({ delivered, total }) {
     return own;
   };
   return html`<svg class="bar" viewBox="0 0 160 12" aria-hidden="true">
-    ${part(delivered.messages, 'delivered')}
-    ${STATIONS.map(([key], at) => part(delivered[key], `lost-${at}`))}</svg>
-    ${' '}${percent(delivered.messages / total)}`;
+    ${part(delivered.messages - queue, 'delivered')}
+    ${STATIONS.map(([key], at) => part(delivered[key], `lost-${at}`))}
+    ${part(queue, 'lost-2')}</svg>
+    ${' '}${percent((delivered.messages - queue) / total)}`;
 }
 
 /** The passages of messages to subscribers. @param {{details: any}} props */

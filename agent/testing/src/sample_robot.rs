@@ -440,6 +440,7 @@ pub fn delivery(direction: Direction) -> DeliveryFacts {
         first_seen: Timestamp(5),
         last_seen: Timestamp(6),
         delivered: if received { delivered() } else { sent() },
+        lost_in_reader_queue: received.then_some(7),
     }
 }
 

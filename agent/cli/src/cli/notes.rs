@@ -368,7 +368,8 @@ fn counted_inside(topic: &Topic<'_>) -> Option<String> {
     Some(format!(
         "its figures come from inside the processes, where no single message is seen: {} messages, \
          {:.1} Hz (`rp top`, `rp inside`)",
-        measured.messages, measured.rate_hertz
+        measured.messages,
+        measured.rate_hertz.unwrap_or_default()
     ))
 }
 
@@ -409,7 +410,7 @@ mod tests {
             source: "inside".into(),
             measurement: Some(ros2probe_api::measurement::Measurement {
                 messages: 200,
-                rate_hertz: 20.04,
+                rate_hertz: Some(20.04),
                 ..Default::default()
             }),
             ..Topic::default()

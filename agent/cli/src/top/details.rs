@@ -401,8 +401,12 @@ fn publishers(topic: &Topic<'_>, theme: Theme, lines: &mut Vec<Styled>) {
         let line = format!(
             "{:<NODE$} {:>6} {:>6} {:>6} {:>5} {:>5}  {}",
             node(writer, theme),
-            known(measured.map(|it| rate(it.rate_hertz))),
-            known(measured.map(|it| bytes(it.bandwidth_bytes_per_second))),
+            known(measured.and_then(|it| it.rate_hertz).map(rate)),
+            known(
+                measured
+                    .and_then(|it| it.bandwidth_bytes_per_second)
+                    .map(bytes)
+            ),
             known(measured.map(|it| it.lost_messages.to_string())),
             known(latency.map(|it| seconds(it.p50_seconds))),
             known(latency.map(|it| seconds(it.p99_seconds))),

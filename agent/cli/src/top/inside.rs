@@ -52,6 +52,16 @@ pub(super) fn problem(diagnosis: &Diagnosis<'_>) -> Option<String> {
             who(node, process_id),
             ratio(*overwritten_ratio)
         ),
+        Diagnosis::ReaderQueueOverflow {
+            node,
+            process_id,
+            lost_ratio,
+            ..
+        } => format!(
+            "{} takes too slowly: its queue loses {} of the messages",
+            who(node, process_id),
+            ratio(*lost_ratio)
+        ),
         Diagnosis::ObservationSuspended { process_id, .. } => {
             format!("process {process_id} exceeds the budget of capture.inside")
         }
@@ -69,6 +79,10 @@ pub(super) fn counts(inside: &TopicInside<'_>) -> String {
         ("takes without a message", inside.failed_takes),
         ("buffered within the process", inside.enqueued_messages),
         ("overwritten there", inside.overwritten_messages),
+        (
+            "lost in queues of subscriptions",
+            inside.lost_in_reader_queue_messages.unwrap_or_default(),
+        ),
         (
             "received within the process",
             inside.intra_process_receptions,

@@ -177,9 +177,9 @@ impl Row {
             name: shown_name(topic),
             message_type: types.join(", "),
             is_measured,
-            rate: measured.map(|it| it.rate_hertz),
+            rate: measured.and_then(|it| it.rate_hertz),
             wanted: wanted(topic),
-            bandwidth: measured.map(|it| it.bandwidth_bytes_per_second),
+            bandwidth: measured.and_then(|it| it.bandwidth_bytes_per_second),
             loss,
             median: latency.map(|it| it.p50_seconds),
             p99: latency.map(|it| it.p99_seconds),
@@ -255,7 +255,8 @@ fn standing(topic: &Topic<'_>, is_measured: bool) -> Standing {
     let flows = topic
         .measurement
         .as_ref()
-        .is_some_and(|it| it.rate_hertz > 0.0);
+        .and_then(|it| it.rate_hertz)
+        .is_some_and(|rate| rate > 0.0);
     match () {
         () if has("violated") => Standing::Violated,
         () if is_blind && !flows => Standing::Unseen,

@@ -456,6 +456,7 @@ fn finding(finding: &Diagnosis) -> Values {
         Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
         | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. } => inside(finding),
         Diagnosis::RestampingNode { node, input, .. } => {
             vec![("ros_node", Some(text(node))), ("from", Some(text(input)))]
@@ -505,6 +506,10 @@ fn inside(finding: &Diagnosis) -> Values {
         } => {
             let ratio = Duration::from_millis(*overwritten_permille);
             values.push(("overwritten_ratio", seconds(&ratio)));
+        }
+        Diagnosis::ReaderQueueOverflow { lost_permille, .. } => {
+            let ratio = Duration::from_millis(*lost_permille);
+            values.push(("lost_ratio", seconds(&ratio)));
         }
         Diagnosis::ObservationSuspended {
             domain_id, process, ..

@@ -123,6 +123,7 @@ const FINDING: &[&str] = &[
     "period_seconds",
     "wait_seconds",
     "overwritten_ratio",
+    "lost_ratio",
     "from",
     "max_latency_ms",
 ];
@@ -230,8 +231,8 @@ pub(super) const GRAPH_DIAGNOSED: Definition = Definition::new(
     FINDING,
     "Another fault of the graph, named by `diagnosis`: type_conflict, type_hash_conflict, \
      duplicate_node, node_in_several_domains, slow_callback, executor_wait, \
-     intra_process_overflow, observation_suspended, slow_chain, or (INFO) unheard_publisher, \
-     unfed_subscriber, restamping_node.",
+     intra_process_overflow, reader_queue_overflow, observation_suspended, slow_chain, or (INFO) \
+     unheard_publisher, unfed_subscriber, restamping_node.",
 )
 .relief(Severity::Info);
 pub(super) const GRAPH_RESOLVED: Definition = Definition::new(

@@ -20,6 +20,8 @@ use ros2probe_model::snapshot::{
 const MAX_SHOWN: usize = 1_000;
 /// Largest number of sockets with their own series.
 const MAX_SOCKETS: usize = 64;
+/// Cause of messages that arrived, and that a process never took.
+const READER_QUEUE: &str = "reader_queue";
 /// Largest number of nodes in one label.
 const MAX_NODES: usize = 4;
 
@@ -130,7 +132,15 @@ impl<'a> Deliveries<'a> {
                         cause_label,
                     ];
                     family.sample(&labels, delivery.delivered.lost_by(cause))
-                })
+                })?;
+                match delivery.facts.lost_in_reader_queue {
+                    Some(lost) => {
+                        let cause = Label::Text(READER_QUEUE);
+                        let labels = [domain_id, topic, writer, destination, subscriber, cause];
+                        family.sample(&labels, lost)
+                    }
+                    None => Ok(()),
+                }
             })
         })?;
         self.each_received(sink, &metric::SUBSCRIBER_PENDING, |got| got.open().into())?;
@@ -271,6 +281,13 @@ pub(super) fn sums(
             for cause in LossCause::ALL {
                 let labels = [domain_id, topic, Label::Text(cause.label())];
                 family.sample(&labels, received.lost_by(cause))?;
+            }
+        }
+        for row in rows {
+            let inside = row.facts.and_then(|topic| topic.inside.as_deref());
+            if let Some(lost) = inside.and_then(|inside| inside.lost_in_queues) {
+                let [domain_id, topic] = row.labels();
+                family.sample(&[domain_id, topic, Label::Text(READER_QUEUE)], lost)?;
             }
         }
         Ok(())

@@ -327,12 +327,10 @@ pub(super) fn topics(
         })
     })?;
     sink.family(&metric::TOPIC_RATE, |family| {
-        measured(family, rows, |facts| Some(facts.rate_hz.into()))
+        per_second(family, rows, TopicFacts::rate_hz)
     })?;
     sink.family(&metric::TOPIC_BANDWIDTH, |family| {
-        measured(family, rows, |facts| {
-            has_size(facts).then(|| facts.bandwidth.into())
-        })
+        per_second(family, rows, TopicFacts::bandwidth)
     })?;
     let doubts: [(&Metric, Count); 3] = [
         (&metric::TOPIC_NEGATIVE_LATENCY, |measured| {
@@ -461,6 +459,25 @@ fn measured(
             .measurement()
             .or_else(|| row.watched.then_some(&nothing));
         if let Some(value) = facts.and_then(&value) {
+            family.sample(&row.labels(), value)?;
+        }
+    }
+    Ok(())
+}
+
+/// Writes a value per second of each measured topic where it is known; 0 of a watched name without a
+/// topic.
+fn per_second(
+    family: &mut Family<'_, '_>,
+    rows: &[TopicRow<'_>],
+    value: impl Fn(&TopicFacts) -> Option<f64>,
+) -> fmt::Result {
+    for row in rows {
+        let value = match (row.facts, row.measurement()) {
+            (Some(facts), Some(_)) => value(facts),
+            _ => row.watched.then_some(0.0),
+        };
+        if let Some(value) = value {
             family.sample(&row.labels(), value)?;
         }
     }

@@ -18,13 +18,14 @@ use crate::receivers::Receivers;
 #[derive(Debug, Default)]
 pub(super) struct Attribution {
     processes: HashMap<u32, ProcessGraph>,
-    /// Participants of these processes.
-    pub(super) participants: HashSet<GuidPrefix>,
+    /// Participants of all of these processes.
+    pub(super) all: HashSet<GuidPrefix>,
 }
 
 /// Participants, nodes and endpoints of one process.
 #[derive(Debug, Default)]
 struct ProcessGraph {
+    participants: BTreeSet<GuidPrefix>,
     domain_ids: BTreeSet<DomainId>,
     nodes: BTreeSet<NodeName>,
     writers: Endpoints,
@@ -82,8 +83,9 @@ impl Attribution {
         participant: &Participant,
         discovery: &Discovery,
     ) {
-        self.participants.insert(prefix);
+        self.all.insert(prefix);
         let graph = self.processes.entry(process).or_default();
+        graph.participants.insert(prefix);
         graph.domain_ids.insert(participant.domain_id);
         let mut owners = HashMap::new();
         for node in &participant.nodes {
@@ -148,6 +150,12 @@ impl Attribution {
         let graph = self.processes.get(&process);
         let own = graph.and_then(|graph| only(graph.domain_ids.iter()));
         own.copied().unwrap_or(otherwise)
+    }
+
+    /// Returns the participants of this process.
+    pub(super) fn participants(&self, process: u32) -> BTreeSet<GuidPrefix> {
+        let graph = self.processes.get(&process);
+        graph.map_or_else(BTreeSet::new, |graph| graph.participants.clone())
     }
 
     /// Returns the only node of this process, or `None` if it has several.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::{DomainId, Timestamp};
+use ros2probe_wire::{DomainId, Guid, Timestamp};
 
 use super::report::{Durations, Trigger};
 use crate::names::{NodeName, TopicName};
@@ -21,6 +21,8 @@ pub struct InsideFacts {
     pub publishers: Vec<Publisher>,
     /// Subscriptions that take from the middleware.
     pub subscriptions: Vec<Subscription>,
+    /// Queues of these subscriptions, as far as their arrivals are known.
+    pub reader_queues: Vec<ReaderQueue>,
     /// Ring buffers of intra-process subscriptions.
     pub buffers: Vec<Buffer>,
     /// Callbacks.
@@ -151,6 +153,26 @@ pub struct Buffer {
     pub waiting: Quantiles,
 }
 
+/// The queue of a process's subscriptions with one topic, between the network and the call that
+/// takes.
+#[derive(Clone, Debug)]
+pub struct ReaderQueue {
+    /// Process, the first of its subscriptions, and the node of all.
+    pub owner: Owner,
+    /// Its topic.
+    pub topic: TopicName,
+    /// The only writer whose messages arrive; `None` if there are several.
+    pub writer: Option<Guid>,
+    /// Messages that it keeps, if that is announced.
+    pub depth: Option<u64>,
+    /// Messages that arrived since the agent compares.
+    pub arrived: u64,
+    /// Messages among them that were taken.
+    pub taken: u64,
+    /// Messages among them that were lost.
+    pub lost: u64,
+}
+
 /// A callback.
 #[derive(Clone, Debug)]
 pub struct Callback {
@@ -241,6 +263,9 @@ pub struct TopicInside {
     pub latency: Arc<Durations>,
     /// Time that messages spent in buffers.
     pub waiting: Arc<Durations>,
+    /// Messages that arrived at observed processes and were never taken; `None` if arrivals and
+    /// takes of no process can be compared.
+    pub lost_in_queues: Option<u64>,
 }
 
 impl InsideFacts {

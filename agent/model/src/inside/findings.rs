@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::inside::distribution::{DELAY, INTERVAL};
-use ros2probe_wire::inside::{bucket, bucket_start};
 
 use super::report::{Durations, Trigger};
 use super::tracked::{Kind, Tracked};
@@ -20,7 +19,7 @@ const BAD: u8 = 3;
 /// Good evaluations in a row until it goes.
 const GOOD: u8 = 10;
 /// Time after the first report of a handle in which it is not judged.
-const GRACE: Duration = Duration::from_secs(10);
+pub(super) const GRACE: Duration = Duration::from_secs(10);
 /// Least number of calls or messages of a window that are bad.
 const LEAST: u64 = 3;
 /// Their least share, as a divisor: 1 %.
@@ -69,7 +68,7 @@ pub(super) struct ThreadLoad {
 impl Alarm {
     /// Evaluates the rule once; `found` is the figure if it is bad. Returns whether the finding
     /// appeared, went or changed.
-    fn judge(&mut self, found: Option<(u64, u64)>) -> bool {
+    pub(super) fn judge(&mut self, found: Option<(u64, u64)>) -> bool {
         match found {
             Some(value) => {
                 (self.bad, self.good) = (self.bad.saturating_add(1), 0);
@@ -184,13 +183,12 @@ fn interval(tracked: &Tracked) -> Option<Duration> {
 /// Returns the 99th percentile if enough durations are certainly longer than the limit: those in
 /// the limit's own bucket do not count.
 fn exceeds(durations: &Durations, limit: Duration) -> Option<Duration> {
-    let above = bucket_start(bucket(nanoseconds(limit)) + 1);
-    let long = durations.count() - durations.up_to(above);
+    let long = durations.above(limit);
     let p99 = durations.quantile(0.99)?;
     (is_many(long, durations.count()) && p99 > limit).then_some(p99)
 }
 
-const fn is_many(bad: u64, all: u64) -> bool {
+pub(super) const fn is_many(bad: u64, all: u64) -> bool {
     bad >= LEAST && bad.saturating_mul(SHARE) > all
 }
 

@@ -6,8 +6,11 @@
 
 mod additions;
 mod attribution;
+pub mod durations;
 pub mod facts;
 mod findings;
+pub mod reader_queue;
+mod reader_queues;
 pub mod report;
 pub mod source;
 mod state;

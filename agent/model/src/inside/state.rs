@@ -9,6 +9,7 @@ use ros2probe_wire::{DomainId, GuidPrefix, Timestamp};
 use super::attribution::Attribution;
 use super::facts::{InsideFacts, LifecycleState, ObservedProcess, TopicInside};
 use super::findings::{ThreadLoad, TimerThread, judge};
+use super::reader_queue::ReaderQueue;
 use super::report::{ProcessReport, Report, Transition, Trigger};
 use super::source::{Seen, Source};
 use super::topics::{Evidence, InsideTopic, InsideTopics, Live, TopicAdded};
@@ -40,10 +41,10 @@ pub struct Inside {
     /// Time of the last report; `None` without one, or if the source has stopped.
     at: Option<Timestamp>,
     has_callbacks: bool,
-    processes: BTreeMap<u32, Process>,
+    pub(super) processes: BTreeMap<u32, Process>,
     /// Handles of all processes.
     handles: usize,
-    topics: InsideTopics,
+    pub(super) topics: InsideTopics,
     /// Participants of observed processes.
     participants: HashSet<GuidPrefix>,
     /// Last state of each managed node, by process and node.
@@ -51,15 +52,19 @@ pub struct Inside {
     /// Revisions of the graph that determined nodes and domains.
     graph: Option<(u64, u64)>,
     /// Changes of the findings.
-    revision: u64,
+    pub(super) revision: u64,
     /// Processes, handles, topics and states dropped or refused because of a cap.
     evictions: u64,
 }
 
 /// An observed process.
 #[derive(Debug)]
-struct Process {
-    facts: ObservedProcess,
+pub(super) struct Process {
+    pub(super) facts: ObservedProcess,
+    /// Time of the report before its first one: all of its calls since then are counted.
+    pub(super) born: Option<Timestamp>,
+    /// Its participants.
+    pub(super) participants: BTreeSet<GuidPrefix>,
     /// Its domain according to its environment.
     reported_domain_id: DomainId,
     /// Nodes that it created while it was observed.
@@ -67,7 +72,9 @@ struct Process {
     cpu: Duration,
     /// The earlier and the later begin of a window: time, CPU time and calls.
     marks: [(Timestamp, Duration, u64); 2],
-    handles: BTreeMap<(Kind, u64), Tracked>,
+    pub(super) handles: BTreeMap<(Kind, u64), Tracked>,
+    /// Queues of its subscriptions.
+    pub(super) queues: BTreeMap<(DomainId, TopicName), ReaderQueue>,
     /// Topics whose receptions within the process may show further publications.
     witnesses: BTreeMap<(DomainId, TopicName), Witness>,
 }
@@ -102,17 +109,24 @@ impl Inside {
                 facts,
                 reported_domain_id: _,
                 reported,
+                born: _,
+                participants: own,
                 cpu: _,
                 marks: _,
                 handles,
+                queues,
                 witnesses,
             } = process;
-            [
+            let of_queues = queues.values().flat_map(ReaderQueue::sizes);
+            let of_process = [
                 Size::new("inside.nodes", facts.nodes.len(), NODES),
                 Size::new("inside.reported_nodes", reported.len(), NODES),
                 Size::new("inside.handles_of_process", handles.len(), HANDLES),
                 Size::new("inside.witnesses", witnesses.len(), HANDLES),
-            ]
+                Size::new("inside.queues", queues.len(), HANDLES),
+                Size::new("inside.participants_of_process", own.len(), participants),
+            ];
+            of_process.into_iter().chain(of_queues)
         });
         let mut sizes = largest(of_processes);
         sizes.extend(topics.sizes());
@@ -206,6 +220,7 @@ impl Inside {
             for tracked in process.handles.values() {
                 self.findings_of(*id, tracked, &mut found);
             }
+            self.findings_of_queues(*id, process, &mut found);
         }
         found
     }
@@ -285,6 +300,7 @@ impl Inside {
             for tracked in process.handles.values() {
                 tracked.facts(*id, &mut facts);
             }
+            process.queue_facts(*id, &mut facts);
         }
         Some(facts)
     }
@@ -311,9 +327,12 @@ impl Inside {
             },
             reported_domain_id: report.domain_id,
             reported: Vec::new(),
+            born: began,
+            participants: BTreeSet::new(),
             cpu: report.cpu,
             marks: [mark, mark],
             handles: BTreeMap::new(),
+            queues: BTreeMap::new(),
             witnesses: BTreeMap::new(),
         });
         self.revision += u64::from(process.facts.is_suspended != report.is_suspended);
@@ -350,7 +369,9 @@ impl Inside {
                     if !is_same {
                         self.graph = None;
                     }
-                    tracked.update(figures, at)
+                    let added = tracked.update(figures, at);
+                    tracked.took(&added);
+                    added
                 }
                 None if self.handles >= HANDLES => {
                     self.evictions += 1;
@@ -363,9 +384,9 @@ impl Inside {
                         counts: figures.counts,
                         delay: figures.added_delay(None),
                     };
-                    process
-                        .handles
-                        .insert(key, Tracked::new(figures, at, began));
+                    let mut tracked = Tracked::new(figures, at, began);
+                    tracked.took(&added);
+                    process.handles.insert(key, tracked);
                     added
                 }
             };
@@ -393,6 +414,7 @@ impl Inside {
             process.facts.domain_id = attribution.domain(*id, domain_id);
             let nodes = attribution.nodes(*id, reported);
             process.facts.nodes = nodes.into_iter().take(NODES).collect();
+            process.participants = attribution.participants(*id);
             for tracked in process.handles.values_mut() {
                 attribution.resolve(*id, domain_id, reported, tracked);
             }
@@ -406,7 +428,7 @@ impl Inside {
                 state.node = attribution.node(*id, &process.reported);
             }
         }
-        self.participants = attribution.participants;
+        self.participants = attribution.all;
     }
 
     /// Adds what a report brought to the topics.

@@ -45,6 +45,8 @@ pub(super) struct InsideTopic {
     last: Option<Timestamp>,
     latency: Arc<Durations>,
     waiting: Arc<Durations>,
+    /// Messages lost in queues of subscriptions; `None` before any queue could be judged.
+    lost_in_queues: Option<u64>,
     /// Times and totals of the last reports.
     past: VecDeque<(Timestamp, u64)>,
     live: Live,
@@ -94,6 +96,7 @@ impl InsideTopics {
                 last: _,
                 latency: _,
                 waiting: _,
+                lost_in_queues: _,
                 past,
                 live: _,
                 choice: _,
@@ -141,6 +144,7 @@ impl InsideTopics {
                 last: None,
                 latency: Arc::default(),
                 waiting: Arc::default(),
+                lost_in_queues: None,
                 past: VecDeque::new(),
                 live: Live::default(),
                 choice: Choice::default(),
@@ -171,6 +175,13 @@ impl InsideTopics {
                 topic.past.pop_front();
             }
             topic.past.push_back((at, topic.messages));
+        }
+    }
+
+    /// Adds messages lost in the queues of subscriptions, also 0.
+    pub(super) fn lose(&mut self, key: &(DomainId, TopicName), lost: u64) {
+        if let Some(topic) = self.topics.get_mut(key) {
+            *topic.lost_in_queues.get_or_insert_default() += lost;
         }
     }
 
@@ -356,6 +367,7 @@ impl InsideTopic {
             depth: self.live.depth,
             latency: Arc::clone(&self.latency),
             waiting: Arc::clone(&self.waiting),
+            lost_in_queues: self.lost_in_queues,
         }
     }
 }

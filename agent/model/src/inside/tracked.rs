@@ -77,6 +77,9 @@ pub(super) struct Tracked {
     pub(super) thread_since: Timestamp,
     /// Time of its first report.
     pub(super) since: Timestamp,
+    /// A subscription: time of publication of the last message that it took, or before. Only
+    /// increases.
+    pub(super) published: Option<Timestamp>,
     /// The earlier and the later begin of a window.
     marks: [Mark; 2],
     pub(super) recent: Recent,
@@ -98,7 +101,7 @@ pub(super) struct Recent {
     pub(super) span: Duration,
     pub(super) counts: Counts,
     pub(super) quantiles: [Quantiles; 2],
-    /// Sum of the durations of its calls.
+    /// Time of the window that its calls took; a call that began before counts from there on.
     pub(super) busy: Duration,
 }
 
@@ -245,6 +248,7 @@ impl Tracked {
             domain_id: DomainId(0),
             thread_since: at,
             since: at,
+            published: None,
             marks: [mark.clone(), mark],
             recent: Recent::default(),
             alarms: Alarms::default(),
@@ -253,7 +257,10 @@ impl Tracked {
     }
 
     /// Replaces the figures by newer ones. Returns what they add.
-    pub(super) fn update(&mut self, figures: Figures, at: Timestamp) -> Added {
+    pub(super) fn update(&mut self, mut figures: Figures, at: Timestamp) -> Added {
+        if figures.counts.count >= self.figures.counts.count {
+            figures.continue_from(&self.figures);
+        }
         let added = Added {
             counts: figures.counts.since(self.figures.counts),
             delay: figures.added_delay(self.figures.durations[DELAY].as_deref()),
@@ -274,6 +281,17 @@ impl Tracked {
         }
         self.figures = figures;
         added
+    }
+
+    /// Takes note of the oldest message among those that a report added. Without the latency of
+    /// each of them, that is unknown.
+    pub(super) fn took(&mut self, added: &Added) {
+        let delay = added.delay.as_ref().filter(|delay| {
+            self.figures.kind == Kind::Subscription && delay.count() == added.counts.count
+        });
+        if let Some((_, longest)) = delay.and_then(Durations::range) {
+            self.published = self.published.max(Some(self.figures.last - longest));
+        }
     }
 
     /// Updates the figures of the window that ends at `at`, and begins the next half.
@@ -400,6 +418,15 @@ impl Tracked {
 }
 
 impl Figures {
+    /// Continues the distributions of the report before.
+    fn continue_from(&mut self, earlier: &Self) {
+        for (now, before) in self.durations.iter_mut().zip(&earlier.durations) {
+            if let (Some(now), Some(before)) = (now, before) {
+                Arc::make_mut(now).continue_from(before);
+            }
+        }
+    }
+
     /// Returns the delays that were added since these.
     pub(super) fn added_delay(&self, before: Option<&Durations>) -> Option<Durations> {
         let now = self.durations[DELAY].as_deref()?;
@@ -413,22 +440,21 @@ impl Figures {
             ..Recent::default()
         };
         let both = self.durations.iter().zip(&mark.durations);
-        for ((now, before), quantiles) in both.zip(&mut recent.quantiles) {
-            *quantiles = match (now, before) {
-                (None, _) => Quantiles::default(),
-                (Some(now), Some(before)) if Arc::ptr_eq(now, before) => Quantiles::default(),
-                (Some(now), Some(before)) => Quantiles::of(&now.since(before)),
-                (Some(now), None) => Quantiles::of(now),
+        for (which, (now, before)) in both.enumerate() {
+            let Some(now) = now else {
+                continue;
             };
-        }
-        if self.kind == Kind::Callback {
-            let sum = |durations: &Option<Arc<Durations>>| {
-                let known = durations.as_deref();
-                known.map_or(Duration::ZERO, Durations::sum)
+            let window = match before {
+                Some(before) if Arc::ptr_eq(now, before) => continue,
+                Some(before) => &now.since(before),
+                None => &**now,
             };
-            let [now, _] = &self.durations;
-            let [before, _] = &mark.durations;
-            recent.busy = sum(now).saturating_sub(sum(before));
+            if let Some(quantiles) = recent.quantiles.get_mut(which) {
+                *quantiles = Quantiles::of(window);
+            }
+            if self.kind == Kind::Callback && which == INTERVAL {
+                recent.busy = window.sum_within(recent.span);
+            }
         }
         recent
     }

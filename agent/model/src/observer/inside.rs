@@ -14,11 +14,13 @@ impl Observer {
     pub(super) fn report_inside(&mut self, mut report: Report) {
         let clock = self.wall_clock;
         report.convert(|time| clock.model_time(time));
+        let at = report.at;
         let transitions = self.inside.report(report, &self.discovery, &self.receivers);
         for state in transitions {
             let events = &mut self.journal.events;
             events.push(state.at, EventKind::Lifecycle(state));
         }
+        self.compare_queues(at);
     }
 
     /// Lists the topics of observed processes, and chooses the source of their counts.

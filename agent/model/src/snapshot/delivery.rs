@@ -42,6 +42,9 @@ pub struct DeliveryFacts {
     pub last_seen: Timestamp,
     /// Fate of the samples.
     pub delivered: Delivered,
+    /// Delivered samples that the process never took from the queue of its subscription; `None` if
+    /// its calls are not observed, or other writers fill the same queue.
+    pub lost_in_reader_queue: Option<u64>,
 }
 
 /// The receiver, as far as it is known. It is displayed as `participant GUID`, `process ID`,

@@ -2,8 +2,11 @@
 //! findings, from reports built by hand in virtual time.
 
 mod findings;
+mod queues;
+mod slow;
 mod sources;
 mod sums;
+mod unknown;
 
 use std::sync::Arc;
 use std::time::Duration;

@@ -7,7 +7,7 @@ use ros2probe_daemon::agent_facts::{InsideLibrary, InsideSourceFacts};
 use ros2probe_model::diagnosis::{Diagnosis, TopicKey};
 use ros2probe_model::inside::facts::{
     Buffer, Callback, InsideFacts, LifecycleState, ObservedProcess, Owner, Publisher, Quantiles,
-    Subscription, TopicCounts, TopicInside,
+    ReaderQueue, Subscription, TopicCounts, TopicInside,
 };
 use ros2probe_model::inside::report::{Durations, Trigger};
 use ros2probe_model::names::TopicName;
@@ -53,6 +53,15 @@ pub fn inside() -> InsideFacts {
             rate_hz: Some(9.9),
             last: LAST,
             latency: quantiles(),
+        }],
+        reader_queues: vec![ReaderQueue {
+            owner: owner(0x20),
+            topic: topic.clone(),
+            writer: None,
+            depth: Some(10),
+            arrived: 1_000,
+            taken: 990,
+            lost: 7,
         }],
         buffers: vec![Buffer {
             owner: owner(0x30),
@@ -104,6 +113,7 @@ pub fn topic() -> TopicInside {
         depth: 4,
         latency: durations(),
         waiting: durations(),
+        lost_in_queues: Some(7),
     }
 }
 
@@ -129,7 +139,7 @@ pub fn source() -> InsideSourceFacts {
 }
 
 /// Returns a finding of each kind that only processes show.
-pub fn findings(topic: &TopicKey) -> [Diagnosis; 4] {
+pub fn findings(topic: &TopicKey) -> [Diagnosis; 5] {
     [
         Diagnosis::SlowCallback {
             topic: Some(topic.clone()),
@@ -149,6 +159,12 @@ pub fn findings(topic: &TopicKey) -> [Diagnosis; 4] {
             topic: topic.clone(),
             queue: owner(0x30),
             overwritten_permille: 140,
+        },
+        Diagnosis::ReaderQueueOverflow {
+            topic: topic.clone(),
+            queue: owner(0x20),
+            lost_permille: 70,
+            depth: Some(10),
         },
         Diagnosis::ObservationSuspended {
             domain_id: DomainId(0),

@@ -349,8 +349,14 @@ fn findings_meet_their_kind_once_they_are_new() {
         },
         Diagnosis::IntraProcessOverflow {
             topic: topic.clone(),
-            queue: owner,
+            queue: owner.clone(),
             overwritten_permille: 10,
+        },
+        Diagnosis::ReaderQueueOverflow {
+            topic: topic.clone(),
+            queue: owner,
+            lost_permille: 10,
+            depth: None,
         },
         Diagnosis::ObservationSuspended {
             domain_id: DomainId(0),

@@ -92,6 +92,17 @@ pub(super) fn diagnosis(finding: &diagnosis::Diagnosis) -> Finding<'_> {
             process_id: queue.process,
             overwritten_ratio: thousandths(*overwritten_permille),
         },
+        diagnosis::Diagnosis::ReaderQueueOverflow {
+            queue,
+            lost_permille,
+            depth,
+            ..
+        } => Diagnosis::ReaderQueueOverflow {
+            node: queue.node.as_deref().map(Cow::Borrowed),
+            process_id: queue.process,
+            lost_ratio: thousandths(*lost_permille),
+            depth: *depth,
+        },
         diagnosis::Diagnosis::ObservationSuspended { process, name, .. } => {
             Diagnosis::ObservationSuspended {
                 process_id: *process,

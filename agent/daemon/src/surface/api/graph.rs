@@ -113,6 +113,7 @@ impl Drawing {
             let party = (publisher.node.as_deref(), participant(publisher.guid));
             let node = self.party(domain_id, party);
             let rate = publisher.measurement.as_ref().map(|it| it.rate_hz);
+            let rate = rate.filter(|rate| *rate > 0.0 || facts.rate_hz().is_some());
             let key = (node, topic.clone(), EdgeKind::Publishes);
             let sum = self.edges.entry(key).or_default();
             if let Some(rate) = rate {

@@ -60,8 +60,10 @@ pub(super) async fn show(
         view.messages.push(row.map(|row| row.messages));
         view.lost_messages.push(row.map(|row| row.lost));
         let rate = reading.as_ref().and_then(|reading| reading.rate_hz);
+        let rate = rate.filter(|rate| *rate > 0.0 || topic.rate_hz().is_some());
         view.rate_hertz.push(rate.map(thousandths));
         let bandwidth = reading.as_ref().and_then(|reading| reading.bandwidth);
+        let bandwidth = bandwidth.filter(|bytes| *bytes > 0.0 || topic.bandwidth().is_some());
         view.bandwidth_bytes_per_second
             .push(bandwidth.map(f64::round));
         view.latency_p50_seconds.push(part(latency, 0));

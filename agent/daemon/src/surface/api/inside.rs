@@ -18,7 +18,7 @@ use crate::agent_facts::InsideSourceFacts;
 use crate::surface::inside_nodes::NodeActivity;
 use ros2probe_api::inside::{
     Buffer, Callback, Counter, Durations, Inside, Library, LifecycleState, NodeInside, Owner,
-    Process, Publisher, Subscription, TopicInside, Trigger,
+    Process, Publisher, ReaderQueue, Subscription, TopicInside, Trigger,
 };
 use ros2probe_model::inside::facts::{self, InsideFacts, Quantiles};
 use ros2probe_model::inside::report;
@@ -88,6 +88,9 @@ fn inside<'a>(
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| is_here(&each.owner));
     answer.subscriptions = subscriptions.map(subscription).collect();
+    let queues = known.reader_queues.iter();
+    let queues = queues.filter(|each| is_here(&each.owner));
+    answer.reader_queues = queues.map(reader_queue).collect();
     let buffers = known.buffers.iter().filter(|each| is_here(&each.owner));
     answer.buffers = buffers.map(buffer).collect();
     let callbacks = known.callbacks.iter().filter(|each| is_here(&each.owner));
@@ -110,6 +113,7 @@ pub(super) fn topic(facts: &TopicFacts) -> Option<TopicInside<'_>> {
         overwritten_messages: counts.overwritten,
         dequeued_messages: counts.dequeued,
         intra_process_receptions: counts.receptions,
+        lost_in_reader_queue_messages: inside.lost_in_queues,
         rate_hertz: inside.rate_hz,
         last_message_timestamp_seconds: inside.last.map(|last| last.seconds()),
         observed_publishers: inside.publishers,
@@ -134,6 +138,9 @@ pub(super) fn topic_details<'a>(
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| own(&each.owner, &each.topic));
     shown.subscriptions = subscriptions.map(subscription).collect();
+    let queues = known.reader_queues.iter();
+    let queues = queues.filter(|each| own(&each.owner, &each.topic));
+    shown.reader_queues = queues.map(reader_queue).collect();
     let buffers = known.buffers.iter();
     let buffers = buffers.filter(|each| is_here(&each.owner) && each.topic.as_ref() == Some(name));
     shown.buffers = buffers.map(buffer).collect();
@@ -162,6 +169,8 @@ pub(super) fn node<'a>(
     let publishers = known.publishers.iter().filter(|each| is_own(&each.owner));
     let subscriptions = known.subscriptions.iter();
     let subscriptions = subscriptions.filter(|each| is_own(&each.owner));
+    let queues = known.reader_queues.iter();
+    let queues = queues.filter(|each| is_own(&each.owner));
     let buffers = known.buffers.iter().filter(|each| is_own(&each.owner));
     let callbacks = known.callbacks.iter().filter(|each| is_own(&each.owner));
     let node = NodeInside {
@@ -169,6 +178,7 @@ pub(super) fn node<'a>(
         lifecycle_state: activity.state.map(Cow::Borrowed),
         publishers: publishers.map(publisher).collect(),
         subscriptions: subscriptions.map(subscription).collect(),
+        reader_queues: queues.map(reader_queue).collect(),
         buffers: buffers.map(buffer).collect(),
         callbacks: callbacks.map(callback).collect(),
     };
@@ -240,6 +250,18 @@ fn subscription(facts: &facts::Subscription) -> Subscription<'_> {
         rate_hertz: facts.rate_hz,
         last_message_timestamp_seconds: facts.last.seconds(),
         latency: durations(&facts.latency),
+    }
+}
+
+fn reader_queue(facts: &facts::ReaderQueue) -> ReaderQueue<'_> {
+    ReaderQueue {
+        owner: owner(&facts.owner),
+        topic: Cow::Borrowed(&facts.topic),
+        writer: facts.writer.map(|writer| writer.to_string()),
+        depth: facts.depth,
+        arrived_messages: facts.arrived,
+        taken_messages: facts.taken,
+        lost_messages: facts.lost,
     }
 }
 

@@ -30,8 +30,8 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
         subscriber_expected_messages: facts.loss.expected,
         subscriber_lost_messages: facts.loss.lost,
         loss_ratio: facts.loss.ratio(),
-        rate_hertz: facts.rate_hz,
-        bandwidth_bytes_per_second: facts.bandwidth,
+        rate_hertz: Some(facts.rate_hz),
+        bandwidth_bytes_per_second: Some(facts.bandwidth),
         last_message_timestamp_seconds: last_message.map(|time| time.seconds()),
         interarrival: distribution(&facts.interarrival),
         latency: distribution(&facts.source_latency),
@@ -46,6 +46,15 @@ pub(super) fn measurement(facts: &snapshot::Measurement) -> Measurement {
             coverage_ratio: sampled.coverage(),
         }),
     }
+}
+
+/// Returns the answer's form of a topic's measurement.
+pub(super) fn topic_measurement(facts: &snapshot::TopicFacts) -> Option<Measurement> {
+    Some(Measurement {
+        rate_hertz: facts.rate_hz(),
+        bandwidth_bytes_per_second: facts.bandwidth(),
+        ..measurement(facts.measurement.as_deref()?)
+    })
 }
 
 /// Returns the answer's form of a delivery's counts.
@@ -83,14 +92,13 @@ pub(super) fn breakdown(facts: &snapshot::Breakdown) -> Breakdown {
 fn distribution(values: &Histogram) -> Option<Distribution> {
     let (minimum, maximum) = values.range()?;
     let count = values.count();
-    let part = |part: f64| values.quantile(part).clamp(minimum, maximum);
     Some(Distribution {
         count,
         mean_seconds: values.sum() / count as f64,
         minimum_seconds: minimum,
-        p50_seconds: part(0.5),
-        p95_seconds: part(0.95),
-        p99_seconds: part(0.99),
+        p50_seconds: values.quantile(0.5)?,
+        p95_seconds: values.quantile(0.95)?,
+        p99_seconds: values.quantile(0.99)?,
         maximum_seconds: maximum,
     })
 }

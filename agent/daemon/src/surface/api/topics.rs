@@ -17,7 +17,7 @@ use super::finding::diagnosis;
 use super::history;
 use super::index::{Index, Standing};
 use super::inside;
-use super::measured::{breakdown, buckets, delivered, measurement};
+use super::measured::{breakdown, buckets, delivered, topic_measurement};
 use super::messages;
 use super::nearest::hint;
 use super::parameters::{Name, Parameters};
@@ -230,6 +230,14 @@ impl<'a> TopicAnswers<'a> {
     fn topic(&self, facts: &'a TopicFacts) -> Topic<'a> {
         let index = &self.circumstances.index;
         let endpoint = |facts| endpoint(facts, index);
+        let is_unseen = facts.measurement.is_some() && facts.rate_hz().is_none();
+        let publisher = |publisher| {
+            let mut shown = endpoint(publisher);
+            if let Some(measured) = shown.measurement.as_mut().filter(|_| is_unseen) {
+                (measured.rate_hertz, measured.bandwidth_bytes_per_second) = (None, None);
+            }
+            shown
+        };
         let findings = index.findings(facts).iter();
         let watches = index.watches(facts).iter();
         let passages = facts.transports.iter().map(|count| topics::Passage {
@@ -250,10 +258,10 @@ impl<'a> TopicAnswers<'a> {
                 .into_iter()
                 .map(Cow::Owned)
                 .collect(),
-            publishers: facts.publishers.iter().map(endpoint).collect(),
+            publishers: facts.publishers.iter().map(publisher).collect(),
             subscriptions: facts.subscriptions.iter().map(endpoint).collect(),
             watches: watches.map(|watching| self.watching(*watching)).collect(),
-            measurement: facts.measurement.as_deref().map(measurement),
+            measurement: topic_measurement(facts),
             received: facts.received.as_deref().map(delivered),
             sent: facts.sent.as_deref().map(delivered),
             breakdown: facts.breakdown.as_deref().map(breakdown),
@@ -323,6 +331,7 @@ fn delivery(facts: &DeliveryFacts) -> Delivery<'_> {
         process: facts.process.as_deref().map(Cow::Borrowed),
         cgroup: facts.cgroup.as_deref().map(Cow::Borrowed),
         delivered: delivered(&facts.delivered),
+        lost_in_reader_queue_messages: facts.lost_in_reader_queue,
     }
 }
 

@@ -395,8 +395,9 @@ fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<WatchedTopic> {
         let same = |facts: &&TopicFacts| {
             facts.domain_id == watched.domain_id && facts.name == watched.topic
         };
-        let mut measurement = snapshot.topics.iter().filter(same);
-        let measurement = measurement.find_map(|facts| facts.measurement.as_deref());
+        let mut all = snapshot.topics.iter().filter(same);
+        let facts = all.find(|facts| facts.measurement.is_some());
+        let measurement = facts.and_then(|facts| facts.measurement.as_deref());
         WatchedTopic {
             domain_id: watched.domain_id.0,
             topic: watched.topic.to_string(),
@@ -414,7 +415,10 @@ fn topics(snapshot: &Snapshot, facts: &WatchFacts) -> Vec<WatchedTopic> {
                 .map(Cow::Borrowed)
                 .collect(),
             messages: measurement.map_or(0, |measured| measured.messages),
-            rate_hertz: measurement.map_or(0.0, |measured| measured.rate_hz),
+            rate_hertz: match measurement {
+                Some(_) => facts.and_then(TopicFacts::rate_hz),
+                None => Some(0.0),
+            },
         }
     };
     facts.topics.iter().map(topic).collect()

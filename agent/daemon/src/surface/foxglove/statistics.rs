@@ -40,12 +40,12 @@ const FIGURES: [Figure; 13] = [
     (
         "rate_hertz",
         "Messages per second over the last window.",
-        |second| Some(second.measured.rate_hz),
+        |second| second.topic.rate_hz(),
     ),
     (
         "bandwidth_bytes_per_second",
         "Payload bytes per second over the same window.",
-        |second| Some(second.measured.bandwidth),
+        |second| second.topic.bandwidth(),
     ),
     (
         "messages",
@@ -74,22 +74,22 @@ const FIGURES: [Figure; 13] = [
     (
         "latency_p50_seconds",
         "Median time from the writer's timestamp to the capture, of the last second.",
-        |second| quantile(&second.times?.latency, 0.5),
+        |second| second.times?.latency.quantile(0.5),
     ),
     (
         "latency_p99_seconds",
         "99th percentile of the same time.",
-        |second| quantile(&second.times?.latency, 0.99),
+        |second| second.times?.latency.quantile(0.99),
     ),
     (
         "header_latency_p50_seconds",
         "Median time from the message's Header.stamp to the capture, of the last second.",
-        |second| quantile(&second.times?.header_latency, 0.5),
+        |second| second.times?.header_latency.quantile(0.5),
     ),
     (
         "interarrival_p99_seconds",
         "99th percentile of the time between messages of one writer, of the last second.",
-        |second| quantile(&second.times?.interarrival, 0.99),
+        |second| second.times?.interarrival.quantile(0.99),
     ),
     ("publishers", "Live writers.", |second| {
         Some(count(second.topic.publishers.len()))
@@ -143,12 +143,6 @@ pub(super) fn message(
         Some(((*name).to_owned(), json!(value)))
     });
     Value::Object(figures.collect()).to_string().into_bytes()
-}
-
-/// Returns an estimate; `None` without values, or above all bounds.
-fn quantile(values: &Histogram, part: f64) -> Option<f64> {
-    let value = values.quantile(part);
-    (values.count() > 0 && value < f64::MAX).then_some(value)
 }
 
 #[expect(

@@ -113,6 +113,12 @@ fn delivery_facts(
         first_seen,
         last_seen,
         delivered: delivery.facts(),
+        lost_in_reader_queue: participant
+            .filter(|_| delivery.direction() == Direction::Received)
+            .and_then(|guid| {
+                let key = (topic.domain_id, &topic.naming);
+                observer.inside.lost_in_queue(guid.prefix, key, writer)
+            }),
     }
 }
 

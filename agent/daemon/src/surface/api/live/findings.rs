@@ -286,6 +286,7 @@ fn in_words(all: &Circumstances<'_>, diagnosis: &Diagnosis, ends: &Ends<'_>) -> 
         Diagnosis::SlowCallback { .. }
         | Diagnosis::ExecutorWait { .. }
         | Diagnosis::IntraProcessOverflow { .. }
+        | Diagnosis::ReaderQueueOverflow { .. }
         | Diagnosis::ObservationSuspended { .. } => inside::in_words(all.ids, diagnosis),
         Diagnosis::RestampingNode { topic, node, input } => {
             let text = format!(

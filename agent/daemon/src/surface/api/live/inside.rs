@@ -62,6 +62,25 @@ pub(super) fn in_words(ids: &Ids, diagnosis: &Diagnosis) -> Finding {
             let remedy = "raise the depth of the subscription, or shorten its callback";
             (about(queue), text, remedy)
         }
+        Diagnosis::ReaderQueueOverflow {
+            topic,
+            queue,
+            lost_permille,
+            depth,
+        } => {
+            let depth = depth.map(|depth| format!(" of depth {depth}"));
+            let text = format!(
+                "{} takes {} too slowly: its queue{} loses {}.{} % of the messages",
+                who(queue),
+                topic.name,
+                depth.unwrap_or_default(),
+                lost_permille / 10,
+                lost_permille % 10
+            );
+            let remedy = "shorten the callback, give it a callback group and thread of its own, or \
+                          raise the depth of the subscription";
+            (about(queue), text, remedy)
+        }
         Diagnosis::ObservationSuspended { process, name, .. } => {
             let name = name.as_deref().unwrap_or("a process");
             let text = format!("Calls of {name} ({process}) exceed the budget and do not count");

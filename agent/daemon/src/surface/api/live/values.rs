@@ -89,8 +89,8 @@ impl Figures<'_> {
         let at = measured.last_message;
         Row(
             id,
-            Some(thousandths(measured.rate_hz)),
-            Some(measured.bandwidth.round()),
+            topic.rate_hz().map(thousandths),
+            topic.bandwidth().map(f64::round),
             Some(measured.messages),
             Some(measured.loss.lost),
             Some(second.map_or(0, |second| second.lost)),
@@ -122,6 +122,7 @@ impl Figures<'_> {
                 | Diagnosis::SlowCallback { .. }
                 | Diagnosis::ExecutorWait { .. }
                 | Diagnosis::IntraProcessOverflow { .. }
+                | Diagnosis::ReaderQueueOverflow { .. }
                 | Diagnosis::ObservationSuspended { .. }
                 | Diagnosis::RestampingNode { .. }
                 | Diagnosis::SlowChain { .. } => {}
@@ -130,7 +131,7 @@ impl Figures<'_> {
         let measured = topic.measurement.as_deref();
         let is_measured = is_measured(topic, self.index);
         let is_connected = unheard < topic.publishers.len() && !topic.subscriptions.is_empty();
-        let is_quiet = measured.is_some_and(|measured| measured.rate_hz == 0.0);
+        let is_quiet = topic.is_silent(self.snapshot.at);
         let watches = self.index.watches(topic);
         let stands = |state| watches.iter().any(|(_, watch)| watch.state == state);
         mark(
