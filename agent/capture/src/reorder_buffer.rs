@@ -535,7 +535,9 @@ mod tests {
         let mut numbers = Vec::new();
         while let Some(next) = order.next(&clocks, clocks.monotonic - SETTLE) {
             numbers.push(match next {
-                Next::Kernel(record) | Next::Walked(record) => record.sequence_number,
+                Next::Kernel(record) | Next::Walked(record) | Next::Polled(record) => {
+                    record.sequence_number
+                }
                 Next::Segment(segment) => {
                     let chunk = segment.chunk();
                     let age = clocks.now.nanoseconds_since(chunk.time);

@@ -8,7 +8,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::time::Duration;
 
 use ros2probe_wire::discovery::Role;
-use ros2probe_wire::{DomainId, Guid, Timestamp};
+use ros2probe_wire::{DomainId, Guid, GuidPrefix, Timestamp};
 
 use super::delivery::Totals;
 use super::expectation::Judgement;
@@ -97,6 +97,17 @@ pub struct Topics {
 }
 
 impl Topic {
+    /// Returns a participant's readers of the topic, sorted within each kind of topic.
+    pub fn readers_of(&self, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + '_ {
+        let lists = [&self.readers, &self.buffer_endpoints].into_iter();
+        let own = lists.flat_map(move |list| {
+            let start = list.partition_point(|guid| guid.prefix < prefix);
+            let own = list.get(start..).unwrap_or_default().iter().copied();
+            own.take_while(move |guid| guid.prefix == prefix)
+        });
+        own.filter(|guid| !guid.entity.is_writer())
+    }
+
     /// Returns whether no endpoint is left.
     #[must_use]
     pub const fn is_vanished(&self) -> bool {

@@ -11,7 +11,6 @@ use crate::diagnosis::{Offer, Verdict, verdict};
 use crate::inside::reader_queue::{Arrivals, ArrivalsOf};
 use crate::naming::Naming;
 use crate::profiler::Measured;
-use crate::receivers::readers;
 use crate::route::Direction;
 use crate::snapshot::Transport;
 use crate::topic::Watched;
@@ -42,7 +41,7 @@ impl Observer {
             return None;
         }
         let own = participants.iter();
-        let readers: Vec<Guid> = own.flat_map(|prefix| readers(topic, *prefix)).collect();
+        let readers: Vec<Guid> = own.flat_map(|prefix| topic.readers_of(*prefix)).collect();
         let mut found = Arrivals {
             readers,
             depth: Some(0),

@@ -60,18 +60,10 @@ impl<'a> MatchedReaders<'a> {
 
     /// Returns this participant's readers that match the writer, sorted within each kind of topic.
     pub fn of(self, prefix: GuidPrefix) -> impl Iterator<Item = Guid> + 'a {
-        let lists = self
-            .topic
-            .map(|topic| [&topic.readers, &topic.buffer_endpoints]);
-        lists
-            .into_iter()
-            .flatten()
-            .flat_map(move |list| {
-                let start = list.partition_point(|guid| guid.prefix < prefix);
-                let own = list.get(start..).unwrap_or_default().iter().copied();
-                own.take_while(move |guid| guid.prefix == prefix)
-            })
-            .filter(move |guid| !guid.entity.is_writer() && self.matches(*guid))
+        let readers = self.topic.into_iter();
+        readers
+            .flat_map(move |topic| topic.readers_of(prefix))
+            .filter(move |guid| self.matches(*guid))
     }
 
     /// Returns whether this participant has a reader that matches the writer.
