@@ -161,6 +161,60 @@ fn reports_become_series() {
 }
 
 #[test]
+fn hours_and_days_become_series_of_their_length() {
+    let mut observer = Observer::new(observer::Settings::default());
+    observer.input(Input::Time(Timestamp(START)));
+    let watches = Watchlist::new(vec![Watch::named("/**").unwrap()]).unwrap();
+    observer.input(Input::Watchlist(Arc::new(watches)));
+    let mut calls = Durations::default();
+    let mut waits = Durations::default();
+    for second in 1..=10 {
+        let now = START + second * SECOND;
+        if second == 9 {
+            calls.observe(Duration::from_secs(3_600));
+            waits.observe(Duration::from_secs(86_400));
+        }
+        observer.input(Input::Inside(Report {
+            at: Timestamp(now),
+            has_callbacks: true,
+            processes: vec![ProcessReport {
+                id: 70,
+                nodes: vec!["/slow".into()],
+                callbacks: vec![CallbackReport {
+                    handle: 3,
+                    node: None,
+                    trigger: Trigger::Timer(None),
+                    thread: 71,
+                    calls: calls.count(),
+                    last: Timestamp(now),
+                    durations: calls.clone(),
+                    waits: waits.clone(),
+                    skipped: 0,
+                }],
+                ..ProcessReport::default()
+            }],
+            transitions: Vec::new(),
+        }));
+        observer.input(Input::Time(Timestamp(now)));
+    }
+    let page = page(&observer, None);
+    let callback = "domain_id=\"0\",ros_node=\"/slow\",trigger=\"timer\",name=\"\"";
+    for expected in [
+        format!("ros2_callback_duration_max_seconds{{{callback}}} 3600.0"),
+        format!("ros2_callback_duration_p99_seconds{{{callback}}} 3600.0"),
+        format!("ros2_callback_wait_p99_seconds{{{callback}}} 86400.0"),
+        format!("ros2_callback_busy_ratio{{{callback}}} 1.0"),
+        format!("ros2_callback_duration_seconds_bucket{{le=\"10.0\",{callback}}} 0"),
+        format!("ros2_callback_duration_seconds_sum{{{callback}}} 3600.0"),
+    ] {
+        assert!(
+            page.lines().any(|line| line == expected),
+            "{expected}\n{page}"
+        );
+    }
+}
+
+#[test]
 fn without_reports_there_are_no_series() {
     let observer = Observer::new(observer::Settings::default());
     let page = page(&observer, None);

@@ -7,7 +7,7 @@ mod table;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::{Read as _, Write as _};
-use std::net::TcpStream;
+use std::net::{SocketAddrV4, TcpStream};
 use std::ops::{Deref, DerefMut};
 use std::path::Path;
 use std::sync::Arc;
@@ -211,12 +211,12 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     };
     let mut host = Host::with(Settings::default().with_limits(&limits));
     let bob = host.reader(BOB, 7411);
-    let at = |socket: u64| CapturePoint {
-        socket,
-        ..bob.multicast(socket)
+    let at = |port: u16| CapturePoint {
+        address: SocketAddrV4::new([10, 0, 0, 9].into(), port),
+        ..bob.wire()
     };
     for number in 1..=10 {
-        (1..=3).for_each(|socket| host.data(at(socket), number));
+        (1..=3).for_each(|port| host.data(at(port), number));
     }
     assert_eq!(standing(limits, host.snapshot(), Limit::Flows), (2, 10));
     assert!(
@@ -226,15 +226,15 @@ fn flows_beyond_the_cap_are_not_followed_until_others_are_silent() {
     );
     assert_eq!(host.measurement().messages, 10);
     for number in 11..=60 {
-        (2..=3).for_each(|socket| host.data(at(socket), number));
+        (2..=3).for_each(|port| host.data(at(port), number));
         host.wait(400);
     }
-    let sockets: Vec<_> = host
+    let ports: Vec<_> = host
         .deliveries()
         .iter()
-        .map(|each| each.sockets.clone())
+        .map(|each| each.destination.port())
         .collect();
-    assert_eq!(sockets, [[2], [3]]);
+    assert_eq!(ports, [2, 3]);
     let (used, reached) = standing(limits, host.snapshot(), Limit::Flows);
     host.data(at(3), 61);
     assert_eq!(used, 2);

@@ -222,7 +222,7 @@ fn values_are_what_the_snapshot_says() {
 }
 
 /// Name, cause and value of the sums by topic.
-const SUMS: [(&str, &str, &str); 12] = [
+const SUMS: [(&str, &str, &str); 13] = [
     ("ros2_topic_sent_messages_total", "", "1000"),
     ("ros2_topic_delivered_messages_total", "", "900"),
     (
@@ -239,6 +239,11 @@ const SUMS: [(&str, &str, &str); 12] = [
         "ros2_topic_delivery_lost_messages_total",
         "socket_buffer",
         "15",
+    ),
+    (
+        "ros2_topic_delivery_lost_messages_total",
+        "reader_queue",
+        "7",
     ),
     ("ros2_topic_delivery_pending_messages", "", "1"),
     ("ros2_topic_delivery_recovered_messages_total", "", "3"),
@@ -284,6 +289,12 @@ fn deliveries_are_summed_by_topic_and_shown_one_by_one_where_a_watch_asks() {
             &received,
             "socket_buffer",
             "15",
+        ),
+        (
+            "ros2_subscriber_lost_messages_total",
+            &received,
+            "reader_queue",
+            "7",
         ),
         ("ros2_subscriber_pending_messages", &received, "", "1"),
         (
