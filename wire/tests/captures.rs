@@ -208,8 +208,8 @@ fn datagrams(capture: &[u8], mut each: impl FnMut(&[u8])) -> bool {
 fn captures(directory: &Path, found: &mut Vec<(PathBuf, PathBuf)>) {
     for entry in fs::read_dir(directory).unwrap() {
         let path = entry.unwrap().path();
-        // Zenoh traffic is not RTPS.
-        if path.ends_with("zenoh") {
+        // Zenoh traffic is not RTPS, and RTPS over TCP is not read.
+        if path.ends_with("zenoh") || path.ends_with("fastrtps-tcp") {
             continue;
         }
         if path.is_dir() {

@@ -255,7 +255,7 @@ mod tests {
             "name": name, "message_types": ["sensor_msgs/msg/Image"],
             "watches": [{"state": "ok", "min_rate_hz": 9.5, "max_rate_hz": 11.0}],
             "publishers": [{"measurement": {}}], "subscriptions": [{}],
-            "measurement": {"messages": 9, "rate_hertz": 10.0,
+            "measurement": {"messages": 9, "subscriber_expected_messages": 9, "rate_hertz": 10.0,
                 "bandwidth_bytes_per_second": 9_216_000.0,
                 "latency": {"p50_seconds": 0.0012, "p99_seconds": 0.015}},
         });

@@ -209,10 +209,10 @@ fn captures(root: &Path) -> Vec<PathBuf> {
         paths.sort();
         paths
     };
-    // Zenoh does not send RTPS.
+    // Zenoh does not send RTPS, and RTPS over TCP is not read.
     let directories = children(root)
         .into_iter()
-        .filter(|label| !label.ends_with("zenoh"))
+        .filter(|label| !label.ends_with("zenoh") && !label.ends_with("fastrtps-tcp"))
         .flat_map(|label| children(&label));
     let files = directories.flat_map(|directory| children(&directory));
     files

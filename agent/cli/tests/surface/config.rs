@@ -178,7 +178,12 @@ fn with_key(path: &str, value: f64) -> String {
         };
         text = match (key, is_list) {
             ("watch", true) => {
-                format!("{{watch: [{{topic: /a, {}]}}", text.trim_start_matches('{'))
+                let rest = text.trim_start_matches('{');
+                let needed = match rest.starts_with("window_s") {
+                    true => "min_rate_hz: 1, ",
+                    false => "",
+                };
+                format!("{{watch: [{{topic: /a, {needed}{rest}]}}")
             }
             ("chains", true) => {
                 let rest = text.trim_start_matches('{');

@@ -35,8 +35,8 @@ fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
         return;
     };
     for path in entries.map(|entry| entry.unwrap().path()) {
-        // Zenoh traffic is not RTPS.
-        if path.ends_with("zenoh") {
+        // Zenoh traffic is not RTPS, and RTPS over TCP is not read.
+        if path.ends_with("zenoh") || path.ends_with("fastrtps-tcp") {
             continue;
         }
         if path.is_dir() {

@@ -33,6 +33,7 @@ fn robot_answer() -> Value {
     let measured = |rate: f64, size: f64, lost: u64| {
         json!({
             "messages": 1905, "bytes": 609_600, "lost_messages": lost, "rate_hertz": rate,
+            "subscriber_expected_messages": 1905 + lost, "subscriber_lost_messages": lost,
             "bandwidth_bytes_per_second": rate * size,
             "interarrival": {"count": 1904, "p50_seconds": 0.0049, "p99_seconds": 0.0091,
                 "minimum_seconds": 0.0041, "maximum_seconds": 0.012},
