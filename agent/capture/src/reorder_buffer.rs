@@ -12,8 +12,8 @@
 //! While a uprobe sees messages in their senders, records from polling shared memory wait here, too.
 //! A message is polled after it was sent, so its own record comes first.
 //!
-//! Segments of Zenoh wait with the records, since the model's clock is that of the records. What
-//! they contain is read at their turn.
+//! Segments of Zenoh wait with the records, since the model's clock is that of the records. Their
+//! content is read at their turn.
 
 use std::collections::{HashSet, VecDeque};
 

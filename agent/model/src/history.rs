@@ -395,8 +395,8 @@ impl Names {
 
 impl PreviousTotals {
     /// Returns the counts between `before` and this state. A count that decreased belongs to a
-    /// topic that was removed in between, so all of it is new. What belongs to earlier seconds is
-    /// left out.
+    /// topic that was removed in between, so all of it is new. Counts of earlier
+    /// seconds are left out.
     fn since(&self, topic: u32, before: &Self) -> Row {
         let more = |now: u64, before: u64| now.checked_sub(before).unwrap_or(now);
         let fresh = |all: (u64, u64), earlier: (u64, u64)| {

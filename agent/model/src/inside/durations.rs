@@ -141,8 +141,8 @@ impl Durations {
         since
     }
 
-    /// Continues the counts of `earlier`, the state of the same handle in the report before, where
-    /// the kernel's counts of 32 bits have begun again at zero.
+    /// Continues the counts of `earlier`, the state of the same handle in the report before. The
+    /// kernel's counts of 32 bits begin again at zero.
     pub fn continue_from(&mut self, earlier: &Self) {
         let mut is_wrapped = false;
         for (count, before) in self.counts.iter_mut().zip(earlier.counts.iter()) {

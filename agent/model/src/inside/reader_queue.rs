@@ -11,7 +11,7 @@
 //! - Takes followed the last arrival, and for long there was neither.
 //!
 //! Arrivals are compared with the takes of the next report, so a message under way is never lost.
-//! What cannot be compared, as messages within the process, is not judged.
+//! Messages within the process cannot be compared, and are not judged.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -19,6 +19,7 @@ use std::time::Duration;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::findings::{Alarm, GRACE, is_many};
+use super::state::HANDLES;
 use super::tracked::HALF_WINDOW;
 use crate::size::Size;
 
@@ -214,10 +215,32 @@ impl ReaderQueue {
     }
 
     /// Returns the lengths and caps of its lists.
-    pub(super) fn sizes(&self) -> [Size; 2] {
+    pub(super) fn sizes(&self) -> [Size; 4] {
+        // The destructuring makes a new list fail to compile until it is listed here. A queue is
+        // compared only if it has as many readers as handles.
+        let Self {
+            handles,
+            readers,
+            writers,
+            depth: _,
+            taken: _,
+            excluded: _,
+            arrived: _,
+            past,
+            lost: _,
+            has_begun: _,
+            changed: _,
+            took: _,
+            longest_gap: _,
+            since: _,
+            marks: _,
+            alarm: _,
+        } = self;
         [
-            Size::new("inside.queue_writers", self.writers.len(), WRITERS),
-            Size::new("inside.queue_past", self.past.len(), PAST),
+            Size::new("inside.queue_handles", handles.len(), HANDLES),
+            Size::new("inside.queue_readers", readers.len(), HANDLES),
+            Size::new("inside.queue_writers", writers.len(), WRITERS),
+            Size::new("inside.queue_past", past.len(), PAST),
         ]
     }
 

@@ -27,7 +27,7 @@ use crate::topic::TopicId;
 /// Processes.
 const PROCESSES: usize = PROCESS_CAPACITY as usize;
 /// Handles of all processes.
-const HANDLES: usize = HANDLE_CAPACITY as usize;
+pub(super) const HANDLES: usize = HANDLE_CAPACITY as usize;
 /// Nodes kept per process.
 const NODES: usize = 256;
 /// Managed nodes with a state.

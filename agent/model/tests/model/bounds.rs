@@ -506,9 +506,16 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     assert_filled(&connected, &["zenoh.directions"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
+    let queued: Vec<_> = inside::of_a_queue()
+        .into_iter()
+        .map(|size| (size.table, (size.entries, size.cap)))
+        .collect();
+    let is_bounded = |(_, (entries, cap)): &(&str, (usize, usize))| entries <= cap;
+    assert!(queued.iter().all(is_bounded), "{queued:#?}");
+
     let further = of_one.into_iter().chain(crowded);
     let further = further.chain(called).chain(reported).chain(chained);
-    let further = further.chain(connected);
+    let further = further.chain(connected).chain(queued);
     for (table, (entries, cap)) in further {
         let seen = largest.entry(table).or_insert((0, cap));
         seen.0 = seen.0.max(entries);

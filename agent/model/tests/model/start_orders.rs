@@ -1,5 +1,5 @@
-//! Discovery of a running stream in every order: whatever the agent learns first, the figures of the
-//! same messages are equal once it knows all of it, and none is wrong on the way.
+//! Discovery of a running stream in every order. Once the agent knows all of it, the figures of the
+//! same messages are equal. No figure is wrong on the way.
 
 use std::net::SocketAddrV4;
 use std::sync::Arc;
@@ -8,15 +8,10 @@ use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::{Delivered, TopicFacts};
 use ros2probe_testing::model::domain::watchlist;
-use ros2probe_testing::model::forge::{self, Message};
-use ros2probe_testing::model::host::{
-    ALICE, BOB, CAROL, CapturePoint, Host, READER, START, WRITER,
-};
+use ros2probe_testing::model::host::{ALICE, BOB, CAROL, CapturePoint, Host, READER, START};
 use ros2probe_wire::record::flag;
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Timestamp};
+use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
-/// The writer of `ros_discovery_info`.
-const NODES: EntityId = EntityId([0, 0, 0x04, 0x03]);
 /// Milliseconds between messages: 50 Hz.
 const PERIOD: u64 = 20;
 const RATE: f64 = 50.0;
@@ -29,17 +24,15 @@ const AFTERWARDS: u64 = 1000;
 enum Step {
     Alice,
     Writer,
-    AliceNode,
     Bob,
     Reader,
     BobSocket,
     Carol,
 }
 
-const STEPS: [Step; 7] = [
+const STEPS: [Step; 6] = [
     Step::Alice,
     Step::Writer,
-    Step::AliceNode,
     Step::Bob,
     Step::Reader,
     Step::BobSocket,
@@ -49,6 +42,8 @@ const STEPS: [Step; 7] = [
 struct Scene {
     host: Host,
     sent: u64,
+    /// Participants whose sockets are known, and whose readers acknowledge again and again.
+    acknowledging: Vec<GuidPrefix>,
 }
 
 /// Figures of the last messages.
@@ -72,17 +67,22 @@ impl Scene {
             observer,
             now: START,
         };
-        Self { host, sent: 0 }
+        Self {
+            host,
+            sent: 0,
+            acknowledging: Vec::new(),
+        }
     }
 
+    /// Returns the multicast socket of a process.
     fn receiver(prefix: GuidPrefix) -> CapturePoint {
-        let port = if prefix == BOB { 7411 } else { 7413 };
-        CapturePoint {
-            socket: port,
+        let unicast = CapturePoint {
+            socket: 0,
             address: SocketAddrV4::new([10, 0, 0, 2].into(), 7411),
             directed: None,
             flags: flag::HOST,
-        }
+        };
+        unicast.multicast(if prefix == BOB { 7401 } else { 7403 })
     }
 
     fn learn(&mut self, step: Step) {
@@ -90,17 +90,12 @@ impl Scene {
         match step {
             Step::Alice => host.participant(ALICE, "10.0.0.1:7411".parse().unwrap()),
             Step::Writer => host.writer(true),
-            Step::AliceNode => {
-                let writer = Guid::new(ALICE, WRITER);
-                let payload = forge::entities(ALICE, 24, &[("/", "sensor", writer)]);
-                host.announce(Message::from(ALICE).data(NODES, 1, &payload));
-            }
-            Step::Bob => host.participant(BOB, Self::receiver(BOB).address),
+            Step::Bob => host.participant(BOB, "10.0.0.2:7411".parse().unwrap()),
             Step::Reader => host.subscribe(BOB, 1),
-            Step::BobSocket => host.owner(Self::receiver(BOB), BOB),
+            Step::BobSocket => self.acknowledging.push(BOB),
             Step::Carol => {
                 host.bystander(CAROL, 7413);
-                host.owner(Self::receiver(CAROL), CAROL);
+                self.acknowledging.push(CAROL);
             }
         }
     }
@@ -111,11 +106,13 @@ impl Scene {
         for _ in 0..count {
             self.host.wait(PERIOD);
             self.sent += 1;
-            for (prefix, socket) in [(BOB, 7401), (CAROL, 7403)] {
-                let seen = Self::receiver(prefix).multicast(socket);
-                self.host.data(seen, self.sent);
+            for prefix in [BOB, CAROL] {
+                self.host.data(Self::receiver(prefix), self.sent);
             }
             if self.sent.is_multiple_of(5) {
+                for prefix in self.acknowledging.clone() {
+                    self.host.owner(Self::receiver(prefix), prefix);
+                }
                 self.is_plausible();
             }
         }
@@ -166,7 +163,6 @@ impl Scene {
 fn discovery_in_every_order_gives_the_same_figures() {
     for order in permutations(&STEPS) {
         let mut scene = Scene::new();
-        // Sockets of multicast have their owners, as those of unicast.
         for step in &order {
             scene.send(BETWEEN);
             scene.learn(*step);

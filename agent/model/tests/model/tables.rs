@@ -35,7 +35,8 @@ const ANSWERS: [&str; 13] = [
     "watch.rs",
 ];
 /// Further structs that are returned, live during one examination, or only contain lengths.
-const ANSWER: [&str; 13] = [
+const ANSWER: [&str; 16] = [
+    "Arrivals",
     "ChainFacts",
     "ChainsFacts",
     "Findings",
@@ -43,9 +44,11 @@ const ANSWER: [&str; 13] = [
     "Past",
     "Path",
     "RememberedConnection",
+    "RememberedPassage",
     "SameStamp",
     "SpanStage",
     "Taken",
+    "Takes",
     "Through",
     "UnknownWriters",
     "ZenohMemory",

@@ -2,8 +2,10 @@
 
 use super::*;
 use ros2probe_model::inside::report::{
-    CallbackReport, Durations, ProcessReport, PublisherReport, Report, Transition, Trigger,
+    CallbackReport, Durations, ProcessReport, PublisherReport, Report, SubscriptionReport,
+    Transition, Trigger,
 };
+use ros2probe_testing::model::host;
 
 const PROCESS: u32 = 0x0101;
 /// A participant of Fast DDS in this process.
@@ -68,4 +70,38 @@ pub(super) fn reports(observer: &mut Observer, dice: &mut Dice, now: u64) {
         processes: vec![process],
         transitions: vec![transition],
     }));
+}
+
+/// Returns the sizes after more reports of a subscription than its queue keeps states.
+pub(super) fn of_a_queue() -> Vec<Size> {
+    let mut host = host::Host::new();
+    let bob = host.reader(host::BOB, 7411);
+    host.owner(bob, host::BOB);
+    for number in 1..=200 {
+        host.wait(1_000);
+        host.data(bob, number);
+        let at = Timestamp(host.now);
+        let subscription = SubscriptionReport {
+            handle: 1,
+            node: None,
+            topic: "/chatter".into(),
+            middleware: None,
+            taken: number,
+            failed: 0,
+            last: at,
+            intervals: Durations::default(),
+            latency: Durations::default(),
+        };
+        host.observer.input(Input::Inside(Report {
+            at,
+            has_callbacks: false,
+            processes: vec![ProcessReport {
+                id: host::BOB.0[2].into(),
+                subscriptions: vec![subscription],
+                ..ProcessReport::default()
+            }],
+            transitions: Vec::new(),
+        }));
+    }
+    host.observer.sizes()
 }

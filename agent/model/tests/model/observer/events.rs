@@ -211,7 +211,7 @@ fn what_the_source_could_not_see_is_no_silence() {
         states.collect()
     };
     assert_eq!(states(&mut world), []);
-    // A publisher that stopped meanwhile is silent 3 s later.
+    // A publisher that stopped in that minute is silent 3 s later.
     world.now += 60 * SECOND;
     let now = Timestamp(world.now);
     world.observer.input(Input::ViewBegan(now));
