@@ -540,6 +540,16 @@ fn no_table_grows_beyond_its_cap_whatever_is_forged() {
     ] {
         largest.remove(drained);
     }
+    // Tests of their own fill these: `deliveries`, `event` and `zenoh::routers`.
+    for rare in [
+        "delivery.withheld",
+        "events.losers",
+        "zenoh.cut",
+        "zenoh.passages",
+        "zenoh.passages.sessions",
+    ] {
+        largest.remove(rare);
+    }
     // These are filled from saved state only.
     for restored in ["zenoh.relayed", "zenoh.remembered", "zenoh.restored"] {
         largest.remove(restored);
