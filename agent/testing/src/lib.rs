@@ -58,3 +58,20 @@ pub fn repository(path: &str) -> PathBuf {
         .join("../..")
         .join(path)
 }
+
+/// Returns these items in every order.
+#[must_use]
+pub fn permutations<T: Copy>(items: &[T]) -> Vec<Vec<T>> {
+    let Some((first, rest)) = items.split_first() else {
+        return vec![Vec::new()];
+    };
+    let mut all = Vec::new();
+    for order in permutations(rest) {
+        for place in 0..=order.len() {
+            let mut order = order.clone();
+            order.insert(place, *first);
+            all.push(order);
+        }
+    }
+    all
+}

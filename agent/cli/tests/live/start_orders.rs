@@ -15,6 +15,7 @@ use ros2probe_testing::harness::agent::{Agent, Scrape, at_the_sockets_of, get};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::peer::{self, Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::process::Process;
+use ros2probe_testing::permutations;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -95,21 +96,6 @@ fn every_order_from(stack: Stack, first: &[Part], parts: &[Part]) -> Result<()> 
     }
     ensure!(failed.is_empty(), "{}", failed.join("\n"));
     Ok(())
-}
-
-fn permutations(parts: &[Part]) -> Vec<Vec<Part>> {
-    let Some((first, rest)) = parts.split_first() else {
-        return vec![Vec::new()];
-    };
-    let mut all = Vec::new();
-    for order in permutations(rest) {
-        for place in 0..=order.len() {
-            let mut order = order.clone();
-            order.insert(place, *first);
-            all.push(order);
-        }
-    }
-    all
 }
 
 /// What the agent reports of a stretch of messages.

@@ -9,6 +9,7 @@ use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::snapshot::{Delivered, TopicFacts};
 use ros2probe_testing::model::domain::watchlist;
 use ros2probe_testing::model::host::{ALICE, BOB, CAROL, CapturePoint, Host, READER, START};
+use ros2probe_testing::permutations;
 use ros2probe_wire::record::flag;
 use ros2probe_wire::{Guid, GuidPrefix, Timestamp};
 
@@ -194,19 +195,4 @@ fn lost(delivered: &Delivered) -> u64 {
         + delivered.lost_in_reassembly
         + delivered.lost_in_socket_buffer
         + delivered.pending
-}
-
-fn permutations(steps: &[Step]) -> Vec<Vec<Step>> {
-    let Some((first, rest)) = steps.split_first() else {
-        return vec![Vec::new()];
-    };
-    let mut all = Vec::new();
-    for order in permutations(rest) {
-        for place in 0..=order.len() {
-            let mut order = order.clone();
-            order.insert(place, *first);
-            all.push(order);
-        }
-    }
-    all
 }
