@@ -149,17 +149,7 @@ rotel() {
 }
 
 # Real sessions and routers of Zenoh, and the hash of rmw_zenoh's GIDs.
-zenoh() {
-    local place=$tools/zenoh
-    local versions=("eclipse-zenoh==1.10.2" "xxhash==4.1.0")
-    [ "$(cat "$place/versions" 2>/dev/null)" = "${versions[*]}" ] && return
-    packages python3 python3-venv
-    say "installing ${versions[*]} from PyPI into target/tools/zenoh"
-    rm -rf "$place"
-    python3 -m venv "$place"
-    "$place/bin/pip" install --quiet --disable-pip-version-check "${versions[@]}"
-    echo "${versions[*]}" >"$place/versions"
-}
+zenoh() { python_packages zenoh "eclipse-zenoh==1.10.2" "xxhash==4.1.0"; }
 
 # Generates requests to the control API; installed in a separate Python environment.
 schemathesis() {
@@ -173,12 +163,15 @@ schemathesis() {
 }
 
 # Other implementations that read bags, for comparison.
-bags() {
-    local place=$tools/bags
-    local versions=("mcap==1.6.0" "rosbags==0.11.9")
+bags() { python_packages bags "mcap==1.6.0" "rosbags==0.11.9"; }
+
+# Installs packages of PyPI into a Python environment of this name.
+python_packages() {
+    local place=$tools/$1
+    local versions=("${@:2}")
     [ "$(cat "$place/versions" 2>/dev/null)" = "${versions[*]}" ] && return
     packages python3 python3-venv
-    say "installing ${versions[*]} from PyPI into target/tools/bags"
+    say "installing ${versions[*]} from PyPI into target/tools/$1"
     rm -rf "$place"
     python3 -m venv "$place"
     "$place/bin/pip" install --quiet --disable-pip-version-check "${versions[@]}"
