@@ -22,6 +22,7 @@ pub mod discovery;
 mod domain;
 #[cfg(feature = "alloc")]
 pub mod entities;
+mod expansion;
 pub mod filter;
 pub mod frame;
 pub mod guid;
@@ -46,6 +47,7 @@ pub mod zenoh;
 
 pub use cursor::{Cursor, Endianness, Reason, WireError};
 pub use domain::DomainId;
+pub use expansion::{ExpandsTooFar, Expansion};
 pub use guid::{EntityId, Guid, GuidPrefix};
 pub use record::Record;
 pub use rtps::SequenceNumber;

@@ -47,8 +47,17 @@ pub struct Watch {
     pub retain: Retain,
     #[serde(flatten)]
     pub expectations: Expectations,
+    /// Whether the watch outlives the agent. False for a watch of a client while the state directory
+    /// is missing or cannot be written.
+    #[serde(default = "yes")]
+    pub kept: bool,
     /// Topics that the watch covers; a watched name without a topic is listed too.
     pub topics: Vec<WatchedTopic>,
+}
+
+/// An agent without this field says nothing else.
+const fn yes() -> bool {
+    true
 }
 
 /// Messages that the agent keeps for recordings that begin later.

@@ -8,6 +8,8 @@ use std::fs;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
+use ros2probe_wire::Expansion;
+
 use super::mcap::Message;
 use super::metadata::{self, File, Metadata, Topic};
 use super::open_file;
@@ -21,6 +23,7 @@ pub struct Bag {
     pub metadata: Metadata,
     /// Size of all files in the directory.
     pub bytes: u64,
+    expansion: Expansion,
 }
 
 /// Why a bag cannot be opened.
@@ -76,13 +79,13 @@ impl Bag {
     ///
     /// # Errors
     /// Fails if nothing there can be read, or if it is not a bag.
-    pub fn open(path: &Path) -> Result<Self, InfoError> {
+    pub fn open(path: &Path, expansion: Expansion) -> Result<Self, InfoError> {
         let wrong = |source| ReadError::Io {
             path: path.to_owned(),
             source,
         };
         if !path.is_dir() {
-            return Self::open_file(path);
+            return Self::open_file(path, expansion);
         }
         let file = path.join(metadata::FILE_NAME);
         let text = match read_text(&file) {
@@ -103,10 +106,11 @@ impl Bag {
             path: path.to_owned(),
             metadata: Metadata::read(&text)?,
             bytes,
+            expansion,
         })
     }
 
-    fn open_file(path: &Path) -> Result<Self, InfoError> {
+    fn open_file(path: &Path, expansion: Expansion) -> Result<Self, InfoError> {
         let wrong = |source| ReadError::Io {
             path: path.to_owned(),
             source,
@@ -120,7 +124,7 @@ impl Bag {
         if begin == SQLITE_MAGIC {
             return Err(InfoError::Sqlite3(path.to_owned()));
         }
-        let contents = match Contents::of_file(path) {
+        let contents = match Contents::of_file(path, expansion) {
             Err(ReadError::NotMcap(path)) => return Err(InfoError::Unknown(path)),
             contents => contents?,
         };
@@ -128,6 +132,7 @@ impl Bag {
             path: path.to_owned(),
             metadata: of_contents(&contents, &path.display().to_string()),
             bytes: file.metadata().map_err(wrong)?.len(),
+            expansion,
         })
     }
 
@@ -147,7 +152,7 @@ impl Bag {
                 self.path.clone()
             };
             let mut calls = BTreeMap::new();
-            let scan = read::scan(&path, &mut |message, contents| {
+            let scan = read::scan(&path, self.expansion, &mut |message, contents| {
                 let channel = contents.channels.get(&message.channel_id);
                 if let Some(channel) = channel
                     && channel.topic.ends_with(SERVICE_EVENT)

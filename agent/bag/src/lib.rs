@@ -16,7 +16,7 @@
 //!
 //! use ros2probe_bag::info::Bag;
 //! use ros2probe_bag::{Options, Schema, TopicDescription, Writer};
-//! use ros2probe_wire::Timestamp;
+//! use ros2probe_wire::{Expansion, Timestamp};
 //!
 //! let directory = tempfile::tempdir()?;
 //! let path = directory.path().join("run");
@@ -35,7 +35,7 @@
 //! writer.write(chatter, received, sent, 1, b"\0\x01\0\0\x06\0\0\0hello\0")?;
 //! writer.close(BTreeMap::new())?;
 //!
-//! let bag = Bag::open(&path)?;
+//! let bag = Bag::open(&path, Expansion::Limited)?;
 //! assert_eq!(bag.metadata.message_count, 1);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```

@@ -10,6 +10,8 @@ use std::fs;
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
+use ros2probe_wire::Expansion;
+
 use super::info::{SQLITE_MAGIC, read_text};
 use super::mcap;
 use super::metadata::{self, Metadata, MetadataError};
@@ -109,6 +111,7 @@ pub fn is_bag(path: &Path) -> bool {
 /// Fails if nothing can be read.
 pub fn read(
     path: &Path,
+    expansion: Expansion,
     each: &mut dyn FnMut(&Message<'_>, Option<u64>),
 ) -> Result<Read, MessagesError> {
     let (files, total) = match path.is_dir() {
@@ -120,7 +123,7 @@ pub fn read(
     let mut is_any_read = false;
     for file in files {
         let before = result.messages;
-        let read = read_file(&file, &mut |message| {
+        let read = read_file(&file, expansion, &mut |message| {
             result.messages += 1;
             each(message, total);
         });
@@ -243,13 +246,17 @@ fn files_of(directory: &Path) -> Result<(Vec<PathBuf>, Option<u64>), MessagesErr
     }
 }
 
-fn read_file(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> Result<Vec<Fault>, MessagesError> {
+fn read_file(
+    path: &Path,
+    expansion: Expansion,
+    each: &mut dyn FnMut(&Message<'_>),
+) -> Result<Vec<Fault>, MessagesError> {
     let begin = begin_of(path).map_err(|source| MessagesError::Io {
         path: path.to_owned(),
         source,
     })?;
     match storage(path, &begin) {
-        Some(Storage::Mcap) => read_mcap(path, each).map_err(|error| match error {
+        Some(Storage::Mcap) => read_mcap(path, expansion, each).map_err(|error| match error {
             ReadError::Io { path, source } => MessagesError::Io { path, source },
             ReadError::NotMcap(path) => MessagesError::Unknown(path),
         }),
@@ -258,8 +265,12 @@ fn read_file(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> Result<Vec<Faul
     }
 }
 
-fn read_mcap(path: &Path, each: &mut dyn FnMut(&Message<'_>)) -> Result<Vec<Fault>, ReadError> {
-    let scan = read::scan_with_cut(path, &mut |message, contents| {
+fn read_mcap(
+    path: &Path,
+    expansion: Expansion,
+    each: &mut dyn FnMut(&Message<'_>),
+) -> Result<Vec<Fault>, ReadError> {
+    let scan = read::scan_with_cut(path, expansion, &mut |message, contents| {
         let Some(channel) = contents.channels.get(&message.channel_id) else {
             return;
         };

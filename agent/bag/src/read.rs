@@ -9,6 +9,8 @@ use std::fs::File;
 use std::io::{self, BufReader, Read, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use ros2probe_wire::{ExpandsTooFar, Expansion};
+
 use super::mcap::{
     self, Channel, Chunk, ChunkIndex, Footer, Message, Metadata, Opcode, RECORD_HEADER, Schema,
     Statistics,
@@ -17,10 +19,11 @@ use super::{Compression, open_file};
 
 /// Longest record; a length beyond this is damage.
 const MAX_RECORD: u64 = 1 << 30;
-/// Compressed content may expand to this many bytes, and to [`EXPANSION`] times the file's size.
-/// Recordings stay far below: a few megabytes of the same byte are rare.
-const EXPANDED: u64 = 64 << 20;
-const EXPANSION: u64 = 1024;
+/// Limit of expansion over a file, beyond [`Expansion::FREE`]. Recordings stay far below: a few
+/// megabytes of the same byte are rare.
+const FACTOR: u64 = 1024;
+/// Limit of expansion of one chunk or record, which is in memory at once.
+const FACTOR_IN_MEMORY: u64 = 16;
 
 /// Content of a file.
 #[derive(Clone, PartialEq, Eq, Debug, Default)]
@@ -94,13 +97,13 @@ impl Contents {
     }
 
     /// Reads the summary, or else all records.
-    pub fn of_file(path: &Path) -> Result<Self, ReadError> {
+    pub fn of_file(path: &Path, expansion: Expansion) -> Result<Self, ReadError> {
         if compression(path) == Compression::None
             && let Some(contents) = Self::of_summary(path)?
         {
             return Ok(contents);
         }
-        Ok(scan_with_cut(path, &mut |_, _| {})?.contents)
+        Ok(scan_with_cut(path, expansion, &mut |_, _| {})?.contents)
     }
 
     /// Returns the number of messages of all channels, saturating: a summary may contain any
@@ -199,14 +202,14 @@ fn read_at(file: &mut File, offset: u64, length: u64) -> io::Result<Vec<u8>> {
 pub type Visitor<'a> = dyn FnMut(&Message<'_>, &Contents) + 'a;
 
 /// Reads a file record by record, decompressing `.zstd` and `.lz4`.
-pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
+pub fn scan(path: &Path, expansion: Expansion, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
     let wrong = |source| ReadError::Io {
         path: path.to_owned(),
         source,
     };
     let file = open_file(path).map_err(wrong)?;
     let length = file.metadata().map_err(wrong)?.len();
-    let expands = EXPANDED.saturating_add(length.saturating_mul(EXPANSION));
+    let expands = expansion.limit(length, FACTOR);
     let compression = compression(path);
     let reader = compression.reader(BufReader::with_capacity(1 << 16, file));
     let mut records = Records {
@@ -217,6 +220,11 @@ pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
             Compression::Lz4 | Compression::Zstd => expands,
         },
         expands,
+        expansion,
+        in_memory: match compression {
+            Compression::None => u64::MAX,
+            Compression::Lz4 | Compression::Zstd => expansion.limit(length, FACTOR_IN_MEMORY),
+        },
     };
     let mut magic = Vec::new();
     records
@@ -229,8 +237,12 @@ pub fn scan(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
 }
 
 /// As [`scan`], but also visits the messages at the beginning of a truncated chunk.
-pub(super) fn scan_with_cut(path: &Path, each: &mut Visitor<'_>) -> Result<Scan, ReadError> {
-    let mut scan = scan(path, each)?;
+pub(super) fn scan_with_cut(
+    path: &Path,
+    expansion: Expansion,
+    each: &mut Visitor<'_>,
+) -> Result<Scan, ReadError> {
+    let mut scan = scan(path, expansion, each)?;
     let cut = std::mem::take(&mut scan.cut);
     take_chunk(&cut, &mut scan, each);
     Ok(scan)
@@ -257,7 +269,8 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
             Next::Whole(opcode) => opcode,
             Next::Cut(Opcode::CHUNK) => {
                 finish_chunk(indexed.take(), &mut scan, false);
-                scan.cut = whole_records(&content, records.expands);
+                let limit = records.in_memory(content.len()).min(records.expands);
+                scan.cut = whole_records(&content, limit);
                 return Ok(scan);
             }
             Next::Cut(_) | Next::End => {
@@ -282,7 +295,9 @@ fn scan_records(records: &mut Records<'_>, each: &mut Visitor<'_>) -> io::Result
                 let Some(chunk) = Chunk::read(&content) else {
                     return Ok(scan);
                 };
-                let index = read_chunk(&chunk, &mut records.expands, &mut scan, each)?;
+                let in_memory = records.in_memory(chunk.records.len());
+                let left = &mut records.expands;
+                let index = read_chunk(&chunk, in_memory, left, &mut scan, each)?;
                 indexed = Some(IndexedChunk::new(&chunk, start, records.position, index));
             }
             Opcode::MESSAGE => {
@@ -358,9 +373,11 @@ fn finish_chunk(indexed: Option<IndexedChunk>, scan: &mut Scan, at_end: bool) {
     scan.chunks.push(indexed.chunk);
 }
 
-/// Reads a chunk. Subtracts its expanded size from `left`; a chunk beyond that ends the reading.
+/// Reads a chunk. Subtracts its expanded size from `left`; a chunk beyond that, or beyond
+/// `in_memory`, ends the reading.
 fn read_chunk(
     chunk: &Chunk<'_>,
+    in_memory: u64,
     left: &mut u64,
     scan: &mut Scan,
     each: &mut Visitor<'_>,
@@ -368,14 +385,17 @@ fn read_chunk(
     let records = match Compression::named(chunk.compression) {
         Some(Compression::None) => return Ok(take_chunk(chunk.records, scan, each)),
         Some(compression) => {
-            let limit = chunk.uncompressed_size.min(*left);
+            let limit = chunk.uncompressed_size.min(*left).min(in_memory);
             let records = compression.decompressed(chunk.records, limit);
             let expanded = records
                 .as_ref()
                 .map_or(limit, |records| records.len() as u64);
             *left = left.saturating_sub(expanded);
             if records.is_err() && limit < chunk.uncompressed_size {
-                return Err(expands_too_far());
+                return Err(expands_too_far(match limit == in_memory {
+                    true => FACTOR_IN_MEMORY,
+                    false => FACTOR,
+                }));
             }
             records
         }
@@ -390,11 +410,8 @@ fn read_chunk(
     })
 }
 
-fn expands_too_far() -> io::Error {
-    io::Error::new(
-        io::ErrorKind::FileTooLarge,
-        format!("it expands to more than {EXPANSION} times its size"),
-    )
+fn expands_too_far(factor: u64) -> io::Error {
+    io::Error::new(io::ErrorKind::FileTooLarge, ExpandsTooFar(factor))
 }
 
 /// Adds a chunk's records, and returns its expected message indexes.
@@ -463,6 +480,9 @@ struct Records<'a> {
     left: u64,
     /// Bytes to which compressed chunks may still expand.
     expands: u64,
+    expansion: Expansion,
+    /// Largest record of a file that is compressed as a whole, in bytes.
+    in_memory: u64,
 }
 
 enum Next {
@@ -473,6 +493,11 @@ enum Next {
 }
 
 impl Records<'_> {
+    /// Returns the number of bytes to which a chunk of this length may expand in memory.
+    const fn in_memory(&self, length: usize) -> u64 {
+        self.expansion.limit(length as u64, FACTOR_IN_MEMORY)
+    }
+
     fn next(&mut self, content: &mut Vec<u8>) -> io::Result<Next> {
         content.clear();
         let mut head = Vec::new();
@@ -499,13 +524,16 @@ impl Records<'_> {
     /// ends.
     fn read(&mut self, length: u64, into: &mut Vec<u8>) -> io::Result<u64> {
         let before = into.len();
-        let limit = length.min(self.left);
+        let limit = length.min(self.left).min(self.in_memory);
         let result = (&mut self.reader).take(limit).read_to_end(into);
         let read = (into.len() - before) as u64;
         self.position += read;
         self.left -= read;
+        if read < length && read == self.in_memory {
+            return Err(expands_too_far(FACTOR_IN_MEMORY));
+        }
         if read < length && self.left == 0 {
-            return Err(expands_too_far());
+            return Err(expands_too_far(FACTOR));
         }
         match result {
             Err(error)

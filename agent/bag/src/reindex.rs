@@ -11,6 +11,8 @@ use std::fs::{self, File};
 use std::io::{self, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use ros2probe_wire::Expansion;
+
 use super::file::FileWriter;
 use super::mcap::{self, Message, Opcode};
 use super::metadata::{self, Metadata, Topic};
@@ -76,7 +78,7 @@ pub enum ReindexError {
 }
 
 /// Completes all files of a bag and writes its metadata.yaml.
-pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
+pub fn reindex(directory: &Path, expansion: Expansion) -> Result<Report, ReindexError> {
     let mut names = files(directory)?;
     let before = info::read_text(&directory.join(metadata::FILE_NAME)).ok();
     let before = before.and_then(|text| Metadata::read(&text).ok());
@@ -87,7 +89,7 @@ pub fn reindex(directory: &Path) -> Result<Report, ReindexError> {
     let mut parts = Vec::new();
     for name in &mut names {
         let path = directory.join(&*name);
-        let (found, contents) = complete(&path)?;
+        let (found, contents) = complete(&path, expansion)?;
         if let Some(contents) = &contents
             && compression != Compression::None
             && read::compression(&path) == Compression::None
@@ -158,7 +160,7 @@ fn number(name: &str) -> Option<u64> {
     stem.rsplit_once('_')?.1.parse().ok()
 }
 
-fn complete(path: &Path) -> Result<(Found, Option<Contents>), ReindexError> {
+fn complete(path: &Path, expansion: Expansion) -> Result<(Found, Option<Contents>), ReindexError> {
     if read::compression(path) == Compression::None {
         match Contents::of_summary(path) {
             Err(ReadError::NotMcap(_)) => return Ok((Found::NotMcap, None)),
@@ -166,13 +168,13 @@ fn complete(path: &Path) -> Result<(Found, Option<Contents>), ReindexError> {
             Ok(Some(contents)) => return Ok((Found::Complete, Some(contents))),
             Ok(None) => {}
         }
-        let scan = read::scan(path, &mut |_, _| {})?;
+        let scan = read::scan(path, expansion, &mut |_, _| {})?;
         let written = |error| Error::writing(path, error);
         let found = rewrite(path, &scan).map_err(written)?;
         let contents = Contents::of_summary(path)?;
         return Ok((found, contents));
     }
-    match read::scan(path, &mut |_, _| {}) {
+    match read::scan(path, expansion, &mut |_, _| {}) {
         Err(ReadError::NotMcap(_)) => Ok((Found::NotMcap, None)),
         Err(error) => Err(error.into()),
         Ok(scan) => Ok((Found::Complete, Some(scan.contents))),

@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use ros2probe_capture::inside::programs;
 use ros2probe_capture::inside::table::ProcessTable;
+use ros2probe_capture::memory_reader::read_memory;
 use ros2probe_capture::system::Clocks;
 use ros2probe_capture::uprobe::library;
 use ros2probe_wire::inside::kind;
@@ -102,7 +103,7 @@ fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
     if counts != [CALLS, CALLS, callbacks] {
         return Err(format!("counted {counts:?}").into());
     }
-    let mut table = ProcessTable::new(has_callbacks);
+    let mut table = ProcessTable::new(has_callbacks, Box::new(read_memory));
     let second = Duration::from_secs(1);
     let round = table.round(&mut tables, &Clocks::read(), second, |_| false);
     drop(attached);

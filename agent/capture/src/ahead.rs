@@ -10,7 +10,7 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{Body, Record, flag};
 
 use super::reassembly::Reassembled;
-use ros2probe_model::size::Size;
+use crate::size::Size;
 
 /// Most waiting datagrams; the oldest makes room for another.
 const DATAGRAMS: usize = 1024;

@@ -6,12 +6,14 @@
 
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use super::cgroup::{self, Cgroup, CgroupError};
 use super::error_chain::in_words;
 use super::filter::{Filter, FilterError, FilterSettings, ports};
 use super::filter_reader::FilterReader;
 use super::reattach::{self, Reattach};
+use super::reorder_buffer::ReorderBuffer;
 use super::sockets::Sockets;
 use super::system::Clocks;
 use super::tracepoints::Abilities;
@@ -121,6 +123,13 @@ impl HostTap {
         self.reattach.as_ref()?.detached()
     }
 
+    /// Returns for how long the thread that follows the control group has made no progress; `None`
+    /// if it makes progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.reattach.as_ref()?.stalled()
+    }
+
     /// Returns how often the hook was attached to another control group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
@@ -172,6 +181,11 @@ impl HostTap {
     /// Returns the kernel programs' maps, for setting interests.
     pub const fn filter_mut(&mut self) -> &mut Filter {
         self.reader.filter_mut()
+    }
+
+    /// Returns the buffer in which records wait for their turn.
+    pub const fn order_mut(&mut self) -> &mut ReorderBuffer {
+        self.reader.order_mut()
     }
 
     /// Returns the reader, for its counters.

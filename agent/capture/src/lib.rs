@@ -15,10 +15,11 @@
 //!
 //! use ros2probe_capture::frame_decoder::FrameDecoder;
 //! use ros2probe_capture::pcap::PcapReader;
+//! use ros2probe_wire::Expansion;
 //! use ros2probe_capture::reassembly::Limits;
 //! use ros2probe_model::observer::{Observer, Settings};
 //!
-//! let mut reader = PcapReader::open(Path::new("robot.pcap.gz"))?;
+//! let mut reader = PcapReader::open(Path::new("robot.pcap.gz"), Expansion::Limited)?;
 //! let mut observer = Observer::new(Settings::default());
 //! FrameDecoder::new(Limits::default()).run(&mut reader, &mut observer)?;
 //! # Ok::<_, ros2probe_capture::pcap::PcapError>(())
@@ -40,6 +41,7 @@ pub mod interfaces;
 pub mod kernel_types;
 pub mod live;
 pub mod mappings;
+pub mod memory_reader;
 pub mod netns;
 pub mod owners;
 pub mod pcap;
@@ -50,6 +52,7 @@ pub mod reorder_buffer;
 pub mod ring;
 pub mod settings;
 pub mod shm;
+pub mod size;
 pub mod sockets;
 pub mod system;
 pub mod threads;

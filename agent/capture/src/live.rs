@@ -7,6 +7,7 @@
 mod open;
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -114,6 +115,53 @@ enum Shm {
     Off,
     Later(Scope, Shares),
     Running(SharedMemory),
+}
+
+/// A part of the source with a thread of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Follows the control group of `capture.cgroup`.
+    ControlGroup,
+    /// Polls shared memory.
+    SharedMemory,
+    /// Attaches breakpoints for `capture.shm.exact`.
+    Exact,
+    /// Observes processes for `capture.inside`.
+    Inside,
+}
+
+impl Part {
+    /// Returns the configuration key of the part.
+    #[must_use]
+    pub const fn key(self) -> &'static str {
+        match self {
+            Self::ControlGroup => "capture.cgroup",
+            Self::SharedMemory => "capture.shm",
+            Self::Exact => "capture.shm.exact",
+            Self::Inside => "capture.inside",
+        }
+    }
+}
+
+/// A part whose thread makes no progress.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stalled {
+    /// The part.
+    pub part: Part,
+    /// Time since its last progress.
+    pub time: Duration,
+}
+
+impl fmt::Display for Stalled {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            f,
+            "{}: its thread has made no progress for {} s: a file or a call of the kernel does not \
+            answer",
+            self.part.key(),
+            self.time.as_secs()
+        )
+    }
 }
 
 /// Frames of one interface.
@@ -303,13 +351,12 @@ impl LiveSource {
         self.clocks = clocks;
         self.refill(clocks.monotonic);
         let mut settle = 0;
+        self.leave_exact_mode(&clocks, observer);
+        self.take_polled(&clocks, observer);
         if let Some(host) = &mut self.host {
             host.poll(&clocks, observer);
             settle = filter_reader::SETTLE_NANOSECONDS;
         }
-        self.leave_exact_mode(&clocks, observer);
-        // What was polled must not overtake what uprobes saw before.
-        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.poll(&clocks, observer);
             settle = filter_reader::SETTLE_NANOSECONDS;
@@ -376,10 +423,10 @@ impl LiveSource {
     /// Passes everything that still waits to the model, at the end.
     pub fn drain(&mut self, observer: &mut Observer) {
         let clocks = Clocks::read();
+        self.take_polled(&clocks, observer);
         if let Some(host) = &mut self.host {
             host.drain(&clocks, observer);
         }
-        self.take_polled(&clocks, observer);
         if let Some(exact) = &mut self.exact {
             exact.drain(&clocks, observer);
         }
@@ -388,11 +435,13 @@ impl LiveSource {
         }
     }
 
-    /// Passes what was polled in shared memory to the model, or to the uprobes' buffer.
+    /// Passes what was polled in shared memory to the model, or to a buffer: polling may miss a
+    /// sample that uprobes or sockets see, and the next one must not overtake it.
     fn take_polled(&mut self, clocks: &Clocks, observer: &mut Observer) {
         if let Shm::Running(shared_memory) = &self.shared_memory {
-            let order = self.exact.as_mut().and_then(Uprobe::order_mut);
-            shared_memory.poll(clocks, order, observer);
+            let exact = self.exact.as_mut().and_then(Uprobe::order_mut);
+            let host = self.host.as_mut().map(HostTap::order_mut);
+            shared_memory.poll(clocks, exact.or(host), observer);
         }
     }
 
@@ -574,6 +623,25 @@ impl LiveSource {
         Some(format!(
             "{key}: the running processes have not been inspected yet"
         ))
+    }
+
+    /// Returns the threads that make no progress: a file or a call of the kernel does not answer.
+    pub fn stalled(&self) -> impl Iterator<Item = Stalled> {
+        let shared_memory = match &self.shared_memory {
+            Shm::Running(shared_memory) => shared_memory.stalled(),
+            Shm::Off | Shm::Later(..) => None,
+        };
+        let threads = [
+            (
+                Part::ControlGroup,
+                self.host.as_ref().and_then(HostTap::stalled),
+            ),
+            (Part::SharedMemory, shared_memory),
+            (Part::Exact, self.exact.as_ref().and_then(Uprobe::stalled)),
+            (Part::Inside, self.inside.as_ref().and_then(Inside::stalled)),
+        ];
+        let stalled = threads.into_iter();
+        stalled.filter_map(|(part, time)| time.map(|time| Stalled { part, time }))
     }
 
     /// Returns how often the host hook was attached to a recreated control group.

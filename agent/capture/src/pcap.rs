@@ -8,6 +8,7 @@
 //!
 //! The reader knows no clock; [`Pacer`] follows the capture's pace.
 
+mod gunzip;
 mod next_generation;
 mod pace;
 
@@ -17,10 +18,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use flate2::read::MultiGzDecoder;
 use ros2probe_wire::frame::Link;
-use ros2probe_wire::{Cursor, Endianness, Timestamp, WireError};
+use ros2probe_wire::{Cursor, Endianness, Expansion, Timestamp, WireError};
 
+use gunzip::Gunzip;
 use next_generation::Section;
 pub use pace::{Pacer, Speed};
 
@@ -158,7 +159,7 @@ impl PcapReader {
     ///
     /// # Errors
     /// Fails if the file cannot be opened or does not begin like a capture.
-    pub fn open(path: &Path) -> Result<Self, PcapError> {
+    pub fn open(path: &Path, expansion: Expansion) -> Result<Self, PcapError> {
         let file = File::open(path).map_err(|source| PcapError::Open {
             path: path.to_path_buf(),
             source,
@@ -172,7 +173,7 @@ impl PcapReader {
         let length = length.filter(|length| *length > 0);
         Ok(Self {
             progress: length.map(|length| (read, length)),
-            ..Self::new(counted)?
+            ..Self::new(counted, expansion)?
         })
     }
 
@@ -188,12 +189,15 @@ impl PcapReader {
     ///
     /// # Errors
     /// Fails if the stream does not begin like a capture.
-    pub fn new(source: impl Read + Send + 'static) -> Result<Self, PcapError> {
+    pub fn new(
+        source: impl Read + Send + 'static,
+        expansion: Expansion,
+    ) -> Result<Self, PcapError> {
         let mut source: Box<dyn Read + Send> = Box::new(BufReader::new(source));
         let mut magic: [u8; 4] = array(&mut source, "file header", 0)?;
         if magic.starts_with(&GZIP_MAGIC) {
             let whole = io::Cursor::new(magic).chain(source);
-            source = Box::new(BufReader::new(MultiGzDecoder::new(whole)));
+            source = Box::new(BufReader::new(Gunzip::new(whole, expansion)));
             magic = array(&mut source, "file header", 0)?;
         }
         let format = if magic == next_generation::MAGIC {

@@ -19,7 +19,7 @@ use ros2probe_wire::{Cursor, Endianness, Timestamp};
 
 use flow::{Flow, Placed};
 
-use ros2probe_model::size::Size;
+use crate::size::Size;
 
 const UDP_HEADER: u32 = 8;
 

@@ -19,7 +19,7 @@ use super::cgroup::{Cgroup, CgroupError};
 use super::error_chain::in_words;
 use super::filter::{FilterError, Links};
 use super::system::{DirectoryWatch, wait};
-use crate::threads::{Spawn, Task};
+use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of checks while the directory above the group is not watched.
 const EVERY: Duration = Duration::from_secs(1);
@@ -44,6 +44,7 @@ struct Shared {
     detached: Mutex<Option<String>>,
     /// How often the hook was attached again.
     attached_anew: AtomicU64,
+    progress: Progress,
 }
 
 /// State of the thread.
@@ -99,6 +100,12 @@ impl Reattach {
         detached.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Returns for how long the thread has made no progress; `None` if it makes progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.shared.progress.stalled()
+    }
+
     /// Returns how often the hook was attached to another group since the start.
     #[must_use]
     pub fn attached_anew(&self) -> u64 {
@@ -109,7 +116,10 @@ impl Reattach {
 impl Drop for Reattach {
     fn drop(&mut self) {
         self.end = None;
-        if let Some(thread) = self.thread.take() {
+        // A stalled thread is left to the end of the process.
+        if let Some(thread) = self.thread.take()
+            && self.shared.progress.stalled().is_none()
+        {
             // The thread has ended in any case; its result has no user.
             let _ = thread.join();
         }
@@ -121,6 +131,7 @@ impl Follow {
         // Without inotify, a recreated group is noticed within a second.
         let mut watch = DirectoryWatch::new().ok();
         loop {
+            self.shared.progress.step();
             let watches_above = match (&mut watch, self.path.parent()) {
                 (Some(watch), Some(above)) => watch.add_with_removals(above),
                 _ => false,
@@ -131,6 +142,7 @@ impl Follow {
                 true => EVERY_WATCHED,
                 false => EVERY,
             };
+            self.shared.progress.rest();
             let is_over = match &watch {
                 Some(watch) => wait(&[ended, watch.as_fd()], every),
                 None => wait(&[ended], every),
@@ -138,6 +150,7 @@ impl Follow {
             if !matches!(is_over, Ok(None | Some(1))) {
                 return;
             }
+            self.shared.progress.step();
             if let Some(watch) = &mut watch {
                 watch.created(|_| true);
             }

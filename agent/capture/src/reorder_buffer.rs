@@ -9,8 +9,8 @@
 //! precede all records of their time or later. For a captured datagram the kernel reports only the
 //! token. The datagram's records are then passed twice, first as not delivered.
 //!
-//! While a uprobe sees messages in their senders, records from polling shared memory wait here, too.
-//! A message is polled after it was sent, so its own record comes first.
+//! Records from polling shared memory wait here, too: a uprobe or a socket may see samples that
+//! polling misses. A message is polled after it was sent, so its own record comes first.
 //!
 //! Segments of Zenoh wait with the records, since the model's clock is that of the records. Their
 //! content is read at their turn.

@@ -10,6 +10,7 @@ use std::ptr;
 use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
+use rustix::process::{DumpableBehavior, set_dumpable_behavior};
 
 /// Most attempts to read the clocks.
 const READINGS: usize = 8;
@@ -158,6 +159,15 @@ pub fn run_first(first: bool) -> io::Result<()> {
         0 => Ok(()),
         error => Err(io::Error::from_raw_os_error(error)),
     }
+}
+
+/// Makes the memory of this process unreadable for processes without `CAP_SYS_PTRACE`, also for
+/// those of the same user, and its end leave no core file. A change of the user undoes this.
+///
+/// # Errors
+/// Fails if the system call is refused.
+pub fn hide_memory() -> io::Result<()> {
+    Ok(set_dumpable_behavior(DumpableBehavior::NotDumpable)?)
 }
 
 /// Returns free memory to the system. Reading the kernel's types takes some 15 MB that glibc's

@@ -1,7 +1,14 @@
 //! Threads of sources, and the privileges that each needs.
 
 use std::io;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread::{Builder, JoinHandle};
+use std::time::Duration;
+
+use crate::system::monotonic;
+
+/// Time without progress after which a thread counts as stalled. Readiness turns within 5 s.
+const STALLED_AFTER: Duration = Duration::from_secs(4);
 
 /// Task of a thread, which determines the privileges that it keeps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,3 +27,56 @@ pub enum Task {
 ///
 /// Fails if the system has no thread left, or if the thread cannot be confined.
 pub type Spawn = fn(Task, Builder, Box<dyn FnOnce() + Send>) -> io::Result<JoinHandle<()>>;
+
+/// Progress of a thread, for its observers. A thread that works on one step for too long is stalled:
+/// a file or a call of the kernel does not answer. One that waits for something to do is not.
+#[derive(Debug, Default)]
+pub struct Progress {
+    /// Begin of the present step, in nanoseconds of the monotonic clock; 0 = the thread waits, or
+    /// has not started.
+    step: AtomicU64,
+}
+
+impl Progress {
+    /// Notes that the thread begins its next step.
+    pub fn step(&self) {
+        self.step.store(monotonic().max(1), Ordering::Release);
+    }
+
+    /// Notes that the thread waits for something to do, or ends.
+    pub fn rest(&self) {
+        self.step.store(0, Ordering::Release);
+    }
+
+    /// Returns the length of a step that takes too long; `None` if there is progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.stalled_at(monotonic())
+    }
+
+    fn stalled_at(&self, now: u64) -> Option<Duration> {
+        let step = self.step.load(Ordering::Acquire);
+        let long = Duration::from_nanos(now.saturating_sub(step));
+        (step != 0 && long > STALLED_AFTER).then_some(long)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_thread_is_stalled_in_a_long_step_and_not_while_it_waits() {
+        let progress = Progress::default();
+        let later = |seconds: u64| monotonic() + seconds * 1_000_000_000;
+        assert_eq!(progress.stalled_at(later(3600)), None, "not started");
+        progress.step();
+        assert_eq!(progress.stalled_at(later(3)), None);
+        let long = progress.stalled_at(later(5)).unwrap();
+        assert!(long > STALLED_AFTER && long < Duration::from_secs(6));
+        progress.rest();
+        assert_eq!(progress.stalled_at(later(3600)), None, "waits");
+        progress.step();
+        assert_eq!(progress.stalled(), None, "the next step");
+    }
+}

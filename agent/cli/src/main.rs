@@ -31,6 +31,7 @@ fn main() -> ExitCode {
         None => cli::help(&[]),
         Some(Command::Run(options)) => done(agent::run(options.into())),
         Some(Command::CheckConfig { file }) => done(check_config(&file)),
+        Some(Command::MemoryReader) => done(agent::read_memory()),
         Some(Command::Discover(options)) => done(ask::discover(&options)),
         Some(Command::Completions(completions)) => completions.print(),
         Some(Command::Man(manual)) => manual.print(),

@@ -7,14 +7,16 @@ use std::time::Duration;
 
 use anyhow::{Context as _, Result};
 use ros2probe_capture::live::LiveSource;
+use ros2probe_capture::memory_reader;
 pub use ros2probe_capture::pcap::Speed;
 use ros2probe_capture::reassembly::Limits;
-use ros2probe_capture::system::give_back_memory;
+use ros2probe_capture::system::{give_back_memory, hide_memory};
 use ros2probe_message::{Dialect, Library, Sources};
 use ros2probe_model::discovery::Memory;
 use ros2probe_model::history::History;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{self, Observer};
+pub use ros2probe_wire::Expansion;
 use tokio_util::sync::CancellationToken;
 
 use crate::config::{Access, Config, ConfigError, PageChoice, Watch};
@@ -49,6 +51,8 @@ pub struct Options {
     pub replay: Option<PathBuf>,
     /// Speed of the replay. `None` means as captured, or as fast as possible for a report.
     pub speed: Option<Speed>,
+    /// How far a gzipped capture may expand.
+    pub expansion: Expansion,
     /// Whether to print the metrics on stdout at the end of the capture and exit.
     pub report: bool,
     /// Topics and globs to measure in addition to the configured ones.
@@ -190,6 +194,17 @@ impl Components<'_> {
     }
 }
 
+/// Answers requests of an agent for memory of other processes, on standard input, until it ends.
+///
+/// # Errors
+///
+/// Standard input is not a socket of an agent, or the process cannot be confined.
+pub fn read_memory() -> Result<()> {
+    hide_memory().context("cannot protect the memory of this process")?;
+    privilege::confine(Role::MemoryReader)?;
+    memory_reader::serve().context("cannot answer the agent")
+}
+
 /// Runs an agent until a signal, a failure or the end of a report.
 ///
 /// # Errors
@@ -209,6 +224,10 @@ pub fn run(options: Options) -> Result<()> {
     // A replay runs as the user of the command line and accesses that user's files.
     if matches!(source, Source::Live(_)) {
         announce(privilege::become_own_user());
+        // Another process of the same user could read payloads, tokens and the kernel's maps.
+        if let Err(error) = hide_memory() {
+            tracing::warn!(%error, "processes of the same user can read the agent's memory");
+        }
     }
     control::open_socket(&mut control, &config.api)?;
     let viewers = foxglove::Server::open(&config.foxglove, &config.api, &sources.viewers)?;
@@ -529,7 +548,8 @@ fn open(options: &Options, config: &Config) -> Result<Source> {
         true => Speed::Max,
         false => Speed::Times(1.0),
     };
-    let replay = Replay::open(file, options.speed.unwrap_or(pace), limits)
+    let speed = options.speed.unwrap_or(pace);
+    let replay = Replay::open(file, options.expansion, speed, limits)
         .with_context(|| format!("cannot replay {}", file.display()))?;
     Ok(Source::Replay(Box::new(replay)))
 }

@@ -25,6 +25,8 @@ pub struct AgentFacts {
     pub blind: Vec<(Ability, String)>,
     /// Observed object that no longer exists, as text; traffic there is invisible.
     pub gone: Option<String>,
+    /// Part of the source that makes no progress, as text.
+    pub stalled: Option<String>,
     /// What is not observed yet after the start, as text.
     pub pending: Option<String>,
     /// Number of times the host hook was attached again to a recreated control group.
@@ -182,6 +184,7 @@ impl AgentFacts {
             on_demand: Vec::new(),
             blind: Vec::new(),
             gone: None,
+            stalled: None,
             pending: None,
             attached_anew: 0,
             at,

@@ -11,7 +11,7 @@ use ros2probe_bag::messages::{self, Message, MessagesError};
 use ros2probe_model::chain::recorded::{RecordedChains, RecordedFacts};
 use ros2probe_model::header::begins_with_header;
 use ros2probe_model::names::TopicName;
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{Expansion, Timestamp};
 
 use crate::run::CaptureTime;
 use crate::surface::api::parts;
@@ -48,6 +48,7 @@ impl BagChains {
     /// Fails if nothing in the bag can be read.
     pub fn read(
         path: &Path,
+        expansion: Expansion,
         (from, until): (Option<CaptureTime>, Option<CaptureTime>),
         ends: &[&str],
         progress: &mut dyn FnMut(u64, Option<u64>),
@@ -57,7 +58,7 @@ impl BagChains {
         let mut stamped: HashMap<String, Option<TopicName>> = HashMap::new();
         let mut first = None;
         let mut seen = 0_u64;
-        let read = messages::read(path, &mut |message, total| {
+        let read = messages::read(path, expansion, &mut |message, total| {
             seen += 1;
             if seen.is_multiple_of(PROGRESS) {
                 progress(seen, total);

@@ -266,6 +266,7 @@ mod tests {
                 table: "participants",
                 size,
                 limit: 10,
+                bytes: None,
                 evictions,
             };
             let snapshot = Snapshot {

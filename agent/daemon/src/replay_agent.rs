@@ -10,6 +10,7 @@ use ros2probe_capture::pcap::{PcapError, Speed, link_name};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_message::{Library, Sources};
 use ros2probe_model::observer::{self, Observer};
+use ros2probe_wire::Expansion;
 use ros2probe_wire::frame::Link;
 use tokio::io::{DuplexStream, duplex};
 use tokio::sync::{mpsc, oneshot};
@@ -43,6 +44,8 @@ pub struct ReplayOptions {
     pub measured: bool,
     /// Pace of the replay during requests.
     pub pace: Pace,
+    /// How far a gzipped capture may expand.
+    pub expansion: Expansion,
 }
 
 /// Pace of a replay during requests.
@@ -199,7 +202,8 @@ fn open(
         Pace::Live(speed) => speed,
         Pace::ToEnd | Pace::Pause | Pace::Steps => Speed::Max,
     };
-    let replay = Replay::open(capture, speed, limits).map_err(ReplayError::Capture)?;
+    let replay =
+        Replay::open(capture, options.expansion, speed, limits).map_err(ReplayError::Capture)?;
     let replay = replay.until(options.until);
     Ok(match options.pace {
         Pace::ToEnd => (replay, None),

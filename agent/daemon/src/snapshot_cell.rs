@@ -203,7 +203,9 @@ impl State {
     /// Returns the reason if it does not.
     pub fn ready(&self, now: Instant) -> Result<(), String> {
         self.progresses(now)?;
-        let unseen = self.agent.gone.as_ref().or(self.agent.pending.as_ref());
+        let agent = &self.agent;
+        let unseen = agent.gone.as_ref().or(agent.stalled.as_ref());
+        let unseen = unseen.or(agent.pending.as_ref());
         unseen.map_or(Ok(()), |reason| Err(reason.clone()))
     }
 
@@ -290,6 +292,12 @@ mod tests {
         assert!(state.progresses(later).is_err());
         state.agent.gone = None;
         assert_eq!(state.ready(start), Ok(()));
+        // So are the figures of a part that makes no progress.
+        let stalled = "capture.inside: its thread has made no progress for 5 s".to_owned();
+        state.agent.stalled = Some(stalled.clone());
+        assert_eq!(state.ready(start), Err(stalled));
+        assert_eq!(state.progresses(start), Ok(()));
+        state.agent.stalled = None;
         // Breakpoints that are still to be set are missing as well.
         let pending = "capture.inside: not inspected yet".to_owned();
         state.agent.pending = Some(pending.clone());

@@ -20,6 +20,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 use crate::file;
+use ros2probe_capture::threads::Progress;
 use ros2probe_model::discovery::Memory;
 
 /// Version of the written format. Fields added so far may be missing in a file and then have
@@ -39,6 +40,9 @@ const MAX_BYTES: u64 = 64 << 20;
 const PERIOD: Duration = Duration::from_secs(3);
 /// Time after a failure until the next attempt, if nothing has changed.
 const RETRY_INTERVAL: Duration = Duration::from_secs(10);
+/// Longest wait for the file system at the agent's end.
+pub(crate) const ENDING: Duration = Duration::from_secs(10);
+const POLL: Duration = Duration::from_millis(5);
 const BOOT_ID: &str = "/proc/sys/kernel/random/boot_id";
 
 /// State directory, locked by this process.
@@ -47,6 +51,8 @@ pub struct StateDirectory {
     path: PathBuf,
     /// Holds the lock; its fsync makes renames durable.
     directory: File,
+    writes: AtomicU64,
+    failures: AtomicU64,
 }
 
 /// The state directory cannot be opened.
@@ -147,6 +153,7 @@ struct Document {
 /// The writing thread and its counters.
 #[derive(Debug)]
 pub struct StateWriter {
+    directory: Arc<StateDirectory>,
     inbox: SyncSender<Memory>,
     thread: JoinHandle<()>,
     done: Arc<Done>,
@@ -156,10 +163,9 @@ pub struct StateWriter {
 
 #[derive(Debug, Default)]
 struct Done {
-    writes: AtomicU64,
-    failures: AtomicU64,
     /// Whether the last write failed.
     is_failing: AtomicBool,
+    progress: Progress,
 }
 
 /// Counters of writes.
@@ -169,6 +175,8 @@ pub struct StateFacts {
     pub writes: u64,
     /// Failed writes.
     pub failures: u64,
+    /// Time since which the file system has not answered, if that is long.
+    pub stalled: Option<Duration>,
 }
 
 impl StateDirectory {
@@ -201,6 +209,8 @@ impl StateDirectory {
         Ok(Self {
             path: path.to_path_buf(),
             directory,
+            writes: AtomicU64::new(0),
+            failures: AtomicU64::new(0),
         })
     }
 
@@ -283,6 +293,11 @@ impl StateDirectory {
             // A partial file is useless, and takes space on a full disk.
             let _ = fs::remove_file(&new);
         }
+        let count = match written {
+            Ok(()) => &self.writes,
+            Err(_) => &self.failures,
+        };
+        count.fetch_add(1, Ordering::Relaxed);
         written
     }
 
@@ -341,13 +356,23 @@ impl StateWriter {
     ///
     /// The thread cannot be started.
     pub fn start(directory: Arc<StateDirectory>) -> io::Result<Self> {
+        let target = Arc::clone(&directory);
+        Self::start_with(directory, move |memory| target.write(memory))
+    }
+
+    fn start_with(
+        directory: Arc<StateDirectory>,
+        write: impl Fn(Memory) -> io::Result<()> + Send + 'static,
+    ) -> io::Result<Self> {
         let (inbox, outbox) = sync_channel(1);
         let done = Arc::<Done>::default();
         let own = Arc::clone(&done);
+        let path = directory.path.clone();
         let thread = std::thread::Builder::new()
             .name("state".to_owned())
-            .spawn(move || keep(&directory, &outbox, &own))?;
+            .spawn(move || keep(&path, write, &outbox, &own))?;
         Ok(Self {
+            directory,
             inbox,
             thread,
             done,
@@ -374,40 +399,76 @@ impl StateWriter {
         }
     }
 
-    /// Writes the last state and waits until it is on disk.
+    /// Writes the last state and waits until it is on disk, for at most [`ENDING`].
     pub fn finish(self, memory: Memory) {
-        let Self { inbox, thread, .. } = self;
-        // The thread ends when its inbox closes; a panic of it is in the log.
-        let _ = inbox.send(memory);
-        drop(inbox);
-        let _ = thread.join();
+        let path = self.directory.path.clone();
+        if !self.finish_until(memory, Instant::now() + ENDING) {
+            let path = path.display();
+            tracing::error!(%path, "the file system does not answer: the last state is not saved");
+        }
     }
 
-    /// Counters of the thread.
+    /// Returns whether the thread has ended.
+    fn finish_until(self, memory: Memory, deadline: Instant) -> bool {
+        let Self { inbox, thread, .. } = self;
+        let mut last = Some(memory);
+        while let Some(memory) = last.take() {
+            // Other errors: the thread has panicked, which is in the log.
+            if let Err(TrySendError::Full(memory)) = inbox.try_send(memory)
+                && Instant::now() < deadline
+            {
+                last = Some(memory);
+                std::thread::sleep(POLL);
+            }
+        }
+        drop(inbox);
+        join_until(thread, deadline)
+    }
+
+    /// Counters of all writes to the directory, watches of clients included.
     #[must_use]
     pub fn facts(&self) -> StateFacts {
         StateFacts {
-            writes: self.done.writes.load(Ordering::Relaxed),
-            failures: self.done.failures.load(Ordering::Relaxed),
+            writes: self.directory.writes.load(Ordering::Relaxed),
+            failures: self.directory.failures.load(Ordering::Relaxed),
+            stalled: self.done.progress.stalled(),
         }
     }
 }
 
-fn keep(directory: &StateDirectory, inbox: &Receiver<Memory>, done: &Done) {
+/// Waits until the thread has ended, at most until then. Returns whether it has. If it has panicked,
+/// the panic is in the log.
+pub(crate) fn join_until(thread: JoinHandle<()>, deadline: Instant) -> bool {
+    while !thread.is_finished() {
+        if Instant::now() >= deadline {
+            return false;
+        }
+        std::thread::sleep(POLL);
+    }
+    let _ = thread.join();
+    true
+}
+
+fn keep(
+    path: &Path,
+    write: impl Fn(Memory) -> io::Result<()>,
+    inbox: &Receiver<Memory>,
+    done: &Done,
+) {
     while let Ok(memory) = inbox.recv() {
-        let written = directory.write(memory);
+        done.progress.step();
+        let written = write(memory);
+        done.progress.rest();
         let failed_before = done.is_failing.swap(written.is_err(), Ordering::Relaxed);
         match written {
             Ok(()) => {
-                done.writes.fetch_add(1, Ordering::Relaxed);
                 if failed_before {
-                    tracing::info!(path = %directory.path.display(), "state is saved again");
+                    tracing::info!(path = %path.display(), "state is saved again");
                 }
             }
             Err(error) => {
-                done.failures.fetch_add(1, Ordering::Relaxed);
                 if !failed_before {
-                    let path = directory.path.display();
+                    let path = path.display();
                     tracing::error!(%path, %error, "cannot save state: a restart would lose names");
                 }
             }

@@ -30,10 +30,10 @@ use ros2probe_message::{Decoded, Definition, MessageType, Truncation, csv, decod
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::{self, Packet, Payload};
 use ros2probe_wire::record::Record;
 use ros2probe_wire::walk::{self, Envelope};
+use ros2probe_wire::{Expansion, Timestamp};
 use zerocopy::FromBytes as _;
 
 /// Length of the block's header, and of a frame's with its address.
@@ -44,7 +44,7 @@ const PACKETS: u64 = 10_000;
 
 /// Reads a capture file, through reassembly and walk.
 pub fn capture(bytes: &[u8]) {
-    let Ok(mut reader) = PcapReader::new(Cursor::new(bytes.to_vec())) else {
+    let Ok(mut reader) = PcapReader::new(Cursor::new(bytes.to_vec()), Expansion::Limited) else {
         return;
     };
     let mut inside = Inside::default();
@@ -331,7 +331,7 @@ pub fn bag_file(bytes: &[u8]) {
         fs::write(directory.join("metadata.yaml"), metadata).expect("a file");
         reported(directory);
     }
-    let Ok(report) = reindex(directory) else {
+    let Ok(report) = reindex(directory, Expansion::Limited) else {
         return;
     };
     assert_eq!(report.files.len(), 1);
@@ -339,7 +339,7 @@ pub fn bag_file(bytes: &[u8]) {
     assert!(!path.with_extension("mcap.part").exists());
     // A completed bag is complete: a second run reports the same.
     reported(directory);
-    let again = reindex(directory).expect("what was written");
+    let again = reindex(directory, Expansion::Limited).expect("what was written");
     assert_eq!(again.metadata.message_count, report.metadata.message_count);
     assert_eq!(again.metadata.topics, report.metadata.topics);
     for file in &again.files {
@@ -353,7 +353,7 @@ pub fn bag_file(bytes: &[u8]) {
 
 /// Reads everything that can be reported of a bag or a file.
 fn reported(path: &Path) {
-    let Ok(opened) = Bag::open(path) else {
+    let Ok(opened) = Bag::open(path, Expansion::Limited) else {
         return;
     };
     let details = opened.details().ok();

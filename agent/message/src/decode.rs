@@ -489,18 +489,27 @@ fn within(cursor: &Cursor<'_>, length: usize, shape: Shape) -> Result<(), Decode
     }
 }
 
-/// Returns UTF-16 text; an invalid code unit counts as a character of its own.
+/// Returns UTF-16 text; an invalid code unit counts as a character of its own. A byte order mark at
+/// the begin is no part of the text, and determines its order, as in rclpy.
 fn wide(units: &Scalars<'_>) -> String {
+    const MARK: u64 = 0xfeff;
+    const SWAPPED: u64 = 0xfffe;
     let mut text = String::with_capacity(units.len());
     let mut pending = Vec::new();
     let flush = |pending: &mut Vec<u16>, text: &mut String| {
         let decoded = char::decode_utf16(pending.drain(..));
         text.extend(decoded.map(|unit| unit.unwrap_or(char::REPLACEMENT_CHARACTER)));
     };
-    for unit in units.iter() {
-        let Scalar::UInt(unit) = unit else { continue };
-        if let Ok(unit) = u16::try_from(unit) {
-            pending.push(unit);
+    let units = units.iter().filter_map(|unit| match unit {
+        Scalar::UInt(unit) => Some(unit),
+        _ => None,
+    });
+    let mut is_swapped = false;
+    for (place, unit) in units.enumerate() {
+        if place == 0 && matches!(unit, MARK | SWAPPED) {
+            is_swapped = unit == SWAPPED;
+        } else if let Ok(unit) = u16::try_from(unit) {
+            pending.push(if is_swapped { unit.swap_bytes() } else { unit });
         } else {
             flush(&mut pending, &mut text);
             let character = u32::try_from(unit).ok().and_then(char::from_u32);

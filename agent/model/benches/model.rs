@@ -15,7 +15,7 @@ use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
-use ros2probe_wire::{EntityId, Guid, GuidPrefix, Record, Timestamp};
+use ros2probe_wire::{EntityId, Expansion, Guid, GuidPrefix, Record, Timestamp};
 
 const START: u64 = 1_795_143_000_000_000_000;
 const ALICE: GuidPrefix = GuidPrefix(*b"\x01\x10alice-host");
@@ -246,7 +246,7 @@ fn captures(criterion: &mut Criterion) {
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
                 let mut world = observer(0);
-                let mut reader = PcapReader::open(&path).unwrap();
+                let mut reader = PcapReader::open(&path, Expansion::Limited).unwrap();
                 FrameDecoder::new(Limits::default())
                     .run(&mut reader, &mut world)
                     .unwrap();

@@ -9,21 +9,17 @@ use std::collections::VecDeque;
 use ros2probe_wire::record::{AckNack, SequenceNumberSet, flag};
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
-use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
-
-/// Sample times that are kept per writer.
-const TIMES: usize = 256;
-/// Largest number of readers per writer.
-const READERS: usize = 512;
+use crate::bounded::Bounded;
+use crate::tables::{AcknowledgingReaders, SampleTimes};
 
 /// All readers that send ACKNACKs to one writer.
 #[derive(Debug, Default)]
 pub struct Acknowledgements {
     /// Readers, sorted by GUID.
-    readers: Vec<Reader>,
+    readers: Bounded<AcknowledgingReaders, Vec<Reader>>,
     /// Sequence numbers and the times at which they were first seen, sorted by number.
-    times: VecDeque<(SequenceNumber, Timestamp)>,
+    times: Bounded<SampleTimes, VecDeque<(SequenceNumber, Timestamp)>>,
     /// Readers that were not added because the list was full.
     pub refused: u64,
 }
@@ -42,24 +38,9 @@ struct Reader {
 }
 
 impl Acknowledgements {
-    /// Returns the length and cap of each list.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            readers,
-            times,
-            refused: _,
-        } = self;
-        [
-            Size::new("acknowledgements.readers", readers.len(), READERS),
-            Size::new("acknowledgements.times", times.len(), TIMES),
-        ]
-    }
-
     /// Returns whether no reader has acknowledged.
     #[must_use]
-    pub const fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.readers.is_empty()
     }
 
@@ -69,12 +50,11 @@ impl Acknowledgements {
         let place = self.readers.binary_search_by_key(&guid, |each| each.guid);
         let index = match place {
             Ok(index) => index,
-            Err(_) if self.readers.len() >= READERS => {
-                self.refused += 1;
-                return;
-            }
             Err(index) => {
-                self.readers.insert(index, Reader::new(guid));
+                if self.readers.insert(index, Reader::new(guid)).is_some() {
+                    self.refused += 1;
+                    return;
+                }
                 index
             }
         };
@@ -100,11 +80,12 @@ impl Acknowledgements {
             // The numbers restart, so the writer restarted under its GUID.
             self.times.clear();
         }
-        if self.times.len() >= TIMES {
+        if self.times.is_full() {
             let mut index = 0;
+            self.times.refuse();
             self.times.retain(|_| {
                 index += 1;
-                index % 2 == 1 || index > TIMES / 2
+                index % 2 == 1 || index > SampleTimes::CAP / 2
             });
         }
         self.times.push_back((number, at));
@@ -114,7 +95,7 @@ impl Acknowledgements {
     pub fn retain(&mut self, is_there: impl Fn(Guid) -> bool) {
         self.readers.retain(|reader| is_there(reader.guid));
         if self.readers.is_empty() {
-            self.times = VecDeque::new();
+            self.times.take();
         }
     }
 
@@ -267,7 +248,7 @@ mod tests {
         for number in 1..=360_000 {
             all.wrote(SequenceNumber(number), Timestamp(number * 10_000_000));
         }
-        assert!(all.times.len() <= TIMES);
+        assert!(all.times.len() <= SampleTimes::CAP);
         put(&mut all, &acknack(1, 180_001, 0, 0));
         let lag = facts(&all, 360_001, 3600)
             .first()

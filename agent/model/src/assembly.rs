@@ -8,16 +8,14 @@
 use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
+use crate::bounded::Bounded;
+use crate::tables::AssembledSamples;
 use bytes::Bytes;
 use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
-use super::size::Size;
-
 /// Memory per sample, and per fragment that arrived early, in addition to its bytes.
 const OVERHEAD: usize = 128;
-/// Largest number of unfinished samples.
-const SAMPLES: usize = 16_384;
 /// An unfinished sample is dropped after this long without a fragment.
 const FRAGMENT_TIMEOUT: Duration = Duration::from_secs(30);
 /// Smallest allocation for a sample.
@@ -26,9 +24,9 @@ const LEAST: usize = 4096;
 /// All unfinished samples.
 #[derive(Debug)]
 pub struct Assembly {
-    parts: HashMap<(Guid, SequenceNumber), Part>,
+    parts: Bounded<AssembledSamples, HashMap<(Guid, SequenceNumber), Part>>,
     /// The same samples in the order in which they began.
-    ages: BTreeMap<u64, (Guid, SequenceNumber)>,
+    ages: Bounded<AssembledSamples, BTreeMap<u64, (Guid, SequenceNumber)>>,
     begun: u64,
     bytes: usize,
     limit: usize,
@@ -56,46 +54,13 @@ impl Assembly {
     #[must_use]
     pub fn new(limit: usize) -> Self {
         Self {
-            parts: HashMap::new(),
-            ages: BTreeMap::new(),
+            parts: Bounded::default(),
+            ages: Bounded::default(),
             begun: 0,
             bytes: 0,
             limit,
             evictions: 0,
         }
-    }
-
-    /// Returns the size and cap of each table, in entries or bytes.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 3] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            parts,
-            ages,
-            begun: _,
-            bytes: _,
-            limit,
-            evictions: _,
-        } = self;
-        let held = |part: &Part| {
-            let Part {
-                age: _,
-                size: _,
-                fragment_size: _,
-                head,
-                next: _,
-                ahead,
-                ahead_bytes: _,
-                touched: _,
-            } = part;
-            let ahead = ahead.values().map(|bytes| bytes.len() + OVERHEAD);
-            OVERHEAD + head.capacity() + ahead.sum::<usize>()
-        };
-        [
-            Size::new("assembly.parts", parts.len(), SAMPLES),
-            Size::new("assembly.ages", ages.len(), SAMPLES),
-            Size::new("assembly.bytes", parts.values().map(held).sum(), *limit),
-        ]
     }
 
     /// Returns the bytes held, their cap, and the number of samples dropped because of it.
@@ -112,6 +77,10 @@ impl Assembly {
         let key = (sample.record().writer(), sample.sequence_number());
         let now = Timestamp(sample.record().time);
         if !self.parts.contains_key(&key) {
+            if self.parts.is_full() {
+                self.parts.refuse();
+                self.evict();
+            }
             self.begun += 1;
             self.ages.insert(self.begun, key);
             self.bytes += OVERHEAD;
@@ -133,14 +102,17 @@ impl Assembly {
         };
         part.put(start, payload);
         self.bytes = self.bytes + part.bytes() - before;
-        while self.bytes + other_bytes > self.limit || self.parts.len() > SAMPLES {
-            let Some((_, key)) = self.ages.first_key_value() else {
-                return;
-            };
-            let key = *key;
-            self.forget(key.0, key.1);
+        while self.bytes + other_bytes > self.limit && self.evict() {}
+    }
+
+    /// Drops the oldest sample. Returns whether there was one.
+    fn evict(&mut self) -> bool {
+        let oldest = self.ages.first_key_value().map(|(_, key)| *key);
+        if let Some((writer, number)) = oldest {
+            self.forget(writer, number);
             self.evictions += 1;
         }
+        oldest.is_some()
     }
 
     /// Returns whether all bytes of this sample have arrived.
@@ -471,10 +443,13 @@ mod tests {
     #[test]
     fn more_samples_than_may_be_put_together_at_once_push_out_the_oldest() {
         let mut assembly = Assembly::new(1 << 30);
-        for number in 0..SAMPLES as u64 + 100 {
+        for number in 0..AssembledSamples::CAP as u64 + 100 {
             let record = fragment(writer(1), number, 1, 1, 2_000, 1000);
             put(&mut assembly, &record, &[0; 1000], 0);
         }
-        assert_eq!((assembly.parts.len(), assembly.evictions), (SAMPLES, 100));
+        assert_eq!(
+            (assembly.parts.len(), assembly.evictions),
+            (AssembledSamples::CAP, 100)
+        );
     }
 }

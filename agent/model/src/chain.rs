@@ -26,11 +26,13 @@ use std::sync::Arc;
 use ros2probe_wire::record::{Sample, flag};
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, Timestamp};
 
+use crate::bounded::Bounded;
 use crate::diagnosis::Diagnosis;
 use crate::discovery::Discovery;
 use crate::names::DdsName;
 use crate::profiler::{Profiler, UNDELIVERED};
-use crate::size::Size;
+use crate::snapshot::TableFacts;
+use crate::tables::ChainOwners;
 use crate::topic::{Topic, Topics};
 use crate::trace::share::Share;
 use crate::wall_clock::WallClock;
@@ -42,9 +44,6 @@ use graph::Graph;
 use path::{ChainsFacts, Paths};
 use spans::{ChainSpans, ChainTracer};
 use stamps::{Messages, Published};
-
-/// Largest number of sockets whose owner is remembered for a second.
-const MAX_OWNERS: usize = 4096;
 
 /// All chains.
 #[derive(Debug, Default)]
@@ -60,7 +59,7 @@ pub struct Chains {
     expected: ExpectedChains,
     tracer: ChainTracer,
     /// Participants that own receiving sockets.
-    owners: HashMap<u64, Option<GuidPrefix>>,
+    owners: Bounded<ChainOwners, HashMap<u64, Option<GuidPrefix>>>,
     findings: Vec<Diagnosis>,
     revision: u64,
 }
@@ -127,7 +126,7 @@ impl Chains {
             size: counted.bytes.try_into().unwrap_or(u32::MAX),
             sampled: counted.sampled,
             is_local,
-            arrivals: Vec::new(),
+            arrivals: Bounded::default(),
         };
         self.evidence.stamped(&message, stamp);
         let key = (output.node.domain_id, stamp);
@@ -158,12 +157,16 @@ impl Chains {
         {
             return;
         }
-        if self.owners.len() >= MAX_OWNERS {
+        if self.owners.is_full() {
+            self.owners.refuse();
             self.owners.clear();
         }
         let owner = match record.socket {
             0 => owner(),
-            socket => *self.owners.entry(socket).or_insert_with(owner),
+            socket => {
+                let known = self.owners.get_or_insert_with(socket, owner);
+                known.copied().flatten()
+            }
         };
         if let Some(owner) = owner {
             let at = wall_clock.wall_time(Timestamp(record.time));
@@ -235,48 +238,11 @@ impl Chains {
         self.paths.facts(&self.expected, now)
     }
 
-    /// Returns the number of messages that wait for evaluation, its cap, and the stamps evaluated
-    /// early because of it.
+    /// Returns the rows of the metrics: chains with the messages of further ones, and messages that
+    /// wait for evaluation with the stamps evaluated early.
     #[must_use]
-    pub const fn size(&self) -> (usize, usize, u64) {
-        self.messages.size()
-    }
-
-    /// Returns the number of chains, its cap, and the messages of further ones.
-    #[must_use]
-    pub fn paths(&self) -> (usize, usize, u64) {
-        self.paths.size()
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            graph,
-            built: _,
-            changes: _,
-            messages,
-            evidence,
-            causality,
-            paths,
-            expected,
-            tracer,
-            owners,
-            findings,
-            revision: _,
-        } = self;
-        let mut sizes = graph.sizes(endpoints);
-        sizes.extend(messages.sizes());
-        sizes.extend(evidence.sizes());
-        sizes.extend(causality.sizes());
-        sizes.extend(paths.sizes());
-        sizes.extend(expected.sizes(endpoints));
-        sizes.extend(tracer.sizes());
-        sizes.push(Size::new("chains.owners", owners.len(), MAX_OWNERS));
-        let most = evidence::MAX_OUTPUTS + expected::MAX_CHAINS;
-        sizes.push(Size::new("chains.findings", findings.len(), most));
-        sizes
+    pub fn tables(&self) -> [TableFacts; 2] {
+        [self.paths.table(), self.messages.table()]
     }
 
     /// Evaluates all messages with one stamp.

@@ -4,10 +4,10 @@
 
 use std::collections::BTreeMap;
 
+use crate::bounded::Bounded;
+use crate::tables::ChurnCounts;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::discovery::Role;
-
-use super::size::Size;
 
 /// Kind of the entity.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -89,22 +89,16 @@ pub struct ChurnCount {
 /// The counters of all domains.
 #[derive(Debug, Default)]
 pub struct Churn {
-    counts: BTreeMap<(DomainId, Entity, Event), u64>,
+    counts: Bounded<ChurnCounts, BTreeMap<(DomainId, Entity, Event), u64>>,
 }
 
 impl Churn {
-    /// Returns the number of counters and its cap: one per domain with UDP ports, entity and event.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { counts } = self;
-        let cap = 233 * 4 * 5;
-        [Size::new("discovery.churn", counts.len(), cap)]
-    }
-
     /// Increments a counter.
     pub fn count(&mut self, domain_id: DomainId, entity: Entity, event: Event) {
-        *self.counts.entry((domain_id, entity, event)).or_default() += 1;
+        let key = (domain_id, entity, event);
+        if let Some(count) = self.counts.get_or_insert_with(key, u64::default) {
+            *count += 1;
+        }
     }
 
     /// Returns all counters above zero, sorted.

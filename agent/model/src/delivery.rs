@@ -27,9 +27,10 @@ use super::route::Direction;
 use super::route::Route;
 use super::samples::Budget;
 use super::sequence::REACH;
-use super::size::Size;
 use super::undelivered::Undelivered;
 use super::writer::{BEST_EFFORT_WINDOW, settle_window};
+use crate::bounded::Bounded;
+use crate::tables::WithheldLosses;
 use accounting::Accounting;
 pub use accounting::Totals;
 
@@ -44,9 +45,6 @@ const SILENCE: Duration = Duration::from_secs(18);
 const FIRST_MOMENTS: Duration = Duration::from_secs(5);
 /// A run of lost samples at least this long keeps its pending cause when two deliveries merge.
 const LONG_RUN: u64 = 256;
-
-/// Largest number of losses of a withheld delivery that enter the journal later.
-const WITHHELD: usize = 64;
 
 /// The receiver of the samples.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
@@ -103,7 +101,7 @@ pub struct Delivery {
     /// Whether samples use the network, at least for some readers, rather than only shared memory.
     uses_network: bool,
     /// The latest losses, while the delivery is withheld.
-    withheld: Option<VecDeque<DeliveryLoss>>,
+    withheld: Option<Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
 }
 
 impl Delivery {
@@ -128,33 +126,6 @@ impl Delivery {
             uses_network: false,
             withheld: None,
         }
-    }
-
-    /// Returns the size and cap of each list, in entries or bytes.
-    pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            receiver: _,
-            main: _,
-            reception,
-            tally: _,
-            undelivered,
-            loss_causes,
-            first_seen: _,
-            last_seen: _,
-            opened: _,
-            waiting: _,
-            presumed_lost: _,
-            under_way: _,
-            recent: _,
-            best_effort: _,
-            uses_network: _,
-            withheld,
-        } = self;
-        let withheld = withheld.as_ref().map_or(0, VecDeque::len);
-        let withheld = Size::new("delivery.withheld", withheld, WITHHELD);
-        let sizes = reception.sizes().chain(undelivered.sizes());
-        sizes.chain(loss_causes.sizes()).chain([withheld])
     }
 
     /// Allows fragmented samples that begin before `until` to be incomplete without a loss.

@@ -6,15 +6,13 @@ use std::collections::VecDeque;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::route::Destination;
-use super::size::Size;
-
-/// Departures that are kept: a sample is in transit briefly, to few destinations.
-const LIMIT: usize = 64;
+use crate::bounded::Bounded;
+use crate::tables::LatestDepartures;
 
 /// The latest departures of one writer.
 #[derive(Debug, Default)]
 pub struct Departures {
-    latest: VecDeque<Departure>,
+    latest: Bounded<LatestDepartures, VecDeque<Departure>>,
     /// Source timestamp of the newest sample that began to leave.
     newest: Timestamp,
 }
@@ -27,14 +25,6 @@ struct Departure {
 }
 
 impl Departures {
-    /// Returns the length and cap of the list.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self { latest, newest: _ } = self;
-        [Size::new("departures.latest", latest.len(), LIMIT)]
-    }
-
     /// Returns whether no datagram of the sample with this source timestamp has left before, to any
     /// destination or as a retransmission.
     pub fn is_first(&mut self, source: Timestamp) -> bool {
@@ -45,9 +35,6 @@ impl Departures {
 
     /// Records that the sample left completely for this destination.
     pub fn note(&mut self, number: SequenceNumber, destination: Destination, at: Timestamp) {
-        if self.latest.len() >= LIMIT {
-            self.latest.pop_front();
-        }
         self.latest.push_back(Departure {
             number,
             destination,
@@ -90,6 +77,6 @@ mod tests {
             Some(Timestamp(1005))
         );
         assert_eq!(departures.find(SequenceNumber(1), destination(1)), None);
-        assert!(departures.latest.len() <= LIMIT);
+        assert!(departures.latest.len() <= LatestDepartures::CAP);
     }
 }

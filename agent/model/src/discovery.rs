@@ -15,7 +15,7 @@ mod nodes;
 mod pending;
 mod priority;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,30 +27,25 @@ use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Times
 use super::churn::{Churn, Event};
 use super::journal::{DiscoveryEvent, Journal};
 use super::naming::Naming;
-use super::size::Size;
+use crate::bounded::{Bounded, Counted, Sum};
+use crate::snapshot::TableFacts;
+use crate::tables::{
+    Applicants, Endpoints, Nodes, Participants, PendingEndpoints, PendingNodeLists,
+};
 use crate::watch::Watchlist;
 use disposals::Disposals;
 use entity::DiscoveredEntity;
 use eviction::{Newcomer, Table, Victims};
-use facts::{ADDRESSES, domain, named};
 pub use facts::{Addresses, DomainSource, Endpoint, Node, Origin, Participant, ParticipantProxy};
+use facts::{domain, named};
 pub use memory::{Memory, hexadecimal};
 use pending::PendingTable;
 pub use priority::Priority;
 
-/// Most endpoints and node lists that wait for their participant.
-const PENDING: usize = 1024;
-/// Most participants that wait for a free entry.
-const APPLICANTS: usize = 128;
-const PENDING_NODES: usize = PENDING / 8;
-/// Most bytes of waiting node lists.
-const PENDING_NODE_BYTES: usize = 1 << 20;
 const PENDING_FOR: Duration = Duration::from_secs(60);
 /// Longest topic or type name: `string<256>` in the builtin topics of DDS. Longer names are
 /// rejected to bound memory.
 const MAX_NAME_LEN: usize = 256;
-/// Most endpoints of one participant.
-const PER_PARTICIPANT: usize = 4096;
 
 /// Capacities of the tables.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,50 +94,22 @@ struct PendingNodes {
 pub struct Discovery {
     caps: Caps,
     watchlist: Arc<Watchlist>,
-    participants: HashMap<GuidPrefix, Box<Participant>>,
-    endpoints: HashMap<Guid, Box<Endpoint>>,
-    applicants: PendingTable<GuidPrefix, Box<Participant>>,
-    pending_endpoints: PendingTable<Guid, PendingEndpoint>,
-    pending_nodes: HashMap<GuidPrefix, PendingNodes>,
+    participants: Bounded<Counted<Participants>, HashMap<GuidPrefix, Box<Participant>>>,
+    endpoints: Bounded<Counted<Endpoints>, HashMap<Guid, Box<Endpoint>>>,
+    applicants: PendingTable<Applicants, GuidPrefix, Box<Participant>>,
+    pending_endpoints: PendingTable<PendingEndpoints, Guid, PendingEndpoint>,
+    pending_nodes: Bounded<PendingNodeLists, HashMap<GuidPrefix, PendingNodes>>,
     disposals: Disposals,
-    node_count: usize,
+    node_count: Sum<Counted<Nodes>>,
     /// Number of writers and readers that nodes list.
     named: usize,
     changes: Vec<Change>,
     /// Counters of discovery events.
     pub churn: Churn,
-    evictions: Evictions,
     participant_victims: Victims,
     endpoint_victims: Victims,
     node_victims: Victims,
     revision: u64,
-}
-
-/// Entries refused or evicted because a table was full.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Evictions {
-    /// Participants.
-    pub participants: u64,
-    /// Endpoints, including waiting ones.
-    pub endpoints: u64,
-    /// Nodes.
-    pub nodes: u64,
-}
-
-impl PendingNodes {
-    /// Returns the bytes of the waiting nodes.
-    fn held(&self) -> usize {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            at: _,
-            writer: _,
-            sequence_number: _,
-            nodes,
-            bytes: _,
-            priority: _,
-        } = self;
-        nodes.iter().map(Node::bytes).sum()
-    }
 }
 
 impl Discovery {
@@ -152,17 +119,16 @@ impl Discovery {
         Self {
             caps,
             watchlist: Arc::default(),
-            participants: HashMap::new(),
-            endpoints: HashMap::new(),
-            applicants: PendingTable::new(APPLICANTS),
-            pending_endpoints: PendingTable::new(PENDING),
-            pending_nodes: HashMap::new(),
+            participants: Bounded::capped(caps.participants),
+            endpoints: Bounded::capped(caps.endpoints),
+            applicants: PendingTable::new(),
+            pending_endpoints: PendingTable::new(),
+            pending_nodes: Bounded::default(),
             disposals: Disposals::default(),
-            node_count: 0,
+            node_count: Sum::capped(caps.nodes),
             named: 0,
             changes: Vec::new(),
             churn: Churn::default(),
-            evictions: Evictions::default(),
             participant_victims: Victims::default(),
             endpoint_victims: Victims::default(),
             node_victims: Victims::default(),
@@ -178,100 +144,24 @@ impl Discovery {
 
     /// Returns all participants.
     #[must_use]
-    pub const fn participants(&self) -> &HashMap<GuidPrefix, Box<Participant>> {
+    pub fn participants(&self) -> &HashMap<GuidPrefix, Box<Participant>> {
         &self.participants
     }
 
     /// Returns all endpoints of known participants.
     #[must_use]
-    pub const fn endpoints(&self) -> &HashMap<Guid, Box<Endpoint>> {
+    pub fn endpoints(&self) -> &HashMap<Guid, Box<Endpoint>> {
         &self.endpoints
     }
 
-    /// Returns the number of nodes of all participants.
+    /// Returns the rows of the metrics: participants, endpoints and nodes.
     #[must_use]
-    pub const fn node_count(&self) -> usize {
-        self.node_count
-    }
-
-    /// Returns the entries refused or evicted because a table was full.
-    #[must_use]
-    pub const fn evictions(&self) -> Evictions {
-        self.evictions
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            caps,
-            watchlist: _,
-            participants,
-            endpoints,
-            applicants,
-            pending_endpoints,
-            pending_nodes,
-            disposals,
-            node_count: _,
-            named: _,
-            changes,
-            churn,
-            evictions: _,
-            participant_victims,
-            endpoint_victims,
-            node_victims,
-            revision: _,
-        } = self;
-        let waiting = pending_nodes.values().map(|pending| pending.held()).sum();
-        let (applicants, pending_endpoints) = (applicants.sizes(), pending_endpoints.sizes());
-        let each = || participants.values().map(|each| each.lists());
-        let nodes = each().map(|lists| lists.nodes).sum();
-        let named = each().map(|lists| lists.named).sum();
-        let of_one = each().map(|lists| lists.endpoints).max().unwrap_or(0);
-        let addresses = each().map(|lists| lists.addresses).max().unwrap_or(0);
-        let mut sizes = vec![
-            Size::new(
-                "discovery.participants",
-                participants.len(),
-                caps.participants,
-            ),
-            Size::new("discovery.participant.endpoints", of_one, PER_PARTICIPANT),
-            Size::new("discovery.participant.addresses", addresses, ADDRESSES),
-            Size::new("discovery.endpoints", endpoints.len(), caps.endpoints),
-            Size::new("discovery.applicants", applicants.0, APPLICANTS),
-            Size::new("discovery.applicants.places", applicants.1, APPLICANTS),
-            Size::new(
-                "discovery.participant_victims",
-                participant_victims.len(),
-                Victims::CAP,
-            ),
-            Size::new(
-                "discovery.endpoint_victims",
-                endpoint_victims.len(),
-                Victims::CAP,
-            ),
-            Size::new("discovery.node_victims", node_victims.len(), Victims::CAP),
-            Size::new("discovery.pending_endpoints", pending_endpoints.0, PENDING),
-            Size::new(
-                "discovery.pending_endpoints.places",
-                pending_endpoints.1,
-                PENDING,
-            ),
-            Size::new(
-                "discovery.pending_nodes",
-                pending_nodes.len(),
-                PENDING_NODES,
-            ),
-            Size::new("discovery.pending_nodes.bytes", waiting, PENDING_NODE_BYTES),
-            Size::new("discovery.nodes", nodes, caps.nodes),
-            Size::new("discovery.nodes.named", named, caps.endpoints),
-            // The changes are taken after each datagram.
-            Size::new("discovery.changes", changes.len(), caps.endpoints),
-        ];
-        sizes.extend(disposals.sizes());
-        sizes.extend(churn.sizes());
-        sizes
+    pub fn tables(&self) -> [TableFacts; 3] {
+        [
+            self.participants.facts(),
+            self.endpoints.facts(),
+            self.node_count.facts(),
+        ]
     }
 
     /// Returns whether this endpoint was disposed so recently that its samples may still arrive.
@@ -396,7 +286,7 @@ impl Discovery {
             domain_id,
             first_seen: origin.at,
             last_seen: origin.at,
-            endpoints: BTreeSet::new(),
+            endpoints: Bounded::default(),
             nodes: Vec::new(),
             watched: 0,
             local: false,
@@ -456,9 +346,9 @@ impl Discovery {
         journal: &mut Journal,
     ) -> bool {
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
-        let is_full = self.participants.len() >= self.caps.participants;
+        let is_full = self.participants.is_full();
         if is_full && !self.evict_for(Table::Participants, Newcomer { guid, priority }, at) {
-            self.evictions.participants += 1;
+            self.participants.refuse();
             self.applicants.put(prefix, priority, participant);
             return false;
         }
@@ -498,7 +388,7 @@ impl Discovery {
         for endpoint in participant.endpoints {
             self.drop_endpoint(endpoint, cascade, at, journal);
         }
-        self.node_count = self.node_count.saturating_sub(participant.nodes.len());
+        self.node_count.sub(participant.nodes.len());
         self.named = self.named.saturating_sub(named(&participant.nodes));
         if let Some(event) = cascade {
             for node in participant.nodes {

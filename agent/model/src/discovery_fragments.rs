@@ -6,25 +6,21 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
+use crate::bounded::{Bounded, Sum};
+use crate::tables::{DiscoveryBytes, DiscoverySamples};
 use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{Guid, SequenceNumber};
 
-use super::size::Size;
-
 /// Largest sample in bytes, far above any discovery data.
 const MAX_SAMPLE: u32 = 256 * 1024;
-/// Budget in bytes for all samples.
-const BUDGET: usize = 1 << 20;
-/// Largest number of unfinished samples; real participants have one each, briefly.
-const SAMPLES: usize = 64;
 /// Memory per fragment in addition to its bytes.
 const OVERHEAD: usize = 64;
 
 /// The unfinished samples, oldest first.
 #[derive(Debug, Default)]
 pub struct DiscoveryFragments {
-    samples: VecDeque<Sample>,
-    bytes: usize,
+    samples: Bounded<DiscoverySamples, VecDeque<Sample>>,
+    bytes: Sum<DiscoveryBytes>,
     evictions: u64,
 }
 
@@ -39,37 +35,6 @@ struct Sample {
 }
 
 impl DiscoveryFragments {
-    /// Returns the size and cap of each table, in entries or bytes.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            samples,
-            bytes: _,
-            evictions: _,
-        } = self;
-        let held = |sample: &Sample| {
-            let Sample {
-                writer: _,
-                number: _,
-                size: _,
-                fragment_size: _,
-                fragments,
-                bytes: _,
-            } = sample;
-            let fragments = fragments.values().map(|bytes| bytes.len() + OVERHEAD);
-            OVERHEAD + fragments.sum::<usize>()
-        };
-        vec![
-            Size::new("discovery_fragments.samples", samples.len(), SAMPLES),
-            Size::new(
-                "discovery_fragments.bytes",
-                samples.iter().map(held).sum(),
-                BUDGET,
-            ),
-        ]
-    }
-
     /// Returns whether fragments of this sample are kept.
     #[must_use]
     pub fn holds(&self, fragments: DataFrag<'_>) -> bool {
@@ -98,18 +63,10 @@ impl DiscoveryFragments {
         if size > MAX_SAMPLE || size == 0 || fragment_size == 0 || fragments.starting() == 0 {
             return None;
         }
-        let index = self.place(fragments).unwrap_or_else(|| {
-            self.samples.push_back(Sample {
-                writer: fragments.record().writer(),
-                number: fragments.sequence_number(),
-                size,
-                fragment_size,
-                fragments: BTreeMap::new(),
-                bytes: OVERHEAD,
-            });
-            self.bytes += OVERHEAD;
-            self.samples.len() - 1
-        });
+        let index = match self.place(fragments) {
+            Some(index) => index,
+            None => self.begin(fragments),
+        };
         let sample = self.samples.get_mut(index)?;
         let total = fragments.total();
         if sample.size == size && sample.fragment_size == fragment_size {
@@ -126,22 +83,43 @@ impl DiscoveryFragments {
                 };
                 if sample.fragments.insert(number, chunk.into()).is_none() {
                     sample.bytes += chunk.len() + OVERHEAD;
-                    self.bytes += chunk.len() + OVERHEAD;
+                    self.bytes.add(chunk.len() + OVERHEAD);
                 }
             }
         }
         if sample.fragments.len() == usize::try_from(total).ok()? {
             let sample = self.samples.remove(index)?;
-            self.bytes = self.bytes.saturating_sub(sample.bytes);
+            self.bytes.sub(sample.bytes);
             let parts: Vec<_> = sample.fragments.into_values().collect();
             return Some(parts.concat());
         }
-        while self.bytes > BUDGET || self.samples.len() > SAMPLES {
+        while self.bytes.is_exceeded() {
             let oldest = self.samples.pop_front()?;
-            self.bytes = self.bytes.saturating_sub(oldest.bytes);
-            self.evictions += 1;
+            self.evict(&oldest);
         }
         None
+    }
+
+    /// Adds a sample without fragments and returns its index.
+    fn begin(&mut self, fragments: DataFrag<'_>) -> usize {
+        let evicted = self.samples.push_back(Sample {
+            writer: fragments.record().writer(),
+            number: fragments.sequence_number(),
+            size: fragments.sample_size(),
+            fragment_size: fragments.fragment_size(),
+            fragments: BTreeMap::new(),
+            bytes: OVERHEAD,
+        });
+        if let Some(oldest) = evicted {
+            self.evict(&oldest);
+        }
+        self.bytes.add(OVERHEAD);
+        self.samples.len() - 1
+    }
+
+    fn evict(&mut self, sample: &Sample) {
+        self.bytes.sub(sample.bytes);
+        self.evictions += 1;
     }
 
     fn place(&self, fragments: DataFrag<'_>) -> Option<usize> {
@@ -208,7 +186,10 @@ mod tests {
             Some(payload)
         );
         assert_eq!(
-            (discovery_fragments.bytes, discovery_fragments.samples.len()),
+            (
+                discovery_fragments.bytes.used(),
+                discovery_fragments.samples.len()
+            ),
             (0, 0)
         );
     }
@@ -231,7 +212,7 @@ mod tests {
                 &[0; 100],
             );
         }
-        assert!(discovery_fragments.bytes <= BUDGET && discovery_fragments.evictions > 0);
+        assert!(!discovery_fragments.bytes.is_exceeded() && discovery_fragments.evictions > 0);
     }
 
     #[test]
@@ -244,11 +225,9 @@ mod tests {
                 &[0; 50_000],
             );
         }
-        let [_, bytes] = discovery_fragments.sizes().try_into().unwrap();
-        assert!(
-            (BUDGET * 8 / 10..=BUDGET).contains(&bytes.entries),
-            "{bytes:?}"
-        );
+        let used = discovery_fragments.bytes.used();
+        let cap = DiscoveryBytes::CAP;
+        assert!((cap * 8 / 10..=cap).contains(&used), "{used} bytes");
         assert!(discovery_fragments.evictions > 900);
     }
 }

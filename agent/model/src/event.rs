@@ -19,16 +19,13 @@ use super::expectation::WatchState;
 use super::inside::facts::LifecycleState;
 use super::loss::Loss;
 use super::names::{DdsName, NodeName, TopicName, TypeName};
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{LosingReceivers, LossBursts, WaitingEvents};
 
 /// Largest number of events per class and second of the source's clock.
 const MOST: u16 = 512;
 /// Number of waiting events above which they should be taken before further input.
 const MANY: usize = 1024;
-/// Largest number of writers whose losses within a second are combined.
-const BURSTS: usize = 1024;
-/// Largest number of receivers of one writer whose losses within a second are compared.
-const LOSERS: usize = 32;
 /// Longest text kept in an event, such as a topic's name.
 pub(crate) const TEXT: usize = 256;
 /// Longest list kept in an event, such as the participants of a duplicate node.
@@ -172,9 +169,9 @@ pub struct Taken {
 /// Events that wait to be taken, and losses that are being combined.
 #[derive(Debug, Default)]
 pub struct Events {
-    waiting: Vec<Event>,
+    waiting: Bounded<WaitingEvents, Vec<Event>>,
     classes: BTreeMap<Class, ClassQuota>,
-    bursts: BTreeMap<Guid, Burst>,
+    bursts: Bounded<LossBursts, BTreeMap<Guid, Burst>>,
 }
 
 /// State of one class.
@@ -191,7 +188,7 @@ struct Burst {
     at: Timestamp,
     losses: LossBurst,
     /// Number of samples that each receiver lost.
-    losers: Vec<(Receiver, u64)>,
+    losers: Bounded<LosingReceivers, Vec<(Receiver, u64)>>,
 }
 
 impl Class {
@@ -236,40 +233,13 @@ impl Events {
             return;
         }
         quota.in_second += 1;
-        self.waiting.push(Event { at, kind });
-    }
-
-    /// Returns the length and cap of each list. Events are taken when `MANY` wait, and one datagram
-    /// or tick adds at most `MOST` of each class and second.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            waiting,
-            classes,
-            bursts,
-        } = self;
-        let losers = |burst: &Burst| {
-            let Burst {
-                at: _,
-                losses: _,
-                losers,
-            } = burst;
-            losers.len()
-        };
-        let losers = bursts.values().map(losers).max();
-        let room = MANY + classes.len() * usize::from(MOST);
-        vec![
-            Size::new("events.waiting", waiting.len(), room),
-            Size::new("events.classes", classes.len(), Class::ALL.len()),
-            Size::new("events.bursts", bursts.len(), BURSTS),
-            Size::new("events.losers", losers.unwrap_or(0), LOSERS),
-        ]
+        let is_full = self.waiting.push(Event { at, kind }).is_some();
+        quota.overflow += u64::from(is_full);
     }
 
     /// Returns whether so many events wait that they should be taken before further input.
     #[must_use]
-    pub const fn are_many(&self) -> bool {
+    pub fn are_many(&self) -> bool {
         self.waiting.len() >= MANY
     }
 
@@ -294,14 +264,12 @@ impl Events {
         let Some(burst) = self.burst(writer, at, (first, last)) else {
             return;
         };
-        let is_full = burst.losers.len() >= LOSERS;
         let mut losers = burst.losers.iter_mut();
         let lost = match losers.find(|(loser, _)| *loser == receiver) {
             Some((_, lost)) => {
                 *lost = lost.saturating_add(count);
                 *lost
             }
-            None if is_full => count,
             None => {
                 burst.losers.push((receiver, count));
                 count
@@ -316,11 +284,7 @@ impl Events {
         at: Timestamp,
         (first, last): (SequenceNumber, SequenceNumber),
     ) -> Option<&mut Burst> {
-        if self.bursts.len() >= BURSTS && !self.bursts.contains_key(&writer) {
-            self.classes.entry(Class::Loss).or_default().overflow += 1;
-            return None;
-        }
-        let burst = self.bursts.entry(writer).or_insert_with(|| Burst {
+        let new = || Burst {
             at,
             losses: LossBurst {
                 writer,
@@ -330,8 +294,12 @@ impl Events {
                 first,
                 last,
             },
-            losers: Vec::new(),
-        });
+            losers: Bounded::default(),
+        };
+        let Some(burst) = self.bursts.get_or_insert_with(writer, new) else {
+            self.classes.entry(Class::Loss).or_default().overflow += 1;
+            return None;
+        };
         burst.at = burst.at.max(at);
         burst.losses.first = burst.losses.first.min(first);
         burst.losses.last = burst.losses.last.max(last);
@@ -347,7 +315,7 @@ impl Events {
 
     /// Ends all bursts. `complete` fills in what is known about the writers.
     pub fn end_bursts(&mut self, mut complete: impl FnMut(&mut LossBurst)) {
-        for (_, Burst { at, mut losses, .. }) in std::mem::take(&mut self.bursts) {
+        for (_, Burst { at, mut losses, .. }) in self.bursts.take() {
             complete(&mut losses);
             self.push(at, EventKind::Loss(losses));
         }
@@ -359,7 +327,7 @@ impl Events {
         let overflow = classes.map(|(class, quota)| (*class, std::mem::take(&mut quota.overflow)));
         Taken {
             overflow: overflow.filter(|(_, count)| *count > 0).collect(),
-            events: std::mem::take(&mut self.waiting),
+            events: self.waiting.take(),
         }
     }
 }
@@ -507,10 +475,7 @@ mod tests {
             let run = (SequenceNumber(1), SequenceNumber(2));
             events.lose_delivery(guid(1), receiver, Timestamp(10), run);
         }
-        let sizes = events.sizes();
-        let losers = sizes.iter().find(|size| size.table == "events.losers");
-        let losers = losers.unwrap();
-        assert_eq!((losers.entries, losers.cap), (LOSERS, LOSERS));
+        assert!(events.bursts[&guid(1)].losers.is_full());
     }
 
     #[test]

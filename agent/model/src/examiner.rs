@@ -16,7 +16,6 @@ use crate::diagnosis::{Diagnoses, Diagnosis, QosPairs};
 use crate::discovery::Discovery;
 use crate::inside::Inside;
 use crate::services::Services;
-use crate::size::Size;
 use crate::topic::Topics;
 use endpoints::{EndpointExaminer, UnmatchedEndpoint};
 
@@ -77,25 +76,6 @@ impl Examiner {
     pub fn size(&self) -> (usize, usize, u64) {
         let limit = PER_KIND * Diagnosis::KINDS.len();
         (self.current.list.len(), limit, self.left_out)
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            revision: _,
-            due: _,
-            alone,
-            current: _,
-            since: _,
-            left_out: _,
-        } = self;
-        let (list, cap, _) = self.size();
-        vec![
-            Size::new("examiner.alone", alone.len(), endpoints),
-            Size::new("examiner.list", list, cap),
-        ]
     }
 
     /// Forces the next examination, even if discovery has not changed.

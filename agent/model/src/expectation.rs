@@ -4,7 +4,8 @@
 //! `BAD` bad evaluations in a row and recovers after `GOOD` good ones. Rates are evaluated over a
 //! window of at least three expected messages (1 to 10 s), or over the window of the entry. One
 //! message of tolerance at the window's edges keeps a healthy periodic topic stable. Silence has
-//! its own time and no hysteresis.
+//! its own time and no hysteresis. The end of a window counts for `min_rate_hz` only as far as its
+//! messages are known: those of a sampled topic are known with the next one that polling sees.
 //!
 //! Windows and silence begin when the agent can see the messages, at the earliest: after its own
 //! start, the first publisher or subscriber, and a time in which the source saw nothing. A topic
@@ -28,6 +29,8 @@ use crate::watch::Expectations;
 const BAD: u8 = 2;
 /// Good evaluations in a row until it recovers.
 const GOOD: u8 = 3;
+/// Longest time in which polling sees no message of a topic on a busy machine. Real Fast DDS: 0.4 s.
+const POLLING_HOLE: Duration = Duration::from_secs(1);
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
 pub const GRACE: u64 = 10;
 const NAMES: [&str; 7] = [
@@ -73,6 +76,9 @@ pub struct Evidence<'a> {
     pub subscriptions: usize,
     /// Time of the last message of any writer.
     pub last_message: Option<Timestamp>,
+    /// Returns how long the topic may seem silent while messages are sent, at this interval if none
+    /// is known.
+    pub seeming_silence: &'a dyn Fn(Duration) -> Duration,
     /// Time since which the topic has a writer and is watched.
     pub since: Timestamp,
     /// Time since which messages are expected and would be seen; at least `since`.
@@ -100,6 +106,19 @@ impl Evidence<'_> {
     fn observed_seconds(&self) -> u64 {
         let first = self.observed.0.div_ceil(SECOND);
         self.now.whole_seconds().saturating_sub(first)
+    }
+
+    /// Returns how much of the last whole seconds is not known yet, in seconds. Messages are expected
+    /// at this rate.
+    fn unknown_seconds(&self, rate: f64) -> f64 {
+        let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
+        let seeming = (self.seeming_silence)(interval);
+        let last = self.last_message.unwrap_or_default().max(self.observed);
+        if seeming.is_zero() || self.now - last > seeming.max(POLLING_HOLE) {
+            return 0.0;
+        }
+        let end = Timestamp(self.now.whole_seconds().saturating_mul(SECOND));
+        (end - last).as_secs_f64()
     }
 }
 
@@ -218,7 +237,8 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
     };
     if let Some(minimum) = expectations.min_rate_hz {
         let (slot, seconds) = rates(minimum);
-        if seconds > 0 && (slot.messages + 1) as f64 <= minimum * seconds as f64 {
+        let known = seconds as f64 - evidence.unknown_seconds(minimum).min(seconds as f64);
+        if known > 0.0 && (slot.messages + 1) as f64 <= minimum * known {
             broken |= MIN_RATE;
         }
     }
@@ -245,7 +265,7 @@ fn broken(expectations: &Expectations, evidence: &Evidence<'_>, is_silent: bool)
             true => last,
             false => last.max(evidence.observed),
         };
-        if evidence.now - begin > maximum {
+        if evidence.now - begin > maximum.max((evidence.seeming_silence)(maximum)) {
             broken |= MAX_SILENCE;
         }
     }
@@ -291,6 +311,9 @@ mod tests {
         expectations: Expectations,
         now: u64,
         last_message: Option<Timestamp>,
+        seeming_silence: Duration,
+        /// Time before an evaluation of which polling has seen nothing.
+        unseen: Duration,
         subscriptions: usize,
         publishers: usize,
         observed: Timestamp,
@@ -303,6 +326,8 @@ mod tests {
                 expectations,
                 now: 1000 * SECOND,
                 last_message: None,
+                seeming_silence: Duration::ZERO,
+                unseen: Duration::ZERO,
                 subscriptions: 1,
                 publishers: 1,
                 observed: Timestamp(1000 * SECOND),
@@ -313,7 +338,8 @@ mod tests {
         fn second(&mut self, slot: Slot) -> WatchState {
             self.now += SECOND;
             if slot.messages > 0 {
-                self.last_message = Some(Timestamp(self.now));
+                let unseen = u64::try_from(self.unseen.as_nanos()).unwrap();
+                self.last_message = Some(Timestamp(self.now - unseen));
             }
             let recent = |seconds: u64| {
                 let mut sum = Slot::default();
@@ -327,6 +353,7 @@ mod tests {
                     publishers: self.publishers,
                     subscriptions: self.subscriptions,
                     last_message: self.last_message,
+                    seeming_silence: &|_| self.seeming_silence,
                     since: Timestamp(1000 * SECOND),
                     observed: self.observed,
                     recent: &recent,
@@ -431,6 +458,45 @@ mod tests {
         bench.now += 5 * SECOND;
         bench.observed = Timestamp(bench.now);
         assert_eq!([0, 1].map(|count| bench.second(rate(count))), [silent, ok]);
+    }
+
+    #[test]
+    fn a_topic_that_is_sampled_is_silent_when_unseen_messages_no_longer_explain_it() {
+        let mut bench = Bench::new(Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        });
+        bench.seeming_silence = Duration::from_secs(4);
+        assert_eq!(bench.second(rate(5)), WatchState::Ok);
+        let states = [(); 5].map(|()| bench.second(rate(0)));
+        let (ok, silent) = (WatchState::Ok, WatchState::Silent);
+        assert_eq!(states, [ok, ok, ok, ok, silent]);
+    }
+
+    #[test]
+    fn a_rate_of_a_sampled_topic_counts_up_to_the_last_message_that_polling_saw() {
+        let mut bench = Bench::new(Expectations {
+            min_rate_hz: Some(40.0),
+            ..Expectations::default()
+        });
+        bench.seeming_silence = Duration::from_millis(200);
+        bench.unseen = Duration::from_millis(400);
+        // 50 Hz, the last 0.4 s of each second unseen.
+        let states = [(); 4].map(|()| bench.second(rate(30)));
+        assert_eq!(states, [WatchState::Ok; 4]);
+        // 30 Hz: too few up to the last message.
+        let states = [(); 2].map(|()| bench.second(rate(18)));
+        let (ok, bad) = (WatchState::Ok, WatchState::Violated);
+        assert_eq!(states, [ok, bad]);
+        // It recovers, and ends.
+        (0..3).for_each(|_| assert_ne!(bench.second(rate(30)), WatchState::Silent));
+        let states = [(); 3].map(|()| bench.second(rate(0)));
+        assert_eq!(states, [ok, bad, bad]);
+        // Without sampling, all messages are known at once.
+        (0..3).for_each(|_| assert_ne!(bench.second(rate(50)), WatchState::Silent));
+        bench.seeming_silence = Duration::ZERO;
+        let states = [(); 2].map(|()| bench.second(rate(30)));
+        assert_eq!(states, [ok, bad]);
     }
 
     #[test]

@@ -14,11 +14,10 @@ use super::histogram::Histogram;
 use super::measurement::{EarlierCounts, Measurement};
 use super::names::DdsName;
 use super::rate::SECONDS as WINDOW;
-use super::size::Size;
 use super::snapshot::TableFacts;
+use crate::bounded::{Bounded, Counted, Sum};
+use crate::tables::{HistoryRows, HistorySeconds, HistoryTotals};
 
-/// Largest number of rows in all seconds, 24 bytes each: 10 minutes of 436 topics.
-const ROWS: usize = 262_144;
 /// Largest number of names per measurable topic. Topics that stopped being measured keep their
 /// names up to this factor.
 const NAMES: usize = 2;
@@ -26,14 +25,12 @@ const NAMES: usize = 2;
 /// A ring of the last seconds.
 #[derive(Debug)]
 pub struct History {
-    /// Number of seconds that are kept.
-    span: usize,
     /// Largest number of topic names.
     most: usize,
-    seconds: VecDeque<Arc<Second>>,
-    rows: usize,
+    seconds: Bounded<Counted<HistorySeconds>, VecDeque<Arc<Second>>>,
+    rows: Sum<HistoryRows>,
     names: Arc<Names>,
-    before: HashMap<u32, PreviousTotals>,
+    before: Bounded<Counted<HistoryTotals>, HashMap<u32, PreviousTotals>>,
     /// The id assigned last.
     last: u32,
     /// Topics whose history was dropped because the ring was full.
@@ -108,13 +105,13 @@ impl History {
     /// once.
     #[must_use]
     pub fn new(span: Duration, topics: usize) -> Self {
+        let most = topics.saturating_mul(NAMES);
         Self {
-            span: usize::try_from(span.as_secs()).unwrap_or(usize::MAX),
-            most: topics.saturating_mul(NAMES),
-            seconds: VecDeque::new(),
-            rows: 0,
+            most,
+            seconds: Bounded::capped(usize::try_from(span.as_secs()).unwrap_or(usize::MAX)),
+            rows: Sum::default(),
             names: Arc::default(),
-            before: HashMap::new(),
+            before: Bounded::capped(most),
             last: 0,
             evictions: 0,
         }
@@ -145,7 +142,7 @@ impl History {
         if self.seconds.back().is_some_and(|last| now < last.at) {
             // The clock was set back, and times within a chart must increase.
             self.seconds.clear();
-            self.rows = 0;
+            self.rows.clear();
         }
         let mut rows: Vec<Row> = Vec::new();
         let mut is_forgetful = true;
@@ -160,14 +157,15 @@ impl History {
             }
         }
         rows.sort_unstable_by_key(|row| row.topic);
-        self.rows += rows.len();
+        self.rows.add(rows.len());
         let rows = rows.into();
-        self.seconds.push_back(Arc::new(Second { at: now, rows }));
-        while self.seconds.len() > self.span || self.rows > ROWS {
-            let Some(oldest) = self.seconds.pop_front() else {
+        let mut left = self.seconds.push_back(Arc::new(Second { at: now, rows }));
+        loop {
+            self.rows.sub(left.map_or(0, |oldest| oldest.rows.len()));
+            if !self.rows.is_exceeded() {
                 break;
-            };
-            self.rows -= oldest.rows.len();
+            }
+            left = self.seconds.pop_front();
         }
     }
 
@@ -187,30 +185,9 @@ impl History {
             table: "history",
             size: self.names.len() as u64,
             limit: self.most as u64,
+            bytes: None,
             evictions: self.evictions,
         }
-    }
-
-    /// Returns the size of each table.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            span,
-            most,
-            seconds,
-            rows,
-            names,
-            before,
-            last: _,
-            evictions: _,
-        } = self;
-        vec![
-            Size::new("history.seconds", seconds.len(), *span),
-            Size::new("history.rows", *rows, ROWS),
-            Size::new("history.names", names.len(), *most),
-            Size::new("history.before", before.len(), *most),
-        ]
     }
 
     /// Assigns an id to a new topic, or returns `None` if the table of names is full.
@@ -467,9 +444,7 @@ mod tests {
             .iter()
             .map(|(name, counted)| (DomainId(0), *name, counted.clone()));
         history.take(Timestamp(second * SECOND), topics);
-        for size in history.sizes() {
-            assert!(size.entries <= size.cap, "{size:?}");
-        }
+        assert!(!history.rows.is_exceeded());
     }
 
     #[test]
@@ -589,10 +564,7 @@ mod tests {
             history.take(Timestamp(second * SECOND), topics);
         }
         assert_eq!(history.past().seconds().len(), 13);
-        let sizes = history.sizes();
-        let rows = sizes.iter().find(|size| size.table == "history.rows");
-        let rows = rows.unwrap();
-        assert_eq!((rows.entries, rows.cap), (13 * 20_000, ROWS));
+        assert_eq!(history.rows.used(), 13 * 20_000);
     }
 
     #[test]

@@ -19,15 +19,12 @@ use std::time::Duration;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::dispatch::{Dispatch, Sample};
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{self, OrderedSamples};
 
 /// Longest time that a gap is waited for. Fast DDS requests retransmissions after a HEARTBEAT,
 /// which follows within three seconds.
 const GAP_TIMEOUT: Duration = Duration::from_secs(4);
-/// Largest number of waiting samples.
-const WAITING: usize = 4096;
-/// Largest number of samples remembered of a writer without an announcement.
-pub(super) const MAX_UNANNOUNCED: usize = 1024;
 /// Samples from before the announcement are retransmitted within this time, or not at all.
 const RETRANSMISSION_TIMEOUT: Duration = Duration::from_secs(10);
 /// Memory per sample in addition to its payload.
@@ -64,10 +61,13 @@ pub struct QueuedSample {
     pub missed: Option<Dispatch>,
 }
 
+/// Numbers of a writer that is not announced yet.
+pub(super) type UnannouncedNumbers = Bounded<tables::UnannouncedNumbers, BTreeSet<SequenceNumber>>;
+
 /// Samples that wait for lower numbers.
 #[derive(Debug, Default)]
 pub struct InOrder {
-    waiting: BTreeMap<SequenceNumber, QueuedSample>,
+    waiting: Bounded<OrderedSamples, BTreeMap<SequenceNumber, QueuedSample>>,
     bytes: usize,
     incarnation: Option<u32>,
     /// The missing number, and since when it is waited for.
@@ -77,7 +77,7 @@ pub struct InOrder {
     /// Time of the last dispatched sample.
     last: Timestamp,
     /// Numbers that were counted before the writer's announcement but not dispatched.
-    earlier: BTreeSet<SequenceNumber>,
+    earlier: UnannouncedNumbers,
     announced: Timestamp,
 }
 
@@ -94,26 +94,6 @@ impl QueuedSample {
 }
 
 impl InOrder {
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            waiting,
-            bytes: _,
-            incarnation: _,
-            hole: _,
-            is_hole_unseen: _,
-            last: _,
-            earlier,
-            announced: _,
-        } = self;
-        [
-            Size::new("in_order.waiting", waiting.len(), WAITING),
-            Size::new("in_order.earlier", earlier.len(), MAX_UNANNOUNCED),
-        ]
-    }
-
     /// Returns whether no sample waits or may still be retransmitted.
     #[must_use]
     pub fn is_idle(&self) -> bool {
@@ -127,7 +107,7 @@ impl InOrder {
     }
 
     /// Sets the numbers that were counted before the writer's announcement at `now`.
-    pub fn announced(&mut self, earlier: BTreeSet<SequenceNumber>, now: Timestamp) {
+    pub fn announced(&mut self, earlier: UnannouncedNumbers, now: Timestamp) {
         (self.earlier, self.announced) = (earlier, now);
     }
 
@@ -156,9 +136,10 @@ impl InOrder {
         let number = queued.sample.sequence_number;
         self.earlier.remove(&number);
         self.bytes += queued.cost();
-        if let Some(before) = self.waiting.insert(number, queued) {
+        if let Some(before) = self.waiting.remove(&number) {
             self.bytes -= before.cost();
         }
+        self.waiting.insert(number, queued);
     }
 
     /// Returns samples from before the announcement that will not be retransmitted.
@@ -168,10 +149,9 @@ impl InOrder {
         }
         let is_late = self.announced + RETRANSMISSION_TIMEOUT <= now;
         if is_late || !progress.reliable {
-            return std::mem::take(&mut self.earlier).into_iter().collect();
+            return self.earlier.take().into_iter().collect();
         }
-        let kept = self.earlier.split_off(&progress.awaited);
-        let gone = std::mem::replace(&mut self.earlier, kept);
+        let gone = self.earlier.take_below(&progress.awaited);
         gone.into_iter().collect()
     }
 
@@ -204,7 +184,7 @@ impl InOrder {
         }
         self.is_hole_unseen = progress.unseen;
         let is_late = self.hole.1 + GAP_TIMEOUT <= now;
-        if is_late || self.waiting.len() > WAITING || self.bytes > room {
+        if is_late || self.waiting.is_full() || self.bytes > room {
             let last = self.waiting.last_key_value().map(|(number, _)| *number);
             self.give_all(now, give);
             return last.map(|last| last.next());

@@ -8,14 +8,15 @@ use std::collections::{BTreeSet, HashMap};
 
 use ros2probe_wire::Guid;
 
-use super::size::Size;
+use crate::bounded::{Bounded, Counted};
+use crate::tables::InterestEntries;
 use ros2probe_wire::record::Verdict;
 
 /// The table of verdicts.
 #[derive(Debug)]
 pub struct Interest {
-    entries: HashMap<Guid, Entry>,
-    changed: BTreeSet<Guid>,
+    entries: Bounded<Counted<InterestEntries>, HashMap<Guid, Entry>>,
+    changed: Bounded<Counted<InterestEntries>, BTreeSet<Guid>>,
     limit: usize,
     evictions: u64,
 }
@@ -27,29 +28,13 @@ struct Entry {
 }
 
 impl Interest {
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            entries,
-            changed,
-            limit,
-            evictions: _,
-        } = self;
-        // Removed entries stay until the kernel's map is updated.
-        vec![
-            Size::new("interest.entries", entries.len(), 2 * limit),
-            Size::new("interest.changed", changed.len(), 2 * limit),
-        ]
-    }
-
     /// Creates an empty table for at most `limit` entries.
     #[must_use]
     pub fn new(limit: usize) -> Self {
         Self {
-            entries: HashMap::new(),
-            changed: BTreeSet::new(),
+            // Removed entries stay until the kernel's map is updated.
+            entries: Bounded::capped(2 * limit),
+            changed: Bounded::capped(2 * limit),
             limit,
             evictions: 0,
         }
@@ -63,7 +48,9 @@ impl Interest {
                 return;
             }
         }
-        let entry = self.entries.entry(guid).or_default();
+        let Some(entry) = self.entries.get_or_insert_with(guid, Entry::default) else {
+            return;
+        };
         entry.wanted = Some(verdict);
         if entry.wanted == entry.reported {
             self.changed.remove(&guid);
@@ -96,7 +83,7 @@ impl Interest {
     /// come first, because the kernel's map has the same cap as this table.
     pub fn changes(&mut self) -> Vec<(Guid, Option<Verdict>)> {
         let mut changes = Vec::with_capacity(self.changed.len());
-        for guid in std::mem::take(&mut self.changed) {
+        for guid in self.changed.take() {
             let Some(entry) = self.entries.get_mut(&guid) else {
                 continue;
             };

@@ -8,12 +8,9 @@ use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 use super::dispatch::MissedReason;
 use super::event::Events;
 use super::loss::{DeliveryLoss, Loss};
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{DiscoveryEvents, LatestDeliveryLosses, LatestLosses, MissingSamples};
 
-/// Largest number of discovery events kept, and of losses per writer kept.
-const LIMIT: usize = 1024;
-/// Largest number of receivers' losses kept; several receivers may miss the same sample.
-const DELIVERY_LIMIT: usize = 4096;
 /// Number of the latest entries that a new loss may extend.
 const RECENT: usize = 16;
 
@@ -50,40 +47,15 @@ pub struct Missing {
 /// All lists.
 #[derive(Debug, Default)]
 pub struct Journal {
-    discovery: VecDeque<DiscoveryEvent>,
-    losses: VecDeque<Loss>,
-    delivery_losses: VecDeque<DeliveryLoss>,
-    missing: Vec<Missing>,
+    discovery: Bounded<DiscoveryEvents, VecDeque<DiscoveryEvent>>,
+    losses: Bounded<LatestLosses, VecDeque<Loss>>,
+    delivery_losses: Bounded<LatestDeliveryLosses, VecDeque<DeliveryLoss>>,
+    missing: Bounded<MissingSamples, Vec<Missing>>,
     /// Events that wait to be taken.
     pub events: Events,
 }
 
 impl Journal {
-    /// Returns the length and cap of each list.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            discovery,
-            losses,
-            delivery_losses,
-            missing,
-            events,
-        } = self;
-        let mut sizes = events.sizes();
-        sizes.extend([
-            Size::new("journal.discovery", discovery.len(), LIMIT),
-            Size::new("journal.losses", losses.len(), LIMIT),
-            Size::new(
-                "journal.delivery_losses",
-                delivery_losses.len(),
-                DELIVERY_LIMIT,
-            ),
-            Size::new("journal.missing", missing.len(), LIMIT),
-        ]);
-        sizes
-    }
-
     /// Returns discovery events, oldest first.
     pub fn discovery(&self) -> impl Iterator<Item = &DiscoveryEvent> {
         self.discovery.iter()
@@ -101,9 +73,6 @@ impl Journal {
 
     /// Adds an event.
     pub fn note(&mut self, event: DiscoveryEvent) {
-        if self.discovery.len() >= LIMIT {
-            self.discovery.pop_front();
-        }
         self.discovery.push_back(event);
     }
 
@@ -115,14 +84,14 @@ impl Journal {
             && last.last.precedes(missing.first)
         {
             last.last = missing.last;
-        } else if self.missing.len() < LIMIT {
+        } else {
             self.missing.push(missing);
         }
     }
 
     /// Removes and returns the missing samples since the last call.
     pub fn take_missing(&mut self) -> Vec<Missing> {
-        std::mem::take(&mut self.missing)
+        self.missing.take()
     }
 
     /// Adds a loss, extending the last entry if the loss continues it. It becomes an event unless
@@ -137,9 +106,6 @@ impl Journal {
         {
             (last.last, last.at) = (loss.last, loss.at);
             return;
-        }
-        if self.losses.len() >= LIMIT {
-            self.losses.pop_front();
         }
         self.losses.push_back(loss);
     }
@@ -163,9 +129,6 @@ impl Journal {
         if let Some(entry) = continued {
             (entry.last, entry.at) = (loss.last, loss.at);
             return;
-        }
-        if self.delivery_losses.len() >= DELIVERY_LIMIT {
-            self.delivery_losses.pop_front();
         }
         self.delivery_losses.push_back(loss);
     }

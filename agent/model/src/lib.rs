@@ -25,6 +25,7 @@
 
 pub mod acknowledgement;
 pub mod assembly;
+pub mod bounded;
 pub mod chain;
 pub mod churn;
 pub mod delivery;
@@ -67,10 +68,10 @@ pub mod samples;
 pub mod selection;
 pub mod sequence;
 pub mod services;
-pub mod size;
 pub mod snapshot;
 pub mod sockets;
 pub mod subscribers;
+pub mod tables;
 pub mod topic;
 pub mod topic_kind;
 pub mod trace;

@@ -328,6 +328,10 @@ impl Limits {
     /// of viewers are included.
     pub const BESIDE: usize = 33 << 20;
 
+    /// Memory of Zenoh at its caps, in bytes: tables with a cap in bytes (42 MiB), messages in
+    /// FRAGMENTs (20 MiB), and batches and segments that wait for their rest (20 MiB).
+    pub const ZENOH: usize = 82 << 20;
+
     /// Returns the memory in bytes that all limits together allow.
     #[must_use]
     pub fn bytes(&self) -> usize {

@@ -10,21 +10,18 @@ use std::time::Duration;
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::loss::LossCause;
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{KnownLosses, OpenLosses};
 
-/// Largest number of samples per receiver: a few seconds of a busy topic's losses.
-const SAMPLES: usize = 8192;
-/// Largest number of runs of pending samples per receiver.
-const RUNS: usize = 1024;
 /// The kernel waits 30 s for IP fragments (`net.ipv4.ipfrag_time`).
 pub const REASSEMBLY: Duration = Duration::from_secs(35);
 
 /// Known causes and pending losses.
 #[derive(Debug, Default)]
 pub struct LossCauses {
-    known: BTreeMap<SequenceNumber, KnownLoss>,
+    known: Bounded<KnownLosses, BTreeMap<SequenceNumber, KnownLoss>>,
     /// Pending runs, by their first number.
-    pending: BTreeMap<SequenceNumber, Run>,
+    pending: Bounded<OpenLosses, BTreeMap<SequenceNumber, Run>>,
 }
 
 /// Where a sample, or part of it, was lost.
@@ -43,26 +40,13 @@ struct Run {
 }
 
 impl LossCauses {
-    /// Returns the length and cap of both lists.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self { known, pending } = self;
-        [
-            Size::new("loss_causes.known", known.len(), SAMPLES),
-            Size::new("loss_causes.pending", pending.len(), RUNS),
-        ]
-    }
-
     /// Records the loss of some or all of this sample. Returns whether an older one was dropped.
     pub fn note(&mut self, number: SequenceNumber, cause: LossCause, at: Timestamp) -> bool {
-        let known_loss = self.known.entry(number).or_insert(KnownLoss { cause, at });
-        known_loss.cause = known_loss.cause.max(cause);
-        let is_full = self.known.len() > SAMPLES;
-        if is_full {
-            self.known.pop_first();
+        if let Some(known_loss) = self.known.get_mut(&number) {
+            known_loss.cause = known_loss.cause.max(cause);
+            return false;
         }
-        is_full
+        self.known.insert(number, KnownLoss { cause, at }).is_some()
     }
 
     /// Removes a sample that arrived after all or was excused.
@@ -104,7 +88,7 @@ impl LossCauses {
             .first_key_value()
             .is_some_and(|(number, _)| *number < below)
         {
-            self.known = self.known.split_off(&below);
+            self.known.take_below(&below);
         }
     }
 
@@ -123,13 +107,8 @@ impl LossCauses {
             run.last = last;
             return None;
         }
-        self.pending.insert(first, Run { last, until });
-        if self.pending.len() <= RUNS {
-            return None;
-        }
-        self.pending
-            .pop_first()
-            .map(|(first, run)| (first, run.last))
+        let decided = self.pending.insert(first, Run { last, until });
+        decided.map(|(first, run)| (first, run.last))
     }
 
     /// Removes this sample from the pending ones and returns whether it was pending. If the split
@@ -140,7 +119,7 @@ impl LossCauses {
         };
         let (first, run) = (*first, *run);
         let splits = first < number && number < run.last;
-        if number > run.last || splits && self.pending.len() >= RUNS {
+        if number > run.last || splits && self.pending.is_full() {
             return false;
         }
         self.pending.remove(&first);
@@ -241,12 +220,12 @@ mod tests {
         let forgotten = (0..10_000).filter(|number| {
             loss_causes.note(SequenceNumber(2 * number), LossCause::SocketBuffer, at(1))
         });
-        assert_eq!(forgotten.count(), 10_000 - SAMPLES);
+        assert_eq!(forgotten.count(), 10_000 - KnownLosses::CAP);
         let losses = (0..2000).filter_map(|number| {
             let number = SequenceNumber(2 * number);
             loss_causes.wait(number, number, at(1))
         });
-        assert_eq!(losses.count(), 2000 - RUNS);
+        assert_eq!(losses.count(), 2000 - OpenLosses::CAP);
     }
 
     #[test]
@@ -254,13 +233,12 @@ mod tests {
         let mut loss_causes = LossCauses::default();
         loss_causes.wait(SequenceNumber(1), SequenceNumber(100_000), at(1));
         let resolved = (1..50_000).filter(|number| loss_causes.resolve(SequenceNumber(2 * number)));
-        assert_eq!(resolved.count(), RUNS - 1);
-        let [_, pending] = loss_causes.sizes();
-        assert_eq!(pending.entries, pending.cap);
+        assert_eq!(resolved.count(), OpenLosses::CAP - 1);
+        assert!(loss_causes.pending.is_full());
         // Removing the end of a run splits nothing, and a removed hole frees no entry.
         assert!(loss_causes.resolve(SequenceNumber(1)));
         let left = loss_causes.due(at(1)).into_iter();
         let left: u64 = left.map(|(first, last)| last - first + 1).sum();
-        assert_eq!(left, 100_000 - RUNS as u64);
+        assert_eq!(left, 100_000 - OpenLosses::CAP as u64);
     }
 }

@@ -45,7 +45,6 @@ use super::profiler::{Profiler, RecordOutcome, UNDELIVERED};
 use super::receivers::Receivers;
 use super::selection::SampleRequest;
 use super::services::Services;
-use super::size::Size;
 use super::snapshot::Snapshot;
 use super::topic::{TopicId, Topics, Watched};
 use super::trace::{LOOPBACK, Tracer, WriterDescription};
@@ -245,75 +244,8 @@ impl Observer {
 
     /// Returns whether so much output waits that it should be drained before further input.
     #[must_use]
-    pub const fn has_much_output(&self) -> bool {
+    pub fn has_much_output(&self) -> bool {
         self.payloads.is_full() || self.journal.events.are_many()
-    }
-
-    /// Returns the size and cap of each table of the model, in entries or bytes.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new component fail to compile until it is listed here.
-        let Self {
-            settings,
-            watchlist,
-            discovery,
-            topics,
-            pending_topics,
-            interest,
-            profiler,
-            discovery_fragments,
-            payloads,
-            sample_requests,
-            receivers,
-            services,
-            inside,
-            chains,
-            tracer,
-            zenoh,
-            zenoh_changes: _,
-            zenoh_keys,
-            examiner,
-            decode_errors,
-            datagrams: _,
-            records: _,
-            journal,
-            clock: _,
-            view_began: _,
-            wall_clock: _,
-        } = self;
-        let mut sizes = discovery.sizes();
-        sizes.push(Size::new(
-            "observer.pending_topics",
-            pending_topics.len(),
-            settings.endpoints,
-        ));
-        sizes.extend(topics.sizes(
-            settings.endpoints,
-            settings.topics,
-            watchlist.watches().len(),
-        ));
-        sizes.extend(interest.sizes());
-        sizes.extend(profiler.sizes(settings.endpoints));
-        sizes.extend(discovery_fragments.sizes());
-        sizes.extend(payloads.sizes(
-            settings.endpoints,
-            settings.unknown_writers,
-            sample_requests.len(),
-        ));
-        sizes.extend(receivers.sizes());
-        sizes.extend(services.sizes());
-        sizes.extend(inside.sizes(settings.participants));
-        sizes.extend(chains.sizes(settings.endpoints));
-        sizes.extend(tracer.sizes());
-        sizes.extend(zenoh.sizes());
-        let keys = Size::new("zenoh.keys", zenoh_keys.len(), settings.endpoints);
-        sizes.push(keys);
-        sizes.extend(examiner.sizes(settings.endpoints));
-        sizes.extend(journal.sizes());
-        // Each stage has every reason at most once.
-        let reasons = Size::new("observer.decode_errors", decode_errors.len(), 64);
-        sizes.push(reasons);
-        sizes
     }
 
     /// Returns what the model needs from shared memory at present.

@@ -6,7 +6,7 @@
 
 mod request_begin;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,15 +14,14 @@ use ros2probe_wire::{Guid, SequenceNumber, Timestamp, record};
 
 use super::assembly::Assembly;
 use super::dispatch::{Dispatch, Missed, MissedReason, Sample, SampleOutcome, Topic};
-use super::in_order::{InOrder, MAX_UNANNOUNCED, Progress, QueuedSample};
+use super::in_order::{InOrder, Progress, QueuedSample, UnannouncedNumbers};
 use super::journal::Missing;
 use super::selection::RequestIds;
-use super::size::{Size, largest};
 use super::writer::Counted;
+use crate::bounded::Bounded;
+use crate::tables::WaitingDispatches;
 use request_begin::RequestBegin;
 
-/// Largest number of entries in the output queue; one round of the capture thread has far fewer.
-const WAITING: usize = 65_536;
 /// Longest time until the kernel captures payloads after a request, and the model has processed
 /// what was captured before.
 pub const PAYLOAD_DELAY: Duration = Duration::from_millis(400);
@@ -47,7 +46,7 @@ struct WantedWriter {
 /// Numbers of a writer that is not announced yet.
 #[derive(Debug, Default)]
 struct UnannouncedSamples {
-    numbers: BTreeSet<SequenceNumber>,
+    numbers: UnannouncedNumbers,
     /// Ids of the requests, and the first number that was counted during each.
     begins: Vec<(u64, SequenceNumber)>,
     /// Lower numbers that are not remembered: the first, the last, and their count.
@@ -64,7 +63,7 @@ pub struct Payloads {
     assembly: Assembly,
     /// Counted samples of writers without an announcement, while samples are requested.
     unknown_writers: HashMap<Guid, UnannouncedSamples>,
-    dispatches: Vec<Dispatch>,
+    dispatches: Bounded<WaitingDispatches, Vec<Dispatch>>,
     dispatch_bytes: usize,
     /// Bytes of samples that wait for lower numbers.
     waiting_bytes: usize,
@@ -82,82 +81,11 @@ impl Payloads {
             deep: 0,
             assembly: Assembly::new(limit),
             unknown_writers: HashMap::new(),
-            dispatches: Vec::new(),
+            dispatches: Bounded::default(),
             dispatch_bytes: 0,
             waiting_bytes: 0,
             refused: 0,
         }
-    }
-
-    /// Returns the size and cap of each table, in entries or bytes. The arguments are the caps of
-    /// requested writers, unknown writers and sample requests.
-    #[must_use]
-    pub fn sizes(
-        &self,
-        endpoints: usize,
-        unknown_writers: usize,
-        sample_requests: usize,
-    ) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            writers,
-            payload_delay: _,
-            deep: _,
-            assembly,
-            unknown_writers: known,
-            dispatches,
-            dispatch_bytes,
-            waiting_bytes,
-            refused: _,
-        } = self;
-        let (bytes, limit, _) = assembly.size();
-        let interested = |interested: &WantedWriter| {
-            let WantedWriter {
-                topic: _,
-                to: _,
-                payloads: _,
-                arrivals: _,
-                begins,
-                since: _,
-                first_whole: _,
-                order,
-            } = interested;
-            let begins = Size::new("payloads.writers.begins", begins.len(), sample_requests);
-            order.sizes().into_iter().chain([begins])
-        };
-        let earlier = |earlier: &UnannouncedSamples| {
-            let UnannouncedSamples {
-                numbers,
-                begins,
-                before: _,
-            } = earlier;
-            [
-                Size::new(
-                    "payloads.unknown_writers.numbers",
-                    numbers.len(),
-                    MAX_UNANNOUNCED,
-                ),
-                Size::new(
-                    "payloads.unknown_writers.begins",
-                    begins.len(),
-                    sample_requests,
-                ),
-            ]
-        };
-        let mut sizes = largest(writers.values().flat_map(interested));
-        sizes.extend(largest(known.values().flat_map(earlier)));
-        sizes.extend(assembly.sizes());
-        sizes.extend([
-            Size::new("payloads.writers", writers.len(), endpoints),
-            Size::new("payloads.unknown_writers", known.len(), unknown_writers),
-            Size::new("payloads.dispatches", dispatches.len(), 2 * WAITING),
-            Size::new(
-                "payloads.bytes",
-                bytes + dispatch_bytes + waiting_bytes,
-                limit,
-            ),
-        ]);
-        sizes
     }
 
     /// Returns the bytes held, their cap, and the number of samples without room.
@@ -358,10 +286,7 @@ impl Payloads {
                 earlier.begins.push((id, number));
             }
         }
-        earlier.numbers.insert(number);
-        if earlier.numbers.len() > MAX_UNANNOUNCED
-            && let Some(lowest) = earlier.numbers.pop_first()
-        {
+        if let Some(lowest) = earlier.numbers.add(number) {
             let (first, _, count) = earlier.before.unwrap_or((lowest, lowest, 0));
             earlier.before = Some((first.min(lowest), lowest, count + 1));
         }
@@ -473,14 +398,14 @@ impl Payloads {
     /// Removes and returns the output queue.
     pub fn take(&mut self) -> Vec<Dispatch> {
         self.dispatch_bytes = 0;
-        std::mem::take(&mut self.dispatches)
+        self.dispatches.take()
     }
 
     /// Returns whether the output queue should be taken before further input.
     #[must_use]
-    pub const fn is_full(&self) -> bool {
+    pub fn is_full(&self) -> bool {
         let (_, limit, _) = self.assembly.size();
-        self.dispatches.len() >= WAITING / 2 || self.dispatch_bytes > limit / 4
+        self.dispatches.len() >= WaitingDispatches::CAP / 4 || self.dispatch_bytes > limit / 4
     }
 
     /// Prepares samples counted before the announcement for dispatch if they are retransmitted.
@@ -535,7 +460,9 @@ impl Payloads {
 
     fn give(&mut self, dispatches: Dispatch, bytes: usize) {
         let (used, limit, _) = self.size();
-        if self.dispatches.len() < WAITING && (bytes == 0 || used + bytes <= limit) {
+        if self.dispatches.len() < WaitingDispatches::CAP / 2
+            && (bytes == 0 || used + bytes <= limit)
+        {
             self.dispatch_bytes += bytes;
             self.dispatches.push(dispatches);
             return;
@@ -543,7 +470,6 @@ impl Payloads {
         self.refused += 1;
         if let SampleOutcome::Sample(sample) = &dispatches.outcome
             && let Some(interested) = self.writers.get(&sample.writer)
-            && self.dispatches.len() < 2 * WAITING
         {
             let (writer, number) = (sample.writer, sample.sequence_number);
             let mut missed = interested.not_captured(writer, number);

@@ -20,11 +20,13 @@ use super::measurement::Measurement;
 use super::receivers::GraphView;
 use super::route::Destination;
 use super::samples::Budget;
-use super::size::{Size, largest};
 use super::subscribers::{DeliveryQuota, RecordNovelty, Subscribers, WriterContext};
 use super::topic::TopicId;
 use super::wall_clock::WallClock;
 use super::writer::{Counted, MeasurementContext, Traits, Writer};
+use crate::bounded::{self, Bounded};
+use crate::snapshot::TableFacts;
+use crate::tables;
 pub use unknown_writers::UnknownWriters;
 
 /// An unknown writer is shown and metered after this time; announcements usually arrive within a
@@ -75,9 +77,7 @@ pub struct Measured {
 #[derive(Debug)]
 pub struct Profiler {
     writers: HashMap<Guid, Measured>,
-    unknown_writers: BTreeSet<Guid>,
-    unknown_writer_limit: usize,
-    unknown_writer_evictions: u64,
+    unknown_writers: Bounded<bounded::Counted<tables::UnknownWriters>, BTreeSet<Guid>>,
     shared: SharedBudgets,
     search_after: Timestamp,
 }
@@ -124,35 +124,13 @@ pub enum RecordOutcome {
     Counted(Counted),
 }
 
-impl Measured {
-    fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            writer,
-            subscribers,
-            topic: _,
-            first_seen: _,
-            last_seen: _,
-            metered: _,
-            sent_from: _,
-            opened: _,
-            unacknowledged: _,
-            sure_from: _,
-        } = self;
-        let subscribers = subscribers.iter().flat_map(|each| each.sizes());
-        writer.sizes().chain(subscribers)
-    }
-}
-
 impl Profiler {
     /// Creates a profiler without writers.
     #[must_use]
     pub fn new(unknown_writer_limit: usize, sample_bytes: usize, deliveries: usize) -> Self {
         Self {
             writers: HashMap::new(),
-            unknown_writers: BTreeSet::new(),
-            unknown_writer_limit,
-            unknown_writer_evictions: 0,
+            unknown_writers: Bounded::capped(unknown_writer_limit),
             shared: SharedBudgets {
                 budget: Budget::new(sample_bytes),
                 unknown_writers_budget: Budget::new(sample_bytes / UNKNOWN_WRITERS_SHARE),
@@ -166,50 +144,6 @@ impl Profiler {
             },
             search_after: Timestamp(0),
         }
-    }
-
-    /// Returns the size and cap of each table, in entries or bytes; for tables of writers, the
-    /// largest.
-    #[must_use]
-    pub fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            writers,
-            unknown_writers,
-            unknown_writer_limit,
-            unknown_writer_evictions: _,
-            shared,
-            search_after: _,
-        } = self;
-        let SharedBudgets {
-            budget,
-            unknown_writers_budget,
-            deliveries_budget,
-            quota,
-        } = shared;
-        let own = writers.len() - unknown_writers.len();
-        let mut sizes = vec![
-            Size::new("profiler.writers", own, endpoints),
-            Size::new(
-                "profiler.unknown_writers",
-                unknown_writers.len(),
-                *unknown_writer_limit,
-            ),
-            Size::new("profiler.samples.bytes", budget.bytes, budget.limit),
-            Size::new(
-                "profiler.unknown_writers.samples.bytes",
-                unknown_writers_budget.bytes,
-                unknown_writers_budget.limit,
-            ),
-            Size::new(
-                "profiler.deliveries.samples.bytes",
-                deliveries_budget.bytes,
-                deliveries_budget.limit,
-            ),
-            Size::new("profiler.deliveries", quota.used, quota.limit),
-        ];
-        sizes.extend(largest(writers.values().flat_map(Measured::sizes)));
-        sizes
     }
 
     /// Returns a measured writer.
@@ -249,17 +183,11 @@ impl Profiler {
         }
     }
 
-    /// Returns the number of writers with a topic, of unknown writers, the cap of unknown writers,
-    /// and those refused or dropped because of it.
+    /// Returns the number of writers with a topic, and the row of the metrics for unknown writers.
     #[must_use]
-    pub fn size(&self) -> (usize, usize, usize, u64) {
+    pub fn size(&self) -> (usize, TableFacts) {
         let known = self.writers.len() - self.unknown_writers.len();
-        (
-            known,
-            self.unknown_writers.len(),
-            self.unknown_writer_limit,
-            self.unknown_writer_evictions,
-        )
+        (known, self.unknown_writers.facts())
     }
 
     /// Returns the memory budgets for fragmented samples: for writers with a topic, unknown

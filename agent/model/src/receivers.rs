@@ -22,16 +22,16 @@ pub use matched::{Matched, MatchedReaders};
 
 use super::discovery::Discovery;
 use super::route::{Destination, Route};
-use super::size::Size;
 use super::sockets::SocketFacts;
 use super::sockets::Sockets;
 use super::topic::Topics;
 use super::wall_clock::WallClock;
+use crate::bounded::{Bounded, Counted};
+use crate::snapshot::TableFacts;
+use crate::tables::{
+    ClosedSockets, LocalParticipants, ParticipantsHere, SocketOwners, SocketProcesses, UsedSockets,
+};
 
-/// Largest number of participants remembered per socket or process.
-const MAX_CANDIDATES: usize = 8;
-/// Largest number of closed sockets remembered, for deliveries that still refer to them.
-const CLOSED: usize = 1024;
 /// Largest number of addresses kept per participant.
 const MAX_ADDRESSES: usize = 16;
 
@@ -39,17 +39,16 @@ const MAX_ADDRESSES: usize = 16;
 #[derive(Debug)]
 pub struct Receivers {
     sockets: Sockets,
-    users: HashMap<u64, SocketUsers>,
-    processes: HashMap<u32, Candidates>,
+    users: Bounded<Counted<UsedSockets>, HashMap<u64, SocketUsers>>,
+    processes: Bounded<Counted<SocketProcesses>, HashMap<u32, Candidates>>,
     /// Participants for which a socket of this host sends; at most as old as the last
     /// [`Self::tidy`].
-    local: HashSet<GuidPrefix>,
+    local: Bounded<Counted<LocalParticipants>, HashSet<GuidPrefix>>,
     /// Participants whose messages left this host, by a socket that is not seen or in shared memory.
-    here: HashSet<GuidPrefix>,
+    here: Bounded<Counted<ParticipantsHere>, HashSet<GuidPrefix>>,
     addresses: AnnouncedAddresses,
-    closed: HashSet<u64>,
-    closings: VecDeque<u64>,
-    limit: usize,
+    closed: Bounded<ClosedSockets, HashSet<u64>>,
+    closings: Bounded<ClosedSockets, VecDeque<u64>>,
     generation: u64,
 }
 
@@ -78,7 +77,7 @@ struct SocketUsers {
 }
 
 #[derive(Debug, Default)]
-struct Candidates(Vec<GuidPrefix>);
+struct Candidates(Bounded<SocketOwners, VecDeque<GuidPrefix>>);
 
 impl Receivers {
     /// Creates an empty state for at most `limit` sockets and the addresses of `participants`
@@ -87,17 +86,16 @@ impl Receivers {
     pub fn new(limit: usize, participants: usize) -> Self {
         Self {
             sockets: Sockets::new(limit),
-            users: HashMap::new(),
-            processes: HashMap::new(),
-            local: HashSet::new(),
-            here: HashSet::new(),
+            users: Bounded::capped(limit),
+            processes: Bounded::capped(limit),
+            local: Bounded::capped(limit * SocketOwners::CAP),
+            here: Bounded::capped(limit * SocketOwners::CAP),
             addresses: AnnouncedAddresses::new(
                 participants.saturating_mul(MAX_ADDRESSES / 2),
                 MAX_ADDRESSES,
             ),
-            closed: HashSet::new(),
-            closings: VecDeque::new(),
-            limit,
+            closed: Bounded::default(),
+            closings: Bounded::default(),
             generation: 1,
         }
     }
@@ -162,9 +160,10 @@ impl Receivers {
             return;
         }
         if let (Some(process), Some(users)) = (process, self.users.get(&cookie))
-            && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+            && let Some(known) = self
+                .processes
+                .get_or_insert_with(process, Candidates::default)
         {
-            let known = self.processes.entry(process).or_default();
             let senders = users.senders.0.iter();
             senders.for_each(|owner| known.add(*owner));
         }
@@ -181,12 +180,9 @@ impl Receivers {
     pub fn socket_closed(&mut self, cookie: u64) {
         self.sockets.remove(cookie);
         self.users.remove(&cookie);
-        if self.closings.len() >= CLOSED
-            && let Some(oldest) = self.closings.pop_front()
-        {
+        if let Some(oldest) = self.closings.push_back(cookie) {
             self.closed.remove(&oldest);
         }
-        self.closings.push_back(cookie);
         self.closed.insert(cookie);
         self.generation += 1;
     }
@@ -211,11 +207,7 @@ impl Receivers {
     /// Records that a message of this participant left this host, by a socket that is not seen or
     /// in shared memory. Returns whether there was room.
     pub fn found_here(&mut self, prefix: GuidPrefix) -> bool {
-        let is_kept = self.here.len() < self.limit * MAX_CANDIDATES;
-        if is_kept {
-            self.here.insert(prefix);
-        }
-        is_kept || self.here.contains(&prefix)
+        self.here.insert(prefix) || self.here.contains(&prefix)
     }
 
     /// Learns the owner of a socket from a record. Returns whether a socket of this host sent it,
@@ -245,23 +237,25 @@ impl Receivers {
         if list.is_some_and(|list| list.0.contains(&owner)) {
             return is_sent && known.is_some_and(|known| !known.is_crowded);
         }
-        if known.is_none() && self.users.len() >= self.limit {
+        let socket = record.socket;
+        let Some(known) = self.users.get_or_insert_with(socket, SocketUsers::default) else {
             return false;
-        }
-        let known = self.users.entry(record.socket).or_default();
+        };
         let mut is_local = false;
         if is_sent {
-            known.is_crowded |= known.senders.0.len() >= MAX_CANDIDATES;
+            known.is_crowded |= known.senders.0.is_full();
             known.senders.add(owner);
-            is_local = !known.is_crowded && self.local.len() < self.limit * MAX_CANDIDATES;
+            is_local = !known.is_crowded && !self.local.is_full();
             if is_local {
                 self.local.insert(owner);
             }
             let facts = self.sockets.get(record.socket);
             if let Some(process) = facts.and_then(|facts| facts.process_id)
-                && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+                && let Some(known) = self
+                    .processes
+                    .get_or_insert_with(process, Candidates::default)
             {
-                self.processes.entry(process).or_default().add(owner);
+                known.add(owner);
             }
         } else {
             known.addressed.add(owner);
@@ -272,20 +266,19 @@ impl Receivers {
 
     /// Records that this participant owns a socket of this host.
     pub fn sends(&mut self, socket: u64, owner: GuidPrefix) {
-        let is_known = self.users.contains_key(&socket);
-        if !is_known && self.users.len() >= self.limit {
+        let Some(known) = self.users.get_or_insert_with(socket, SocketUsers::default) else {
             return;
-        }
-        let known = self.users.entry(socket).or_default();
-        known.senders = Candidates(vec![owner]);
-        if self.local.len() < self.limit * MAX_CANDIDATES {
-            self.local.insert(owner);
-        }
+        };
+        known.senders = Candidates::default();
+        known.senders.add(owner);
+        self.local.insert(owner);
         let facts = self.sockets.get(socket);
         if let Some(process) = facts.and_then(|facts| facts.process_id)
-            && (self.processes.len() < self.limit || self.processes.contains_key(&process))
+            && let Some(known) = self
+                .processes
+                .get_or_insert_with(process, Candidates::default)
         {
-            self.processes.entry(process).or_default().add(owner);
+            known.add(owner);
         }
         self.generation += 1;
     }
@@ -308,52 +301,10 @@ impl Receivers {
         }
     }
 
-    /// Returns the number of addresses, their cap, and those dropped because of it.
+    /// Returns the rows of the metrics: sockets and addresses.
     #[must_use]
-    pub fn addresses(&self) -> (usize, usize, u64) {
-        self.addresses.size()
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            sockets,
-            users,
-            processes,
-            local,
-            here,
-            addresses,
-            closed,
-            closings,
-            limit,
-            generation: _,
-        } = self;
-        let candidates = |Candidates(candidates): &Candidates| candidates.len();
-        let learned_owners = users.values().map(|users| {
-            let SocketUsers {
-                senders,
-                addressed,
-                is_crowded: _,
-            } = users;
-            candidates(senders).max(candidates(addressed))
-        });
-        let of_one = learned_owners
-            .chain(processes.values().map(candidates))
-            .max();
-        let mut sizes = Vec::from(sockets.sizes());
-        sizes.extend(addresses.sizes());
-        sizes.extend([
-            Size::new("receivers.users", users.len(), *limit),
-            Size::new("receivers.processes", processes.len(), *limit),
-            Size::new("receivers.local", local.len(), *limit * MAX_CANDIDATES),
-            Size::new("receivers.here", here.len(), *limit * MAX_CANDIDATES),
-            Size::new("receivers.owners", of_one.unwrap_or(0), MAX_CANDIDATES),
-            Size::new("receivers.closed", closed.len(), CLOSED),
-            Size::new("receivers.closings", closings.len(), CLOSED),
-        ]);
-        sizes
+    pub fn tables(&self) -> [TableFacts; 2] {
+        [self.sockets.table(), self.addresses.table()]
     }
 
     /// Removes the evidence of participants that are gone and do not wait for an entry.
@@ -373,9 +324,10 @@ impl Receivers {
         self.processes
             .retain(|_, candidates| !candidates.0.is_empty());
         let sockets = self.users.values().filter(|users| !users.is_crowded);
-        self.local = sockets
-            .flat_map(|users| users.senders.0.iter().copied())
-            .collect();
+        self.local.clear();
+        for owner in sockets.flat_map(|users| users.senders.0.iter()) {
+            self.local.insert(*owner);
+        }
     }
 
     /// Returns the participant that receives on this route.
@@ -456,12 +408,8 @@ fn announced_in(process: u32, discovery: &Discovery) -> Option<GuidPrefix> {
 
 impl Candidates {
     fn add(&mut self, owner: GuidPrefix) {
-        if self.0.contains(&owner) {
-            return;
+        if !self.0.contains(&owner) {
+            self.0.push_back(owner);
         }
-        if self.0.len() >= MAX_CANDIDATES {
-            self.0.remove(0);
-        }
-        self.0.push(owner);
     }
 }

@@ -11,7 +11,6 @@ use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
 use super::samples::{Budget, Facts, Progress, Samples};
 use super::sequence::{Arrival, REACH, RepairMode, RunMembership, Sequence, Settled};
-use super::size::Size;
 
 /// A fragment that completes its sample this long after the sample's last fragment was
 /// retransmitted.
@@ -79,13 +78,6 @@ pub enum Decision {
 }
 
 impl Reception {
-    /// Returns the size and cap of each list, in entries or bytes.
-    pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self { sequence, samples } = self;
-        sequence.sizes().into_iter().chain(samples.sizes())
-    }
-
     /// Returns the sequence numbers.
     #[must_use]
     pub const fn sequence(&self) -> &Sequence {

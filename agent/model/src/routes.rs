@@ -11,19 +11,16 @@ use ros2probe_wire::{GuidPrefix, SequenceNumber, Timestamp};
 use super::receivers::{Matched, MatchedReaders};
 use super::route::Direction;
 use super::route::{Destination, Route};
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{DepartureTimes, WriterRoutes};
 
-/// Largest number of routes per writer.
-const LIMIT: usize = 512;
-/// Number of times at which the last departed number is remembered.
-const DEPARTURE_TIMES: usize = 24;
 /// Interval of these times.
 const DEPARTURE_INTERVAL: Duration = Duration::from_secs(1);
 
 /// All routes of one writer, sorted.
 #[derive(Debug, Default)]
 pub struct Routes {
-    routes: Vec<KnownRoute>,
+    routes: Bounded<WriterRoutes, Vec<KnownRoute>>,
     /// Index of the route used last.
     last: usize,
     /// Routes dropped because of the cap.
@@ -55,42 +52,10 @@ pub struct KnownRoute {
     /// Whether samples, rather than only control messages, have used it.
     pub has_data: bool,
     /// Highest number that had left, at each remembered time.
-    left: VecDeque<(Timestamp, SequenceNumber)>,
+    left: Bounded<DepartureTimes, VecDeque<(Timestamp, SequenceNumber)>>,
 }
 
 impl Routes {
-    /// Returns the length and cap of each list.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            routes,
-            last: _,
-            evictions: _,
-        } = self;
-        let left = |known: &KnownRoute| {
-            let KnownRoute {
-                route: _,
-                owner: _,
-                directed_to: _,
-                matched: _,
-                is_shared: _,
-                delivery: _,
-                last_seen: _,
-                brought: _,
-                at_socket: _,
-                has_data: _,
-                left,
-            } = known;
-            left.len()
-        };
-        let left = routes.iter().map(left).max().unwrap_or(0);
-        [
-            Size::new("routes.routes", routes.len(), LIMIT),
-            Size::new("routes.left", left, DEPARTURE_TIMES),
-        ]
-    }
-
     /// Returns all routes.
     pub fn iter(&self) -> impl Iterator<Item = &KnownRoute> {
         self.routes.iter()
@@ -144,11 +109,12 @@ impl Routes {
             self.last = index;
             return index;
         }
-        if self.routes.len() >= LIMIT {
+        if self.routes.is_full() {
             let silent = self.routes.iter().enumerate();
             let oldest = silent.min_by_key(|(_, known)| known.last_seen);
             if let Some(index) = oldest.map(|(index, _)| index) {
                 self.routes.remove(index);
+                self.routes.refuse();
                 self.evictions += 1;
             }
         }
@@ -163,7 +129,7 @@ impl Routes {
             brought: 0,
             at_socket: false,
             has_data: false,
-            left: VecDeque::new(),
+            left: Bounded::default(),
         };
         known.resolve(readers);
         let index = self.routes.partition_point(|known| known.route < route);
@@ -240,9 +206,6 @@ impl KnownRoute {
             .back()
             .is_none_or(|(at, last)| *last != number && *at + DEPARTURE_INTERVAL <= now);
         if is_due {
-            if self.left.len() >= DEPARTURE_TIMES {
-                self.left.pop_front();
-            }
             self.left.push_back((now, number));
         }
     }
@@ -279,13 +242,13 @@ mod tests {
             brought: 0,
             at_socket: true,
             has_data: true,
-            left: VecDeque::new(),
+            left: Bounded::default(),
         };
         let at = |tenths: u64| Timestamp((1000 + tenths) * SECOND / 10);
         (0..1000).for_each(|tenths| known.mark(SequenceNumber(tenths * 3), at(tenths)));
         assert_eq!(known.left_by(at(500)), None);
         assert_eq!(known.left_by(at(905)), Some(SequenceNumber(2700)));
         assert_eq!(known.left_by(at(2000)), Some(SequenceNumber(2970)));
-        assert!(known.left.len() <= DEPARTURE_TIMES);
+        assert!(known.left.len() <= DepartureTimes::CAP);
     }
 }

@@ -12,12 +12,19 @@ use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::measurement::SampledFacts;
 use super::sequence::{MAX_WINDOW, Run, RunMembership, Sequence};
-use super::size::Size;
 
 /// A writer that was not seen in shared memory for this long is no longer sampled.
 const SAMPLED_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time that an unseen sample may take to arrive by another transport before it is skipped.
 const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
+/// Probability that a silence is claimed while messages are sent.
+const FALSE_SILENCE: f64 = 1e-6;
+/// Messages that are presumed before the first one is seen, and the share of them that polling
+/// missed: it misses nine of ten large ones on a busy machine.
+const PRESUMED: f64 = 2.0;
+const PRESUMED_MISSED: f64 = 0.9;
+/// Share of the newest interval in the mean one.
+const NEWEST: f64 = 0.125;
 /// Numbers below the next one that are tracked individually.
 const WINDOW: u64 = u128::BITS as u64;
 
@@ -31,6 +38,8 @@ pub struct Sampled {
     span: u64,
     seen: u64,
     uncertain: u64,
+    /// Mean time between messages of late, in seconds.
+    interval: Option<f64>,
     /// Messages known from HEARTBEATs and ACKNACKs whose size is not known yet.
     unmeasured: u64,
     /// Bit `i`: the number `i + 1` below the next one was seen or need not be.
@@ -90,6 +99,7 @@ impl Sampled {
             span: 0,
             seen: 0,
             uncertain: 0,
+            interval: None,
             unmeasured: 0,
             sighted: u128::MAX,
             finished: u128::MAX,
@@ -100,29 +110,6 @@ impl Sampled {
             arrived: None,
             head: None,
         }
-    }
-
-    /// Returns the length and cap of its list, which is taken after each record.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            last: _,
-            left: _,
-            span: _,
-            seen: _,
-            uncertain: _,
-            unmeasured: _,
-            sighted: _,
-            finished: _,
-            next: _,
-            settled: _,
-            last_settled: _,
-            unseen,
-            arrived: _,
-            head: _,
-        } = self;
-        [Size::new("sampled.unseen", unseen.len(), 0)]
     }
 
     /// Records that the writer was seen in shared memory.
@@ -219,6 +206,44 @@ impl Sampled {
     /// Records a polling gap in which samples may have been missed.
     pub const fn uncertain(&mut self) {
         self.uncertain += 1;
+    }
+
+    /// Records that `samples` were sent after `since`.
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "counts of samples are far below 2^52"
+    )]
+    pub fn pace(&mut self, samples: u64, since: Timestamp, now: Timestamp) {
+        if samples > 0 && since != Timestamp(0) {
+            let newest = (now - since).as_secs_f64() / samples as f64;
+            let mean = self.interval.unwrap_or(newest);
+            self.interval = Some(mean + NEWEST * (newest - mean));
+        }
+    }
+
+    /// Returns how long the writer may seem silent while it sends: the time of so many messages in
+    /// a row that polling would hardly miss them all. Until two messages are known, they are assumed
+    /// to come at intervals of `slowest`. Zero after [`Self::end`].
+    #[must_use]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "counts of samples are far below 2^52"
+    )]
+    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+        if self.last == Timestamp(0) {
+            return Duration::ZERO;
+        }
+        let interval = self.interval.unwrap_or(slowest.as_secs_f64());
+        let unseen = self.span.saturating_sub(self.seen) as f64;
+        let missed = (unseen + PRESUMED * PRESUMED_MISSED) / (self.span as f64 + PRESUMED);
+        let messages = FALSE_SILENCE.ln() / missed.ln();
+        Duration::try_from_secs_f64(messages * interval).unwrap_or(Duration::MAX)
+    }
+
+    /// As [`Self::seeming_silence`], for a writer that polling has not seen yet.
+    #[must_use]
+    pub fn seeming_silence_of_unseen(slowest: Duration) -> Duration {
+        Self::new(Timestamp(1)).seeming_silence(slowest)
     }
 
     /// Returns the counts so far.

@@ -7,15 +7,13 @@
 
 use std::time::Duration;
 
+use crate::bounded::Bounded;
+use crate::tables::PartialSamples;
 use ros2probe_wire::record::DataFrag;
 use ros2probe_wire::{RtpsTime, SequenceNumber, Timestamp};
 
-use super::size::Size;
-
 /// Largest number of fragments per sample: 88 MB of Cyclone DDS, 4 GB of Fast DDS.
 pub const MAX_FRAGMENTS: u32 = 65_536;
-/// Largest number of unfinished samples per writer.
-const MAX_PER_WRITER: usize = 16;
 
 /// Memory budget for the bitmaps of all writers, and its evictions.
 #[derive(Clone, Copy, Debug)]
@@ -49,7 +47,7 @@ impl Budget {
 /// The unfinished samples of one writer.
 #[derive(Debug, Default)]
 pub struct Samples {
-    partial: Vec<Partial>,
+    partial: Bounded<PartialSamples, Vec<Partial>>,
     /// Time from which samples have all fragments captured; earlier ones may lack some.
     sure_from: Timestamp,
     /// The last sample that began before that time.
@@ -101,40 +99,6 @@ pub enum Progress {
 }
 
 impl Samples {
-    /// Returns the number of samples and the bytes of the largest bitmap, with their caps. The sum
-    /// over all writers is in the [`Budget`].
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            partial,
-            sure_from: _,
-            last_uncertain: _,
-        } = self;
-        let bitmap = |partial: &Partial| {
-            let Partial {
-                number: _,
-                size: _,
-                fragment_size: _,
-                seen: _,
-                bitmap,
-                tail: _,
-                latest: _,
-                facts: _,
-            } = partial;
-            bitmap.len() * 8
-        };
-        let largest = partial.iter().map(bitmap).max().unwrap_or(0);
-        [
-            Size::new("samples.partial", partial.len(), MAX_PER_WRITER),
-            Size::new(
-                "samples.partial.bitmap",
-                largest,
-                MAX_FRAGMENTS as usize / 8,
-            ),
-        ]
-    }
-
     /// Processes a DATA_FRAG.
     pub fn fragment(
         &mut self,
@@ -279,7 +243,8 @@ impl Samples {
 
     fn open(&mut self, fragments: DataFrag<'_>, now: Timestamp, budget: &mut Budget) -> usize {
         let number = fragments.sequence_number();
-        if self.partial.len() >= MAX_PER_WRITER {
+        if self.partial.is_full() {
+            self.partial.refuse();
             self.evict(number, budget);
         }
         budget.samples += 1;
@@ -478,7 +443,7 @@ mod tests {
             let last = fragment(number, 65_000, 1, 65_000 * 1344);
             put(&mut samples, &last, number, &mut budget);
         }
-        assert!(budget.bytes <= budget.limit && samples.partial.len() <= MAX_PER_WRITER);
+        assert!(budget.bytes <= budget.limit && samples.partial.len() <= PartialSamples::CAP);
         assert!(budget.evictions > 9000);
     }
 

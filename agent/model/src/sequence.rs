@@ -17,7 +17,8 @@ use std::time::Duration;
 
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
-use super::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{Checkpoints, SequenceGaps};
 use bitmap::Bitmap;
 pub use unconfirmed::Run;
 use unconfirmed::{CONFIRMATIONS, UnconfirmedRun};
@@ -37,8 +38,6 @@ pub const REACH: u64 = 64;
 /// even if their ACKNACK was not seen: readers wait 5 ms (Fast DDS) to 100 ms (Cyclone DDS) before
 /// they answer a HEARTBEAT.
 const REORDERING: Duration = Duration::from_millis(5);
-/// Number of gaps remembered, to distinguish reordering from retransmission.
-const GAPS: usize = 32;
 /// A lower number with a source time later by this much begins a new incarnation of the writer.
 const INCARNATION: Duration = Duration::from_millis(100);
 /// This many consecutive samples below the window also begin a new incarnation, whatever their
@@ -46,10 +45,6 @@ const INCARNATION: Duration = Duration::from_millis(100);
 const STALE: u32 = 1024;
 /// Number of steps per window in which settling advances.
 const STEPS: u32 = 16;
-/// Largest number of checkpoints: two windows of different lengths, and one that is held.
-const CHECKPOINTS: usize = 3 * STEPS as usize;
-/// Words of a bitmap.
-const WORDS: usize = MAX_WINDOW as usize / 64;
 
 /// State of one writer's sequence numbers.
 #[derive(Debug, Default)]
@@ -73,8 +68,8 @@ pub struct Sequence {
     received: Bitmap,
     excused: Bitmap,
     /// `next` at some times, oldest first.
-    checkpoints: VecDeque<(Timestamp, SequenceNumber)>,
-    gaps: VecDeque<Gap>,
+    checkpoints: Bounded<Checkpoints, VecDeque<(Timestamp, SequenceNumber)>>,
+    gaps: Bounded<SequenceGaps, VecDeque<Gap>>,
     newest_source: Timestamp,
     /// The number with the newest source time.
     newest: SequenceNumber,
@@ -150,45 +145,6 @@ pub enum Settled {
 }
 
 impl Sequence {
-    /// Returns the size and cap of each list, in entries or bytes.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 5] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            first: _,
-            settled: _,
-            next: _,
-            available: _,
-            withdrawn: _,
-            acknowledged: _,
-            complete: _,
-            incarnation: _,
-            received,
-            excused,
-            checkpoints,
-            gaps,
-            newest_source: _,
-            newest: _,
-            older: _,
-            stale: _,
-            last_advance: _,
-            followed: _,
-            unconfirmed,
-            jumps: _,
-        } = self;
-        let length = |Bitmap { words }: &Bitmap| words.len();
-        let unconfirmed = unconfirmed
-            .as_ref()
-            .map_or(0, |unconfirmed| unconfirmed.len());
-        [
-            Size::new("sequence.received", length(received), WORDS),
-            Size::new("sequence.excused", length(excused), WORDS),
-            Size::new("sequence.checkpoints", checkpoints.len(), CHECKPOINTS),
-            Size::new("sequence.gaps", gaps.len(), GAPS),
-            Size::new("sequence.unconfirmed", unconfirmed, UnconfirmedRun::CAP),
-        ]
-    }
-
     /// Returns whether any sample was seen.
     #[must_use]
     pub const fn started(&self) -> bool {
@@ -487,9 +443,6 @@ impl Sequence {
     }
 
     fn note_gap(&mut self, start: SequenceNumber, end: SequenceNumber, now: Timestamp) {
-        if self.gaps.len() >= GAPS {
-            self.gaps.pop_front();
-        }
         self.gaps.push_back(Gap {
             start,
             end,

@@ -24,24 +24,17 @@ use ros2probe_wire::rtps::{RequestHeader, VendorId};
 use ros2probe_wire::walk::Found;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, Record, SequenceNumber, Timestamp, WireError};
 
+use crate::bounded::{Bounded, Counted, Sum};
 use crate::diagnosis::TopicKey;
 use crate::names::TopicName;
 use crate::naming::Naming;
 use crate::profiler::UNDELIVERED;
-use crate::size::Size;
-use crate::snapshot::{ActionFacts, ServiceFacts};
+use crate::snapshot::{ActionFacts, ServiceFacts, TableFacts};
+use crate::tables::{CallIdentities, OpenCalls, ServiceFigures, ServiceWriters};
 use crate::topic_kind::TopicKind;
 use action::Action;
 use service::{CallId, Position, Service, Sighting};
 
-/// Largest number of writers of requests and replies that are captured.
-pub const MAX_WRITERS: usize = 4096;
-/// Largest number of services, and of actions, with figures.
-const MAX_SERVICES: usize = 512;
-/// Largest number of calls without a reply, of all services.
-const MAX_CALLS: usize = 4096;
-/// Largest number of messages whose identity is remembered, for further copies of them.
-const MAX_IDENTITIES: usize = 4096;
 /// Bytes per second of one writer above which it is not captured for a while.
 const MAX_BYTES_PER_SECOND: usize = 4 << 20;
 /// Time for which such a writer is not captured.
@@ -53,13 +46,12 @@ type Key = (DomainId, TopicName);
 /// All services with calls.
 #[derive(Debug, Default)]
 pub struct Services {
-    writers: HashMap<Guid, ServiceWriter>,
+    writers: Bounded<ServiceWriters, HashMap<Guid, ServiceWriter>>,
     identities: Identities,
-    services: BTreeMap<Key, Service>,
-    actions: BTreeMap<Key, Action>,
+    services: Bounded<ServiceFigures, BTreeMap<Key, Service>>,
+    actions: Bounded<ServiceFigures, BTreeMap<Key, Action>>,
     /// Calls without a reply, of all services.
-    open: usize,
-    evictions: u64,
+    open: Sum<Counted<OpenCalls>>,
     revision: u64,
     /// Whether a topic of a service is or was measured.
     has_measured: bool,
@@ -93,8 +85,8 @@ struct ServiceName {
 /// The identities of the latest requests and replies.
 #[derive(Debug, Default)]
 struct Identities {
-    known: HashMap<(Guid, SequenceNumber), Identity>,
-    order: VecDeque<(Guid, SequenceNumber)>,
+    known: Bounded<CallIdentities, HashMap<(Guid, SequenceNumber), Identity>>,
+    order: Bounded<CallIdentities, VecDeque<(Guid, SequenceNumber)>>,
 }
 
 /// What the first captured copy of a request or reply shows.
@@ -118,8 +110,9 @@ impl Services {
         if let Some(known) = self.writers.get(&guid) {
             return known.suspended.is_none();
         }
-        if self.writers.len() >= MAX_WRITERS {
-            self.evictions += 1;
+        if self.writers.is_full() {
+            self.writers.refuse();
+            self.open.refuse();
             return false;
         }
         let action = RosName::parse(&naming.name).ok();
@@ -149,7 +142,7 @@ impl Services {
         {
             let before = service.open();
             let changed = service.forget_client(guid);
-            self.open -= before - service.open();
+            self.open.sub(before - service.open());
             self.revision += u64::from(changed);
         }
     }
@@ -303,7 +296,9 @@ impl Services {
         self.actions.retain(|(domain_id, name), _| {
             is_known(*domain_id, &format!("{name}/_action/send_goal"))
         });
-        self.open = self.services.values().map(Service::open).sum();
+        self.open.clear();
+        self.open
+            .add(self.services.values().map(Service::open).sum());
         self.revision += u64::from(changed);
         let mut resumed = Vec::new();
         for (guid, writer) in &mut self.writers {
@@ -371,44 +366,13 @@ impl Services {
         self.actions.iter().map(facts).collect()
     }
 
-    /// Returns the number of open calls, their cap, and the entries of every table that were
-    /// dropped because of a cap.
+    /// Returns the row of the metrics: calls without a reply, and what was dropped because of a cap.
     #[must_use]
-    pub fn size(&self) -> (usize, usize, u64) {
-        let goals: u64 = self.actions.values().map(|action| action.evictions).sum();
-        (self.open, MAX_CALLS, self.evictions + goals)
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            writers,
-            identities,
-            services,
-            actions,
-            open: _,
-            evictions: _,
-            revision: _,
-            has_measured: _,
-        } = self;
-        let Identities { known, order } = identities;
-        let mut sizes = vec![
-            Size::new("services.writers", writers.len(), MAX_WRITERS),
-            Size::new("services.identities", known.len(), MAX_IDENTITIES),
-            Size::new("services.order", order.len(), MAX_IDENTITIES),
-            Size::new("services.services", services.len(), MAX_SERVICES),
-            Size::new("services.actions", actions.len(), MAX_SERVICES),
-        ];
-        // The empty ones list the tables of an agent without calls.
-        let (no_service, no_action) = (Service::default(), Action::default());
-        let each = services.values().chain([&no_service]);
-        let each = each.flat_map(|each| each.sizes(MAX_CALLS));
-        let actions = actions.values().chain([&no_action]);
-        let all = each.chain(actions.flat_map(Action::sizes));
-        sizes.extend(crate::size::largest(all));
-        sizes
+    pub fn table(&self) -> TableFacts {
+        let mut facts = self.open.facts();
+        let goals = self.actions.values().map(|action| action.evictions);
+        facts.evictions += goals.sum::<u64>();
+        facts
     }
 
     fn requested(
@@ -421,15 +385,18 @@ impl Services {
         if !self.services.contains_key(&name.key) && !self.has_place(sighting.at) {
             return;
         }
-        let service = self.services.entry(name.key.clone()).or_default();
+        let key = name.key.clone();
+        let Some(service) = self.services.get_or_insert_with(key, Service::default) else {
+            return;
+        };
         let goal = identity.goal.filter(|_| name.action.is_some());
         if !service.request(identity.call, writer, sighting, goal) {
             return;
         }
-        self.open += 1;
-        if self.open > MAX_CALLS {
-            self.evictions += 1;
-            self.open -= usize::from(service.forget_one());
+        self.open.add(1);
+        if self.open.is_exceeded() {
+            self.open.refuse();
+            self.open.sub(service.forget_one().into());
             self.revision += 1;
         }
     }
@@ -448,19 +415,22 @@ impl Services {
         let Some(answered) = service.reply(identity.call, writer, sample, sighting) else {
             return;
         };
-        self.open -= 1;
+        self.open.sub(1);
         self.revision += u64::from(answered.was_hanging);
         let (Some((key, part)), Some(goal)) = (&name.action, answered.goal) else {
             return;
         };
-        if !self.actions.contains_key(key) && self.actions.len() >= MAX_SERVICES {
-            self.evictions += 1;
+        if !self.actions.contains_key(key) && self.actions.is_full() {
+            self.actions.refuse();
+            self.open.refuse();
             return;
         }
         match part {
             ActionPart::SendGoal => {
-                let action = self.actions.entry(key.clone()).or_default();
-                action.replied(goal, answered.sent, identity.first != 0);
+                let key = key.clone();
+                if let Some(action) = self.actions.get_or_insert_with(key, Action::default) {
+                    action.replied(goal, answered.sent, identity.first != 0);
+                }
             }
             ActionPart::GetResult => {
                 if let Some(action) = self.actions.get_mut(key) {
@@ -474,10 +444,11 @@ impl Services {
     /// Returns whether one more service has room: if necessary, the one with the oldest request
     /// and without open calls is dropped.
     fn has_place(&mut self, at: Timestamp) -> bool {
-        if self.services.len() < MAX_SERVICES {
+        if !self.services.is_full() {
             return true;
         }
-        self.evictions += 1;
+        self.services.refuse();
+        self.open.refuse();
         let idle = self.services.iter().filter(|(_, it)| it.open() == 0);
         let oldest = idle.min_by_key(|(_, service)| service.last_request);
         let oldest = oldest.filter(|(_, service)| service.last_request < at);
@@ -487,13 +458,16 @@ impl Services {
 
     /// Drops the open calls of a service, since one of its writers is no longer captured.
     fn suspend(&mut self, key: &Key, until: Timestamp, at: Timestamp) {
-        self.evictions += 1;
+        self.open.refuse();
         if !self.services.contains_key(key) && !self.has_place(at) {
             return;
         }
-        let service = self.services.entry(key.clone()).or_default();
+        let key = key.clone();
+        let Some(service) = self.services.get_or_insert_with(key, Service::default) else {
+            return;
+        };
         service.suspended = Some(until);
-        self.open -= service.open();
+        self.open.sub(service.open());
         self.revision += u64::from(service.forget_calls());
     }
 }
@@ -512,15 +486,12 @@ impl ServiceWriter {
 
 impl Identities {
     fn put(&mut self, message: (Guid, SequenceNumber), identity: Identity) {
-        if self.known.insert(message, identity).is_some() {
-            return;
-        }
-        self.order.push_back(message);
-        if self.order.len() > MAX_IDENTITIES
-            && let Some(oldest) = self.order.pop_front()
+        if !self.known.contains_key(&message)
+            && let Some(oldest) = self.order.push_back(message)
         {
             self.known.remove(&oldest);
         }
+        self.known.insert(message, identity);
     }
 }
 

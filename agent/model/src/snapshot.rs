@@ -391,6 +391,8 @@ pub struct TableFacts {
     pub size: u64,
     /// Cap.
     pub limit: u64,
+    /// Bytes and their cap, of a table with both.
+    pub bytes: Option<(u64, u64)>,
     /// Entries dropped because of the cap.
     pub evictions: u64,
 }

@@ -4,10 +4,11 @@
 //! The capture side reads these facts from the kernel. The table is bounded: when it is full, a new
 //! socket is refused and counted, because existing ones already identify receivers.
 
+use crate::bounded::{Bounded, Counted};
+use crate::snapshot::TableFacts;
+use crate::tables::KnownSockets;
 use std::collections::BTreeMap;
 use std::sync::Arc;
-
-use super::size::Size;
 
 /// Facts about one socket from outside the packets.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -30,46 +31,24 @@ pub struct SocketFacts {
 /// All known sockets.
 #[derive(Debug)]
 pub struct Sockets {
-    sockets: BTreeMap<u64, SocketFacts>,
-    limit: usize,
-    evictions: u64,
+    sockets: Bounded<Counted<KnownSockets>, BTreeMap<u64, SocketFacts>>,
 }
 
 impl Sockets {
     /// Creates an empty table for at most `limit` sockets.
     #[must_use]
-    pub const fn new(limit: usize) -> Self {
+    pub fn new(limit: usize) -> Self {
         Self {
-            sockets: BTreeMap::new(),
-            limit,
-            evictions: 0,
+            sockets: Bounded::capped(limit),
         }
-    }
-
-    /// Returns the number of sockets and its cap.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            sockets,
-            limit,
-            evictions: _,
-        } = self;
-        [Size::new("receivers.sockets", sockets.len(), *limit)]
     }
 
     /// Records facts about a socket. Returns whether they are new.
     pub fn put(&mut self, facts: SocketFacts) -> bool {
-        let known = self.sockets.get(&facts.cookie);
-        if known == Some(&facts) {
+        if self.sockets.get(&facts.cookie) == Some(&facts) {
             return false;
         }
-        if known.is_none() && self.sockets.len() >= self.limit {
-            self.evictions += 1;
-            return false;
-        }
-        self.sockets.insert(facts.cookie, facts);
-        true
+        self.sockets.insert(facts.cookie, facts).is_none()
     }
 
     /// Removes a closed socket. Returns whether it was known.
@@ -79,7 +58,7 @@ impl Sockets {
 
     /// Removes a socket that may be open, because the kernel's table dropped it.
     pub fn forget(&mut self, cookie: u64) {
-        self.evictions += 1;
+        self.sockets.refuse();
         self.remove(cookie);
     }
 
@@ -94,16 +73,20 @@ impl Sockets {
         self.sockets.values()
     }
 
-    /// Returns the number of sockets, its cap, and those refused or dropped because of a cap.
-    #[must_use]
-    pub fn size(&self) -> (usize, usize, u64) {
-        (self.sockets.len(), self.limit, self.evictions)
+    /// Returns the row of the metrics.
+    pub fn table(&self) -> TableFacts {
+        self.sockets.facts()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn size(sockets: &Sockets) -> (u64, u64, u64) {
+        let facts = sockets.table();
+        (facts.size, facts.limit, facts.evictions)
+    }
 
     #[test]
     fn a_full_table_keeps_whom_it_knows() {
@@ -117,9 +100,9 @@ mod tests {
         assert!(!sockets.put(socket(3, 0)) && !sockets.put(socket(2, 0)));
         assert!(sockets.put(socket(2, 7)));
         assert_eq!(sockets.get(2).map(|each| each.unidentified_drops), Some(7));
-        assert_eq!((sockets.get(3), sockets.size()), (None, (2, 2, 1)));
+        assert_eq!((sockets.get(3), size(&sockets)), (None, (2, 2, 1)));
         assert!(sockets.remove(1) && sockets.put(socket(3, 0)));
         sockets.forget(3);
-        assert_eq!((sockets.get(3), sockets.size()), (None, (1, 2, 2)));
+        assert_eq!((sockets.get(3), size(&sockets)), (None, (1, 2, 2)));
     }
 }

@@ -35,7 +35,6 @@ use super::reception::CompleteSample;
 use super::route::{Destination, Route};
 use super::routes::Routes;
 use super::samples::Budget;
-use super::size::Size;
 use super::snapshot::AcknowledgementFacts;
 use super::topic::{Topic, TopicId};
 
@@ -114,29 +113,6 @@ pub struct WriterContext<'a> {
 }
 
 impl Subscribers {
-    /// Returns the size and cap of each list, in entries or bytes, for one delivery after the
-    /// other. The number of deliveries is in [`DeliveryQuota`].
-    pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            routes,
-            deliveries,
-            open: _,
-            totals: _,
-            departures,
-            acknowledgements,
-            reassembled: _,
-            at_socket: _,
-            has_readers: _,
-            departed: _,
-            generation: _,
-            sure_from: _,
-        } = self;
-        let own = routes.sizes().into_iter().chain(departures.sizes());
-        let own = own.chain(acknowledgements.sizes());
-        own.chain(deliveries.iter().flat_map(Delivery::sizes))
-    }
-
     /// Creates an empty state for a writer that the kernel meters from `sure_from` on.
     #[must_use]
     pub fn new(sure_from: Timestamp) -> Self {

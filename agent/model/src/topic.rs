@@ -17,7 +17,6 @@ use super::measurement::Measurement;
 use super::names::{DdsName, TypeName};
 use super::naming::Naming;
 use super::selection::{RequestIds, SampleRequest};
-use super::size::Size;
 use crate::watch::Watchlist;
 
 /// Handle of a topic.
@@ -170,59 +169,6 @@ impl Topics {
     #[must_use]
     pub fn ids(&self) -> Vec<TopicId> {
         self.index.values().copied().collect()
-    }
-
-    /// Returns the size and cap of each table; there are at most as many topics as endpoints.
-    #[must_use]
-    pub fn sizes(&self, endpoints: usize, measured: usize, watches: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            topics,
-            index,
-            vanished,
-            vanished_watched,
-            yielding,
-            created: _,
-            watched,
-            rejected: _,
-            evictions: _,
-        } = self;
-        let lists = |topic: &Topic| {
-            let Topic {
-                domain_id: _,
-                naming: _,
-                writers,
-                readers,
-                buffer_endpoints,
-                last_type: _,
-                watched: _,
-                judgements,
-                requested: _,
-                retired: _,
-                retired_totals: _,
-                loss: _,
-                reader_appeared: _,
-                subscribed: _,
-                published: _,
-                vanished: _,
-                is_held: _,
-            } = topic;
-            let members = writers.len() + readers.len() + buffer_endpoints.len();
-            (members, judgements.len())
-        };
-        let each = || topics.values().map(|topic| lists(topic));
-        let members = each().map(|(members, _)| members).max().unwrap_or(0);
-        let judgements = each().map(|(_, judgements)| judgements).max().unwrap_or(0);
-        vec![
-            Size::new("topic.members", members, endpoints),
-            Size::new("topic.judgements", judgements, watches),
-            Size::new("topics.topics", topics.len(), endpoints),
-            Size::new("topics.index", index.len(), endpoints),
-            Size::new("topics.vanished", vanished.len(), endpoints),
-            Size::new("topics.vanished_watched", vanished_watched.len(), measured),
-            Size::new("topics.yielding", yielding.len(), measured),
-            Size::new("topics.watched", *watched, measured),
-        ]
     }
 
     /// Returns the number of topics.

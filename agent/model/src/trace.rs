@@ -19,22 +19,14 @@ use super::identity::Identity;
 use super::names::{TopicName, TypeName};
 use super::route::Destination;
 use super::samples::{Budget, Progress, Samples};
-use super::size::{Size, largest};
+use crate::bounded::{Bounded, Counted, Sum};
+use crate::snapshot::TableFacts;
+use crate::tables::{
+    FinishedMessages, FinishedSpans, MessagesUnderWay, OpenMessages, OpenSpans, SettledReaders,
+    TracedWriters,
+};
 use share::Share;
 
-/// Largest number of writers whose messages may be traced.
-const MAX_WRITERS: usize = 4096;
-/// Largest number of open messages, of all writers and of one.
-const MAX_OPEN: usize = 4096;
-const MAX_OPEN_OF_WRITER: usize = 256;
-/// Largest number of unfinished fragmented messages per writer.
-const MAX_UNDER_WAY: usize = 16;
-/// Largest number of readers with a span per message.
-const MAX_READERS: usize = 32;
-/// Number of recent messages per writer that are remembered, to ignore duplicates.
-const REMEMBERED: usize = 128;
-/// Largest number of spans kept until they are taken.
-const MAX_FINISHED: usize = 2048;
 /// Memory for bitmaps of fragments in bytes.
 const BITMAP_BYTES: usize = 1 << 18;
 /// Acknowledgements after this time have no span.
@@ -109,7 +101,7 @@ pub struct WriterDescription {
 #[derive(Debug, Default)]
 pub struct Spans {
     /// Spans in the order in which they ended.
-    pub spans: Vec<Span>,
+    pub spans: Bounded<FinishedSpans, Vec<Span>>,
     /// Number of spans dropped because the list was full.
     pub lost: u64,
 }
@@ -120,7 +112,7 @@ pub struct Tracer {
     wanted: bool,
     directed: bool,
     /// Traced writers; `None` for a writer that is not traced.
-    writers: HashMap<Guid, Option<Box<WriterTrace>>>,
+    writers: Bounded<TracedWriters, HashMap<Guid, Option<Box<WriterTrace>>>>,
     shared: Shared,
 }
 
@@ -128,8 +120,7 @@ pub struct Tracer {
 #[derive(Debug)]
 struct Shared {
     budget: Budget,
-    open: usize,
-    evictions: u64,
+    open: Sum<Counted<OpenSpans>>,
     finished: Spans,
 }
 
@@ -144,11 +135,11 @@ struct WriterTrace {
     /// Whether it sends from this host. The kernel shows a multicast's local copies before its
     /// departure, so the first message arrives before this is known.
     is_local: bool,
-    under_way: VecDeque<Message>,
+    under_way: Bounded<MessagesUnderWay, VecDeque<Message>>,
     /// Spans of arrivals, until it is certain that they were not sent from this host.
-    arrived: VecDeque<Span>,
-    waiting: VecDeque<Unacknowledged>,
-    done: VecDeque<SequenceNumber>,
+    arrived: Bounded<OpenMessages, VecDeque<Span>>,
+    waiting: Bounded<OpenMessages, VecDeque<Unacknowledged>>,
+    done: Bounded<FinishedMessages, VecDeque<SequenceNumber>>,
 }
 
 /// A message that was sent and that some readers have not acknowledged.
@@ -156,7 +147,7 @@ struct WriterTrace {
 struct Unacknowledged {
     message: Message,
     at: Timestamp,
-    readers: Vec<Guid>,
+    readers: Bounded<SettledReaders, Vec<Guid>>,
 }
 
 /// Where a sample was seen.
@@ -178,11 +169,10 @@ impl Tracer {
         Self {
             wanted: false,
             directed,
-            writers: HashMap::new(),
+            writers: Bounded::default(),
             shared: Shared {
                 budget: Budget::new(BITMAP_BYTES),
-                open: 0,
-                evictions: 0,
+                open: Sum::default(),
                 finished: Spans::default(),
             },
         }
@@ -197,9 +187,9 @@ impl Tracer {
     /// Restarts after a change of the traced topics.
     pub fn restart(&mut self, wanted: bool) {
         self.wanted = wanted;
-        self.writers = HashMap::new();
+        self.writers.take();
         self.shared.budget = Budget::new(BITMAP_BYTES);
-        self.shared.open = 0;
+        self.shared.open.clear();
     }
 
     /// Removes a writer.
@@ -224,12 +214,11 @@ impl Tracer {
             let Some((description, share)) = about() else {
                 return;
             };
-            if self.writers.len() >= MAX_WRITERS {
-                self.shared.evictions += 1;
+            let traced = share.map(|share| WriterTrace::new(writer, description, share).into());
+            if self.writers.insert(writer, traced).is_some() {
+                self.shared.open.refuse();
                 return;
             }
-            let traced = share.map(|share| WriterTrace::new(writer, description, share).into());
-            self.writers.insert(writer, traced);
         }
         let Some(Some(traced)) = self.writers.get_mut(&writer) else {
             return;
@@ -259,7 +248,7 @@ impl Tracer {
                 && now - first.at > ACKNACK_TIMEOUT
             {
                 traced.waiting.pop_front();
-                self.shared.open = self.shared.open.saturating_sub(1);
+                self.shared.open.sub(1);
             }
         }
     }
@@ -269,37 +258,10 @@ impl Tracer {
         std::mem::take(&mut self.shared.finished)
     }
 
-    /// Returns the size and cap of each table, in entries or bytes.
+    /// Returns the row of the metrics: the open messages of all writers.
     #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            wanted: _,
-            directed: _,
-            writers,
-            shared,
-        } = self;
-        let Shared {
-            budget,
-            open,
-            evictions: _,
-            finished,
-        } = shared;
-        let Spans { spans, lost: _ } = finished;
-        let mut sizes = largest(writers.values().flatten().flat_map(|each| each.sizes()));
-        sizes.extend([
-            Size::new("trace.writers", writers.len(), MAX_WRITERS),
-            Size::new("trace.bytes", budget.bytes, budget.limit),
-            Size::new("trace.open", *open, MAX_OPEN),
-            Size::new("trace.finished", spans.len(), MAX_FINISHED),
-        ]);
-        sizes
-    }
-
-    /// Returns the number of open messages, its cap, and those dropped because of it.
-    #[must_use]
-    pub const fn size(&self) -> (usize, usize, u64) {
-        (self.shared.open, MAX_OPEN, self.shared.evictions)
+    pub fn table(&self) -> TableFacts {
+        self.shared.open.facts()
     }
 }
 
@@ -323,41 +285,6 @@ fn numbered(mut identity: Identity, sequence_number: SequenceNumber) -> u128 {
 }
 
 impl WriterTrace {
-    fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            description: _,
-            identity: _,
-            share: _,
-            samples,
-            is_local: _,
-            under_way,
-            arrived,
-            waiting,
-            done,
-        } = self;
-        let readers = |each: &Unacknowledged| {
-            let Unacknowledged {
-                message: _,
-                at: _,
-                readers,
-            } = each;
-            readers.len()
-        };
-        let of_one = waiting.iter().map(readers).max().unwrap_or(0);
-        let own = [
-            Size::new("trace.writer.under_way", under_way.len(), MAX_UNDER_WAY),
-            Size::new(
-                "trace.writer.open",
-                arrived.len() + waiting.len(),
-                MAX_OPEN_OF_WRITER,
-            ),
-            Size::new("trace.writer.done", done.len(), REMEMBERED),
-            Size::new("trace.message.readers", of_one, MAX_READERS),
-        ];
-        own.into_iter().chain(samples.sizes())
-    }
-
     fn new(writer: Guid, description: WriterDescription, share: Share) -> Self {
         Self {
             description: Arc::new(description),
@@ -365,10 +292,10 @@ impl WriterTrace {
             share,
             samples: Samples::default(),
             is_local: false,
-            under_way: VecDeque::new(),
-            arrived: VecDeque::new(),
-            waiting: VecDeque::new(),
-            done: VecDeque::new(),
+            under_way: Bounded::default(),
+            arrived: Bounded::default(),
+            waiting: Bounded::default(),
+            done: Bounded::default(),
         }
     }
 
@@ -415,16 +342,14 @@ impl WriterTrace {
             return;
         };
         message.source = source;
-        if self.done.len() >= REMEMBERED {
-            self.done.pop_front();
-        }
         self.done.push_back(number);
         self.whole(message, begin, at, shared);
     }
 
     /// Processes a message that was seen whole.
     fn whole(&mut self, message: Message, begin: Timestamp, at: Timestamp, shared: &mut Shared) {
-        if self.waiting.len() + self.arrived.len() >= MAX_OPEN_OF_WRITER {
+        if self.waiting.len() + self.arrived.len() >= OpenMessages::CAP {
+            self.waiting.refuse();
             self.arrived
                 .pop_front()
                 .map_or_else(|| drop(self.waiting.pop_front()), drop);
@@ -444,13 +369,13 @@ impl WriterTrace {
         let message = span.message.clone();
         shared.finish(span);
         if !self.description.reliable {
-            shared.open = shared.open.saturating_sub(1);
+            shared.open.sub(1);
             return;
         }
         self.waiting.push_back(Unacknowledged {
             message,
             at,
-            readers: Vec::new(),
+            readers: Bounded::default(),
         });
     }
 
@@ -460,7 +385,7 @@ impl WriterTrace {
             && now - first.end > LOCAL_COPY_DELAY
             && let Some(span) = self.arrived.pop_front()
         {
-            shared.open = shared.open.saturating_sub(1);
+            shared.open.sub(1);
             shared.finish(span);
         }
     }
@@ -469,7 +394,7 @@ impl WriterTrace {
     fn forget_arrivals(&mut self, shared: &mut Shared) {
         self.is_local = true;
         let open = self.under_way.len() + self.arrived.len();
-        shared.open = shared.open.saturating_sub(open);
+        shared.open.sub(open);
         self.under_way.clear();
         self.arrived.clear();
         self.done.clear();
@@ -478,18 +403,19 @@ impl WriterTrace {
 
     /// Adds a message, dropping another if necessary, and returns its index.
     fn begin(&mut self, message: Message, shared: &mut Shared) -> Option<usize> {
-        if self.under_way.len() >= MAX_UNDER_WAY {
+        if self.under_way.is_full() {
             self.under_way.pop_front();
+            self.under_way.refuse();
             shared.give_up();
         }
-        if shared.open >= MAX_OPEN {
+        if shared.open.is_full() {
             if self.waiting.pop_front().is_none() {
-                shared.evictions += 1;
+                shared.open.refuse();
                 return None;
             }
             shared.give_up();
         }
-        shared.open += 1;
+        shared.open.add(1);
         self.under_way.push_back(message);
         self.under_way.len().checked_sub(1)
     }
@@ -517,7 +443,7 @@ impl WriterTrace {
         let covered = |waiting: &&mut Unacknowledged| {
             waiting.message.sequence_number < acknack.base()
                 && !waiting.readers.contains(&reader)
-                && waiting.readers.len() < MAX_READERS
+                && !waiting.readers.is_full()
         };
         for waiting in self.waiting.iter_mut().filter(covered) {
             waiting.readers.push(reader);
@@ -533,7 +459,7 @@ impl WriterTrace {
     fn close(mut self, shared: &mut Shared) {
         self.release(Timestamp(u64::MAX), shared);
         let open = self.under_way.len() + self.waiting.len();
-        shared.open = shared.open.saturating_sub(open);
+        shared.open.sub(open);
         self.samples.clear(&mut shared.budget);
     }
 }
@@ -556,16 +482,12 @@ impl Place {
 
 impl Shared {
     fn finish(&mut self, span: Span) {
-        if self.finished.spans.len() < MAX_FINISHED {
-            self.finished.spans.push(span);
-        } else {
-            self.finished.lost += 1;
-        }
+        self.finished.lost += u64::from(self.finished.spans.push(span).is_some());
     }
 
     fn give_up(&mut self) {
-        self.open = self.open.saturating_sub(1);
-        self.evictions += 1;
+        self.open.sub(1);
+        self.open.refuse();
     }
 }
 

@@ -79,6 +79,20 @@ pub(super) fn may_share_memory(discovery: &Discovery, writer: Guid) -> bool {
         })
 }
 
+/// Returns whether all samples of this writer pass through Fast DDS's shared memory, which is polled:
+/// some of these readers receive there, and none on the network.
+pub(super) fn is_polled(discovery: &Discovery, writer: Guid, readers: &[Guid]) -> bool {
+    let mut is_shared = false;
+    for reader in readers.iter().take(MAX_PAIRS) {
+        match transport(discovery, writer, *reader) {
+            Some(Transport::SharedMemory) => is_shared = true,
+            Some(Transport::Network) => return false,
+            _ => {}
+        }
+    }
+    is_shared
+}
+
 /// Returns whether names are missing that shared memory may contain at present: nodes of a
 /// participant, or the node of an endpoint.
 pub(super) fn lacks_names(discovery: &Discovery, now: Timestamp) -> bool {

@@ -9,13 +9,11 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use crate::bounded::Bounded;
+use crate::tables::UndeliveredParts;
 use ros2probe_wire::record::Sample;
 use ros2probe_wire::{Record, SequenceNumber, Timestamp};
 
-use super::size::Size;
-
-/// Largest number of drops that wait for their arrival, more than the datagrams of a large sample.
-const LIMIT: usize = 4096;
 /// Largest difference between the clock conversions of the two reports.
 const SLACK: Duration = Duration::from_micros(100);
 /// Arrivals follow within this time, or their record was lost.
@@ -24,7 +22,7 @@ const LIFETIME: Duration = Duration::from_secs(60);
 /// Drops that wait for their arrival at one receiver.
 #[derive(Debug, Default)]
 pub struct Undelivered {
-    waiting: VecDeque<UndeliveredPart>,
+    waiting: Bounded<UndeliveredParts, VecDeque<UndeliveredPart>>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -39,14 +37,6 @@ struct UndeliveredPart {
 }
 
 impl Undelivered {
-    /// Returns the number of entries and its cap.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self { waiting } = self;
-        [Size::new("undelivered.waiting", waiting.len(), LIMIT)]
-    }
-
     /// Returns whether no drop waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
@@ -67,11 +57,7 @@ impl Undelivered {
             (back.end, back.last) = (end, last);
             return false;
         }
-        let is_full = self.waiting.len() >= LIMIT;
-        if is_full {
-            self.waiting.pop_front();
-        }
-        self.waiting.push_back(UndeliveredPart {
+        let evicted = self.waiting.push_back(UndeliveredPart {
             socket: record.socket,
             number: sample.sequence_number(),
             start,
@@ -79,7 +65,7 @@ impl Undelivered {
             first,
             last,
         });
-        is_full
+        evicted.is_some()
     }
 
     /// Returns the delivered parts of an arrival, in order. Adds evicted entries to `evictions`.
@@ -114,10 +100,8 @@ impl Undelivered {
             }
             each.start < each.end
         });
-        self.waiting.extend(left);
-        while self.waiting.len() > LIMIT {
-            self.waiting.pop_front();
-            *evictions += 1;
+        for part in left {
+            *evictions += u64::from(self.waiting.push_back(part).is_some());
         }
         let Sample::DataFrag(fragments) = sample else {
             return if parts.is_empty() {
@@ -138,7 +122,7 @@ impl Undelivered {
             self.waiting.pop_front();
         }
         if self.waiting.is_empty() && self.waiting.capacity() > 0 {
-            self.waiting = VecDeque::new();
+            self.waiting.take();
         }
     }
 }
@@ -287,7 +271,7 @@ mod tests {
             };
             note(&mut undelivered, &data);
         }
-        assert!(undelivered.waiting.len() <= LIMIT);
+        assert!(undelivered.waiting.len() <= UndeliveredParts::CAP);
     }
 
     #[test]
@@ -303,8 +287,7 @@ mod tests {
                 &mut evictions,
             );
         }
-        let [waiting] = undelivered.sizes();
-        assert_eq!(waiting.entries, waiting.cap);
-        assert_eq!(evictions, 20_000 - LIMIT as u64);
+        assert!(undelivered.waiting.is_full());
+        assert_eq!(evictions, 20_000 - UndeliveredParts::CAP as u64);
     }
 }

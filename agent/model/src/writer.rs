@@ -24,7 +24,6 @@ use super::reception::{Decision, Outcome, Reception};
 use super::sampled::Sampled;
 use super::samples::Budget;
 use super::sequence::{FAR, REACH};
-use super::size::Size;
 use super::wall_clock::WallClock;
 
 /// Time in which reordering may fill a gap of a best-effort writer.
@@ -138,27 +137,6 @@ impl Writer {
         }
     }
 
-    /// Returns the size and cap of each list, in entries or bytes.
-    pub fn sizes(&self) -> impl Iterator<Item = Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            guid: _,
-            traits: _,
-            reception,
-            tally: _,
-            interarrival: _,
-            source_latency: _,
-            header_latency: _,
-            last_message: _,
-            negative_latency: _,
-            implausible_latency: _,
-            sampled,
-            exact: _,
-        } = self;
-        let sampled = sampled.iter().flat_map(|sampled| sampled.sizes());
-        reception.sizes().chain(sampled)
-    }
-
     /// Updates the properties from discovery.
     pub const fn learn(&mut self, traits: Traits) {
         self.traits = traits;
@@ -254,6 +232,20 @@ impl Writer {
     #[must_use]
     pub const fn last_message(&self) -> Option<Timestamp> {
         self.last_message
+    }
+
+    /// Returns how long the writer may seem silent while it sends, as polling misses messages. Its
+    /// intervals are at most `slowest`, unless they are known.
+    #[must_use]
+    pub fn seeming_silence(&self, slowest: Duration) -> Duration {
+        let sampled = self.sampled.as_ref();
+        sampled.map_or(Duration::ZERO, |sampled| sampled.seeming_silence(slowest))
+    }
+
+    /// Returns whether no view has shown any of its samples.
+    #[must_use]
+    pub const fn is_unseen(&self) -> bool {
+        self.last_message.is_none() && self.sampled.is_none() && self.exact.is_none()
     }
 
     /// Records that samples in shared memory before `now` may have been missed.

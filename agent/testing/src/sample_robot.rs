@@ -95,7 +95,7 @@ fn chains() -> ChainsFacts {
             path,
             count: 100,
             last: traces[99][2].published,
-            traces: Arc::new(traces.into()),
+            traces: Arc::new(traces.into_iter().collect()),
             whole: histogram,
             hops,
         }],
@@ -167,7 +167,6 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
                 incomplete: 1,
             },
             unseen: [1, 0, 0, 0, 0, 0],
-            evictions: 0,
         }),
         chains: chains(),
         diagnosed: Arc::new(vec![Timestamp(5); diagnoses().list.len()]),
@@ -187,6 +186,7 @@ pub fn snapshot<'a>(names: impl IntoIterator<Item = &'a str>) -> Snapshot {
             table: "topics",
             size: 3,
             limit: 1_000,
+            bytes: Some((500, 8_000)),
             evictions: 0,
         }],
         datagrams: 100,
@@ -339,6 +339,7 @@ pub fn agent() -> AgentFacts {
         state: Some(StateFacts {
             writes: 3,
             failures: 0,
+            stalled: None,
         }),
         inside: Some(inside::source()),
         exact: vec![ExactFacts {

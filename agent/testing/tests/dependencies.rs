@@ -55,6 +55,61 @@ const NOT_IN_MODEL: &[&str] = &[
 /// Libraries that must not be in the tree of any of these crates.
 const NO_RUNTIME: &[&str] = &["axum", "hyper", "tokio", "tonic"];
 
+/// The packages that the project's owner chose: the package, the crate that depends on it, and a
+/// source of that crate with the words that use the package for its purpose.
+const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
+    (
+        "aya",
+        "ros2probe-capture",
+        "agent/capture/src/filter.rs",
+        &["use aya::{Ebpf", "EbpfLoader::new()"],
+    ),
+    (
+        "axum",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/http.rs",
+        &["use axum::Router;", "Router::new()"],
+    ),
+    (
+        "prometheus-client",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/exposition.rs",
+        &[
+            "impl Collector for",
+            "prometheus_text::encode(",
+            " text::encode(",
+        ],
+    ),
+    (
+        "tokio",
+        "ros2probe-daemon",
+        "agent/daemon/src/agent.rs",
+        &["tokio::runtime::Builder::new_"],
+    ),
+    (
+        "tracing",
+        "ros2probe-daemon",
+        "agent/daemon/src/agent.rs",
+        &["tracing::info!("],
+    ),
+    (
+        "tracing-subscriber",
+        "ros2probe-daemon",
+        "agent/daemon/src/logging.rs",
+        &["tracing_subscriber::registry()", "fmt::layer()"],
+    ),
+    // The maintained drop-in of serde_yaml, under its name.
+    (
+        "yaml_serde",
+        "ros2probe-daemon",
+        "agent/daemon/src/config/meaning.rs",
+        &["serde_yaml::from_str"],
+    ),
+];
+
+/// What the chosen packages write in place of the product's own sources.
+const WRITTEN_BY_PACKAGES: &[&str] = &["# HELP ", "# TYPE ", "# UNIT ", "# EOF"];
+
 struct Workspace {
     /// Package id by name.
     ids: BTreeMap<String, String>,
@@ -205,4 +260,56 @@ fn what_is_below_the_daemon_needs_no_runtime() {
             assert!(!tree.contains(library), "{name} must not need {library}");
         }
     }
+}
+
+#[test]
+fn each_chosen_package_is_used_for_its_purpose() {
+    let workspace = Workspace::read();
+    for (package, crate_name, source, uses) in CHOSEN {
+        let required = &workspace.required[*crate_name];
+        assert!(
+            required.contains(*package),
+            "{crate_name} must need {package}"
+        );
+        let text = read(source);
+        for phrase in *uses {
+            assert!(
+                text.contains(phrase),
+                "{source} must use {package}: {phrase}"
+            );
+        }
+    }
+    // The programs of the kernel are a workspace of their own.
+    assert!(read("agent-ebpf/Cargo.toml").contains("\naya-ebpf = "));
+    let programs = read("agent-ebpf/src/host.rs");
+    assert!(programs.contains("use aya_ebpf::{"));
+}
+
+#[test]
+fn no_source_writes_what_a_chosen_package_writes() {
+    let mut waiting = vec![ros2probe_testing::repository("agent")];
+    let mut sources = 0;
+    while let Some(path) = waiting.pop() {
+        if path.is_dir() {
+            let entries = std::fs::read_dir(&path).unwrap();
+            waiting.extend(entries.map(|entry| entry.unwrap().path()));
+        }
+        let is_product = path.components().any(|part| part.as_os_str() == "src")
+            && !path.starts_with(ros2probe_testing::repository("agent/testing"));
+        if !is_product || path.extension().is_none_or(|extension| extension != "rs") {
+            continue;
+        }
+        sources += 1;
+        let text = std::fs::read_to_string(&path).unwrap();
+        let product = text.split("#[cfg(test)]").next().unwrap_or_default();
+        for phrase in WRITTEN_BY_PACKAGES {
+            assert!(!product.contains(phrase), "{}: {phrase:?}", path.display());
+        }
+    }
+    assert!(sources > 300, "{sources} sources");
+}
+
+fn read(source: &str) -> String {
+    let path = ros2probe_testing::repository(source);
+    std::fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
 }

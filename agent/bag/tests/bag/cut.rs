@@ -9,7 +9,7 @@ use ros2probe_bag::mcap::{self as records, Opcode};
 use ros2probe_bag::read;
 use ros2probe_bag::reindex::{Found, ReindexError, reindex};
 use ros2probe_bag::{Compression, Form, Options, Storage, Writer};
-use ros2probe_wire::Timestamp;
+use ros2probe_wire::{Expansion, Timestamp};
 
 use super::{BEGIN, messages, metadata, text, topic};
 
@@ -86,7 +86,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
             fs::create_dir(&bag).unwrap();
             let file = bag.join("cut_0.mcap");
             fs::write(&file, &bytes[..length]).unwrap();
-            let report = reindex(&bag).unwrap();
+            let report = reindex(&bag, Expansion::Limited).unwrap();
             let expected: Vec<u32> = (0..60)
                 .filter(|index| ends[*index as usize] <= length as u64)
                 .collect();
@@ -127,7 +127,7 @@ fn a_file_cut_anywhere_keeps_every_whole_message() {
                 assert!(bytes[..length].ends_with(&kept), "{length}");
             }
             // A second run changes nothing.
-            let second = reindex(&bag).unwrap();
+            let second = reindex(&bag, Expansion::Limited).unwrap();
             assert_eq!(second.files[0].found, Found::Complete, "{length}");
             assert_eq!(fs::read(&file).unwrap(), again);
         }
@@ -146,7 +146,7 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
         };
         let whole = written(directory.path(), storage, Form::Compatible);
         let bytes = fs::read(&whole).unwrap();
-        let scan = read::scan(&whole, &mut |_, _| {}).unwrap();
+        let scan = read::scan(&whole, Expansion::Limited, &mut |_, _| {}).unwrap();
         assert_eq!(scan.chunks[2].compression, compression.name());
         let bag = directory.path().join("cut");
         fs::create_dir(&bag).unwrap();
@@ -154,9 +154,12 @@ fn a_compressed_chunk_that_was_cut_gives_what_can_be_decompressed() {
         // Within the third chunk: the first two are complete.
         let third = &scan.chunks[2];
         fs::write(&file, &bytes[..(third.offset + third.length - 20) as usize]).unwrap();
-        reindex(&bag).unwrap();
+        reindex(&bag, Expansion::Limited).unwrap();
         let mut found = Vec::new();
-        let again = read::scan(&file, &mut |message, _| found.push(message.data.to_vec())).unwrap();
+        let again = read::scan(&file, Expansion::Limited, &mut |message, _| {
+            found.push(message.data.to_vec());
+        })
+        .unwrap();
         let whole = scan.contents.counts.values().sum::<u64>() as usize;
         assert!((20..whole).contains(&found.len()), "{}", found.len());
         for (index, data) in found.iter().enumerate() {
@@ -174,7 +177,7 @@ fn what_the_loss_of_power_leaves_is_cut_at_the_zeros() {
         ..Storage::default()
     };
     let whole = written(directory.path(), storage, Form::Compatible);
-    let scan = read::scan(&whole, &mut |_, _| {}).unwrap();
+    let scan = read::scan(&whole, Expansion::Limited, &mut |_, _| {}).unwrap();
     let bag = directory.path().join("cut");
     fs::create_dir(&bag).unwrap();
     let end = (scan.chunks[1].offset + scan.chunks[1].length) as usize;
@@ -182,7 +185,7 @@ fn what_the_loss_of_power_leaves_is_cut_at_the_zeros() {
     bytes.resize(end + 5000, 0);
     let file = bag.join("cut_0.mcap");
     fs::write(&file, &bytes).unwrap();
-    let report = reindex(&bag).unwrap();
+    let report = reindex(&bag, Expansion::Limited).unwrap();
     let Found::Unfinished {
         cut: 0,
         kept: None,
@@ -212,7 +215,7 @@ fn metadata_is_made_anew_from_all_files_in_their_order() {
         let before = metadata(&path);
         assert!(before.files.len() > 10);
         fs::remove_file(path.join("metadata.yaml")).unwrap();
-        let report = reindex(&path).unwrap();
+        let report = reindex(&path, Expansion::Limited).unwrap();
         assert!(
             report
                 .files
@@ -233,7 +236,7 @@ fn a_file_that_is_not_mcap_is_left_alone_and_reported() {
     super::bag(&path, Options::default(), 5);
     fs::write(path.join("bag_1.mcap"), "").unwrap();
     fs::write(path.join("bag_2.mcap"), "something else").unwrap();
-    let report = reindex(&path).unwrap();
+    let report = reindex(&path, Expansion::Limited).unwrap();
     assert_eq!(report.files[1].found, Found::NotMcap);
     assert_eq!(report.metadata.relative_file_paths, ["bag_0.mcap"]);
     assert_eq!(
@@ -242,9 +245,15 @@ fn a_file_that_is_not_mcap_is_left_alone_and_reported() {
     );
     let empty = directory.path().join("empty");
     fs::create_dir(&empty).unwrap();
-    assert!(matches!(reindex(&empty), Err(ReindexError::NoFiles(_))));
+    assert!(matches!(
+        reindex(&empty, Expansion::Limited),
+        Err(ReindexError::NoFiles(_))
+    ));
     fs::write(empty.join("a_0.db3"), "").unwrap();
-    assert!(matches!(reindex(&empty), Err(ReindexError::Sqlite3(_))));
+    assert!(matches!(
+        reindex(&empty, Expansion::Limited),
+        Err(ReindexError::Sqlite3(_))
+    ));
 }
 
 #[test]
@@ -270,7 +279,7 @@ fn compression_of_files_that_was_interrupted_is_completed() {
     let done = writer.take_file_compressions().remove(0).run().unwrap();
     writer.compressed(&done).unwrap();
     std::mem::forget(writer);
-    let report = reindex(&path).unwrap();
+    let report = reindex(&path, Expansion::Limited).unwrap();
     let names = ["bag_0.mcap.zstd", "bag_1.mcap.zstd", "bag_2.mcap.zstd"];
     assert_eq!(report.metadata.relative_file_paths, names);
     assert_eq!(report.metadata.message_count, 30);
@@ -305,16 +314,17 @@ fn expanding(chunk_bytes: usize, chunks: usize, compression: Compression) -> Vec
 #[test]
 fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
     let directory = tempfile::tempdir().unwrap();
-    let refused = |name: &str, file: &[u8]| {
+    let refused = |name: &str, factor: u32, file: &[u8]| {
         let path = directory.path().join(name);
         fs::write(&path, file).unwrap();
-        let error = read::scan(&path, &mut |_, _| {}).unwrap_err();
+        let error = read::scan(&path, Expansion::Limited, &mut |_, _| {}).unwrap_err();
         let cause = std::error::Error::source(&error).unwrap().to_string();
-        assert_eq!(
-            cause, "it expands to more than 1024 times its size",
-            "{name}"
+        let expected = format!(
+            "it expands to more than {factor} times its size; if you trust it, pass \
+            --no-expansion-limit"
         );
-        assert!(Bag::open(&path).is_err(), "{name}");
+        assert_eq!(cause, expected, "{name}");
+        assert!(Bag::open(&path, Expansion::Limited).is_err(), "{name}");
         path
     };
     let (one, many) = (
@@ -327,9 +337,9 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
         one.len(),
         many.len()
     );
-    refused("one_0.mcap", &one);
-    let path = refused("many_0.mcap", &many);
-    assert!(reindex(directory.path()).is_err());
+    refused("one_0.mcap", 16, &one);
+    let path = refused("many_0.mcap", 1024, &many);
+    assert!(reindex(directory.path(), Expansion::Limited).is_err());
     assert_eq!(fs::read(path).unwrap(), many, "left as it was");
     // A compressed file with one record.
     let mut whole = records::MAGIC.to_vec();
@@ -337,10 +347,13 @@ fn a_small_file_that_expands_to_gigabytes_is_refused_before_it_does() {
         out.resize(out.len() + (200 << 20), 0);
     });
     let whole = Compression::Zstd.compressed(&whole).unwrap();
-    refused("whole_0.mcap.zstd", &whole);
+    let path = refused("whole_0.mcap.zstd", 16, &whole);
+    // A person can trust it.
+    let scan = read::scan(&path, Expansion::Unlimited, &mut |_, _| {}).unwrap();
+    assert_eq!(scan.metadata_places.len(), 1);
     // Content that expands like recordings of a still image is readable.
     let path = directory.path().join("still_0.mcap");
     fs::write(&path, expanding(4 << 20, 8, Compression::Lz4)).unwrap();
-    let scan = read::scan(&path, &mut |_, _| {}).unwrap();
+    let scan = read::scan(&path, Expansion::Limited, &mut |_, _| {}).unwrap();
     assert_eq!((scan.chunks.len(), scan.unreadable_chunks), (8, 8));
 }

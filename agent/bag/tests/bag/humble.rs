@@ -11,9 +11,9 @@ use ros2probe_bag::{
     Compression, Form, Options, Schema, Storage, TopicDescription, TopicId, Writer,
 };
 use ros2probe_testing::repository;
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::qos::{Durability, History, HistoryKind, Qos, Reliability, Role};
 use ros2probe_wire::rtps::VendorId;
+use ros2probe_wire::{Expansion, Timestamp};
 
 fn real() -> PathBuf {
     repository("agent/testing/data/bags")
@@ -154,7 +154,7 @@ fn records_are_those_that_humble_writes() {
         let topic = topics[&message.channel_id];
         writer.write(topic, time, time, 0, message.data).unwrap();
     };
-    read::scan(&original, write).unwrap();
+    read::scan(&original, Expansion::Limited, write).unwrap();
     let summary = writer.close(BTreeMap::new()).unwrap();
     let ours = listing(&fs::read(&summary.files[0]).unwrap());
     let theirs = listing(&fs::read(&original).unwrap());

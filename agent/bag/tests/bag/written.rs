@@ -1,6 +1,7 @@
 //! Content of written bags, as other readers find it.
 
 use super::*;
+use ros2probe_wire::Expansion;
 
 #[test]
 fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones() {
@@ -34,7 +35,7 @@ fn messages_larger_than_a_chunk_are_in_the_bag_as_they_came_between_small_ones()
         }
         let summary = writer.close(BTreeMap::new()).unwrap();
         let mut found = Vec::new();
-        read::scan(&summary.files[0], &mut |message, _| {
+        read::scan(&summary.files[0], Expansion::Limited, &mut |message, _| {
             found.push((message.sequence as usize, message.data.to_vec()));
         })
         .unwrap();

@@ -15,20 +15,22 @@ use std::collections::HashSet;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use ros2probe_wire::inside::Counter;
 
+use self::process::ReadMemory;
 use self::programs::{Attached, Programs, Tables};
 use self::table::{ProcessTable, Round};
 use crate::error_chain::in_words;
 use crate::filter::FilterError;
 use crate::mappings::{MappingEvents, UNCONCERNED};
+use crate::memory_reader::MemoryReader;
 use crate::settings::InsideChoice;
 use crate::shm::directories::Scope;
 use crate::system::{Clocks, wait};
-use crate::threads::{Spawn, Task};
+use crate::threads::{Progress, Spawn, Task};
 use crate::uprobe::attachments::{Attachments, LibraryFacts, Refusal, installed};
 use crate::uprobe::processes::{Processes, is_version_of};
 use crate::uprobe::{self, UprobeError};
@@ -68,10 +70,10 @@ pub struct Facts {
     pub counters: Vec<(&'static str, u64)>,
 }
 
-#[derive(Default)]
 struct Shared {
     rounds: Mutex<Vec<Round>>,
     facts: Mutex<Facts>,
+    progress: Arc<Progress>,
     stop: AtomicBool,
 }
 
@@ -80,6 +82,7 @@ struct Work {
     tables: Tables,
     scope: Scope,
     has_callbacks: bool,
+    read: ReadMemory,
 }
 
 impl Inside {
@@ -101,9 +104,11 @@ impl Inside {
             error => error.into(),
         })?;
         set_clocks(&mut tables, &Clocks::read());
-        let mut attachments = attachments(programs);
+        let progress = Arc::new(Progress::default());
+        let mut attachments = attachments(programs, Arc::clone(&progress));
         // A node announces its publishers once: installed libraries are attached in advance.
         attachments.install(&installed(is_library), Instant::now());
+        progress.rest();
         let scope = cgroup.map_or(Scope::AllProcesses, |path| {
             Scope::Cgroup(path.to_path_buf())
         });
@@ -113,14 +118,17 @@ impl Inside {
         };
         Ok(Self {
             shared: Arc::new(Shared {
+                rounds: Mutex::default(),
                 facts: Mutex::new(facts),
-                ..Shared::default()
+                progress,
+                stop: AtomicBool::new(false),
             }),
             waiting: Some(Work {
                 attachments,
                 tables,
                 scope,
                 has_callbacks,
+                read: memory(),
             }),
         })
     }
@@ -149,8 +157,13 @@ impl Inside {
     /// Returns the state of the source.
     #[must_use]
     pub fn facts(&self) -> Facts {
-        let facts = self.shared.facts.lock();
-        facts.unwrap_or_else(PoisonError::into_inner).clone()
+        self.shared.facts().clone()
+    }
+
+    /// Returns for how long the thread has made no progress; `None` if it makes progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.shared.progress.stalled()
     }
 }
 
@@ -175,20 +188,24 @@ impl Shared {
         rounds.unwrap_or_else(PoisonError::into_inner).push(round);
     }
 
+    fn facts(&self) -> MutexGuard<'_, Facts> {
+        self.facts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     fn report(&self, facts: Facts) {
-        let mut known = self.facts.lock().unwrap_or_else(PoisonError::into_inner);
-        *known = facts;
+        *self.facts() = facts;
     }
 }
 
 /// The thread's main function.
 fn follow(shared: &Shared, mut work: Work) {
     let mut processes = Processes::new(work.scope.clone(), is_library);
-    let mut table = ProcessTable::new(work.has_callbacks);
+    let mut table = ProcessTable::new(work.has_callbacks, work.read);
     let mut mappings = MappingEvents::open_or_warn("capture.inside");
     let mut detached_at = None::<Instant>;
     let mut last = Instant::now();
     while !shared.stop.load(Ordering::Acquire) {
+        shared.progress.step();
         let now = Instant::now();
         if detached_at.is_some_and(|at| now - at >= PAUSE) {
             detached_at = None;
@@ -251,6 +268,7 @@ fn follow(shared: &Shared, mut work: Work) {
             }
         }
     }
+    shared.progress.rest();
 }
 
 /// What ends a wait between two rounds.
@@ -295,10 +313,11 @@ fn next_event(
 }
 
 /// Returns attachments of the functions of `libtracetools.so`.
-fn attachments(mut programs: Programs) -> Attachments<Attached> {
+fn attachments(mut programs: Programs, progress: Arc<Progress>) -> Attachments<Attached> {
     Attachments::new(
         "calls are observed",
         Box::new(move |file| {
+            progress.step();
             let attached = programs.attach(file);
             attached.map_err(|error| Refusal::Probe(error.into()))
         }),
@@ -315,6 +334,19 @@ fn showing_intra_process(
     let using = processes.using();
     let showing = using.filter(|(_, used)| used.libraries.iter().any(|library| shows(&library.id)));
     showing.map(|(process, _)| process).collect()
+}
+
+/// Starts the process that reads memory of observed processes.
+fn memory() -> ReadMemory {
+    match MemoryReader::start() {
+        Ok(mut reader) => {
+            Box::new(move |process, address, length| reader.read(process, address, length))
+        }
+        Err(error) => {
+            tracing::warn!(%error, "the domains of observed processes are taken for 0");
+            Box::new(|_, _, _| None)
+        }
+    }
 }
 
 fn set_clocks(tables: &mut Tables, clocks: &Clocks) {

@@ -9,10 +9,11 @@ use ros2probe_wire::DomainId;
 
 /// Variable with the domain of a ROS process.
 const DOMAIN: &[u8] = b"ROS_DOMAIN_ID=";
-/// Most bytes of an environment that are read.
-const MAX_ENVIRONMENT: u64 = 256 << 10;
 /// Most bytes of `/proc/<pid>/stat`.
 const MAX_STAT: u64 = 4096;
+
+/// Reads memory: process, address and most bytes; `None` if it cannot be read.
+pub type ReadMemory = Box<dyn FnMut(u32, u64, u64) -> Option<Vec<u8>> + Send>;
 
 /// One reading of `/proc/<pid>/stat` (proc_pid_stat(5)).
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,12 +60,12 @@ impl Stat {
     }
 
     /// Returns the domain in the process's environment, 0 without one. `None` if the environment
-    /// cannot be read.
+    /// cannot be read. `read` reads the process's memory.
     #[must_use]
-    pub fn domain(&self, process: u32) -> Option<DomainId> {
+    pub fn domain(&self, process: u32, read: &mut ReadMemory) -> Option<DomainId> {
         let (start, end) = self.environment;
         let length = end.checked_sub(start).filter(|length| *length > 0)?;
-        let bytes = read_memory(process, start, length.min(MAX_ENVIRONMENT))?;
+        let bytes = read(process, start, length)?;
         Some(domain_in(&bytes))
     }
 }
@@ -74,33 +75,6 @@ fn domain_in(environment: &[u8]) -> DomainId {
     let value = variables.find_map(|variable| variable.strip_prefix(DOMAIN));
     let value = value.and_then(|value| std::str::from_utf8(value).ok()?.trim().parse().ok());
     DomainId(value.unwrap_or(0))
-}
-
-/// Copies memory of another process; `None` if it cannot be read. Needs CAP_SYS_PTRACE.
-fn read_memory(process: u32, address: u64, length: u64) -> Option<Vec<u8>> {
-    let mut bytes = vec![0; usize::try_from(length).ok()?];
-    let local = libc::iovec {
-        iov_base: bytes.as_mut_ptr().cast(),
-        iov_len: bytes.len(),
-    };
-    let remote = libc::iovec {
-        iov_base: std::ptr::with_exposed_provenance_mut(usize::try_from(address).ok()?),
-        iov_len: bytes.len(),
-    };
-    // SAFETY: writes at most `iov_len` bytes to `bytes`, which outlives the call; the kernel checks
-    // the remote address.
-    let read = unsafe {
-        libc::process_vm_readv(
-            process.cast_signed(),
-            &raw const local,
-            1,
-            &raw const remote,
-            1,
-            0,
-        )
-    };
-    bytes.truncate(usize::try_from(read).ok()?);
-    Some(bytes)
 }
 
 fn ticks_per_second() -> u64 {
@@ -143,6 +117,15 @@ mod tests {
         }
         let own = std::process::id();
         let stat = Stat::read(own).unwrap();
-        assert!(stat.domain(own).is_some(), "{stat:?}");
+        let (start, end) = stat.environment;
+        let mut read: ReadMemory = Box::new(move |process, address, length| {
+            assert_eq!((process, address, length), (own, start, end - start));
+            Some(b"ROS_DOMAIN_ID=9\0".to_vec())
+        });
+        assert_eq!(stat.domain(own, &mut read), Some(DomainId(9)));
+        assert_eq!(
+            stat.domain(own, &mut (Box::new(|_, _, _| None) as ReadMemory)),
+            None
+        );
     }
 }

@@ -17,7 +17,7 @@ use ros2probe_wire::{DomainId, Timestamp};
 use zerocopy::FromBytes as _;
 
 use super::names::{Endpoint, Names, text};
-use super::process::Stat;
+use super::process::{ReadMemory, Stat};
 use super::programs::Tables;
 use crate::system::Clocks;
 
@@ -32,8 +32,8 @@ const MAX_HOPS: usize = 16_384;
 const MAX_TRANSITIONS: usize = 1_024;
 
 /// The observed processes.
-#[derive(Debug)]
 pub struct ProcessTable {
+    read: ReadMemory,
     known: HashMap<u32, Observed>,
     has_callbacks: bool,
     hops: Vec<inside::Hop>,
@@ -81,10 +81,11 @@ impl Observed {
 }
 
 impl ProcessTable {
-    /// Creates an empty table.
+    /// Creates an empty table. `read` reads the memory of observed processes.
     #[must_use]
-    pub fn new(has_callbacks: bool) -> Self {
+    pub fn new(has_callbacks: bool, read: ReadMemory) -> Self {
         Self {
+            read,
             known: HashMap::new(),
             has_callbacks,
             hops: Vec::new(),
@@ -139,9 +140,10 @@ impl ProcessTable {
 
     /// Returns the state of a process, new if necessary. The kernel's table bounds their number.
     fn observe(&mut self, process: u32) -> &mut Observed {
+        let read = &mut self.read;
         self.known.entry(process).or_insert_with(|| {
             let stat = Stat::read(process);
-            let domain = stat.as_ref().and_then(|stat| stat.domain(process));
+            let domain = stat.as_ref().and_then(|stat| stat.domain(process, read));
             Observed {
                 domain: domain.unwrap_or_default(),
                 stat,

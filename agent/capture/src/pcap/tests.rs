@@ -2,6 +2,7 @@ use std::io::Write;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use ros2probe_wire::Expansion;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use super::*;
@@ -157,7 +158,7 @@ type Owned = (u64, Link, u32, Vec<u8>, u32);
 
 fn read(bytes: &[u8]) -> (Vec<Owned>, Option<PcapError>) {
     let mut packets = Vec::new();
-    let mut reader = match PcapReader::new(io::Cursor::new(bytes.to_vec())) {
+    let mut reader = match PcapReader::new(io::Cursor::new(bytes.to_vec()), Expansion::Limited) {
         Ok(reader) => reader,
         Err(error) => return (packets, Some(error)),
     };
@@ -235,7 +236,7 @@ fn pcapng_blocks_interfaces_and_resolutions() {
 fn a_second_section_starts_over_in_its_own_byte_order() {
     let mut file = next_generation(Endianness::Little);
     file.extend(next_generation(Endianness::Big));
-    let mut reader = PcapReader::new(io::Cursor::new(file)).unwrap();
+    let mut reader = PcapReader::new(io::Cursor::new(file), Expansion::Limited).unwrap();
     let mut count = 0;
     while reader.next_packet().unwrap().is_some() {
         count += 1;
@@ -336,7 +337,7 @@ fn a_file_that_is_not_a_capture_is_reported() {
         text,
         "not a capture: it begins with [25, 50, 44, 46], which is neither pcap nor pcapng"
     );
-    let missing = PcapReader::open(Path::new("/nonexistent/x.pcap"))
+    let missing = PcapReader::open(Path::new("/nonexistent/x.pcap"), Expansion::Limited)
         .err()
         .unwrap()
         .to_string();
@@ -354,7 +355,7 @@ fn fragments_of_a_real_capture_become_a_datagram() {
 
 /// Returns frames, datagrams (whole or reassembled), and the reassembly's counters.
 fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
-    let mut reader = PcapReader::open(path).unwrap();
+    let mut reader = PcapReader::open(path, Expansion::Limited).unwrap();
     let mut reassembly = Reassembly::new(Limits::default());
     let mut whole = 0;
     while let Some(captured) = reader.next_packet().unwrap() {
@@ -377,7 +378,7 @@ fn datagrams(path: &Path) -> (u64, u64, reassembly::Counters) {
 /// Returns the numbers of frames, whole UDP datagrams, fragments, and frames that a cooked header
 /// marks as outgoing.
 fn census(path: &Path) -> (u64, u64, u64, u64) {
-    let mut reader = PcapReader::open(path).unwrap();
+    let mut reader = PcapReader::open(path, Expansion::Limited).unwrap();
     let (mut datagrams, mut fragments, mut outgoing) = (0, 0, 0);
     while let Some(captured) = reader.next_packet().unwrap() {
         let frame = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
@@ -406,4 +407,38 @@ fn real_captures_hold_what_another_decoder_counted() {
         census(&data("cyclonedds-samehost-any.pcap.gz")),
         (620, 615, 0, 133)
     );
+}
+
+#[test]
+fn a_small_capture_that_expands_to_gigabytes_of_empty_packets_ends_soon() {
+    // The header of a capture, and empty packets.
+    const PACKETS: usize = 8 << 20;
+    let mut file = GzEncoder::new(Vec::new(), Compression::fast());
+    let header = [0xa1b2_c3d4_u32, 0x0002_0004, 0, 0, 65_535, 1];
+    file.write_all(&header.map(u32::to_le_bytes).concat())
+        .unwrap();
+    for _ in 0..PACKETS / 4096 {
+        file.write_all(&[0; 16 * 4096]).unwrap();
+    }
+    let file = file.finish().unwrap();
+    let read = |expansion| {
+        let mut reader = PcapReader::new(io::Cursor::new(file.clone()), expansion).unwrap();
+        let end = loop {
+            match reader.next_packet() {
+                Ok(Some(_)) => {}
+                Ok(None) => break None,
+                Err(PcapError::Read { source, .. }) => break Some(source.to_string()),
+                Err(error) => panic!("{error}"),
+            }
+        };
+        (usize::try_from(reader.packets()).unwrap(), end)
+    };
+    assert!(file.len() < 1 << 20, "{}", file.len());
+    let (packets, end) = read(Expansion::Limited);
+    // 64 MiB are free.
+    assert!(packets > 4 << 20 && packets < PACKETS, "{packets}");
+    let end = end.unwrap();
+    assert!(end.contains("more than 100 times its size"), "{end}");
+    assert!(end.contains("--no-expansion-limit"), "{end}");
+    assert_eq!(read(Expansion::Unlimited), (PACKETS, None));
 }

@@ -195,6 +195,14 @@ impl ShmDirectories {
         self.go_through_scope();
     }
 
+    /// Returns whether each directory's path still reaches it: the process that it leads through may
+    /// have ended, while others use the directory.
+    #[must_use]
+    pub fn are_reachable(&self) -> bool {
+        let mut directories = self.directories.values();
+        directories.all(|directory| directory.path.exists())
+    }
+
     fn go_through_scope(&mut self) {
         for directory in self.directories.values_mut() {
             directory.seen = false;
@@ -673,6 +681,40 @@ mod tests {
         fs::create_dir(&path).unwrap();
         fs::write(path.join("fastrtps_port7413"), "").unwrap();
         assert_only("fastrtps_port7413");
+    }
+
+    #[test]
+    fn a_directory_whose_process_ended_is_reached_through_another_one() {
+        let group = tempfile::tempdir().unwrap();
+        let sleeper = || std::process::Command::new("sleep").arg("60").spawn();
+        let (mut first, mut second) = (sleeper().unwrap(), sleeper().unwrap());
+        let members = format!("{}\n{}\n", first.id(), second.id());
+        fs::write(group.path().join("cgroup.procs"), members).unwrap();
+        let mut directories = ShmDirectories::new(Scope::Cgroup(group.path().to_path_buf()));
+        directories.find();
+        let path = |directories: &ShmDirectories| {
+            let paths = directories.directories.values();
+            let paths: Vec<_> = paths.map(|each| each.path.display().to_string()).collect();
+            paths.concat()
+        };
+        assert_eq!(
+            path(&directories),
+            format!("/proc/{}/root/dev/shm", first.id())
+        );
+        assert!(directories.are_reachable());
+        first.kill().unwrap();
+        first.wait().unwrap();
+        assert!(!directories.are_reachable());
+        directories.find();
+        assert_eq!(
+            path(&directories),
+            format!("/proc/{}/root/dev/shm", second.id())
+        );
+        assert!(directories.are_reachable());
+        second.kill().unwrap();
+        second.wait().unwrap();
+        directories.find();
+        assert!(directories.directories.is_empty());
     }
 
     #[test]

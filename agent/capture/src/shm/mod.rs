@@ -39,7 +39,7 @@ use self::poll_interval::{Budget, Need, PollInterval};
 use self::tap::{Counters, Tap};
 use super::reorder_buffer::ReorderBuffer;
 use super::system::{Clocks, DirectoryWatch, calendar, monotonic, run_first, thread_cpu, wait};
-use crate::threads::{Spawn, Task};
+use crate::threads::{Progress, Spawn, Task};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Wanted};
 
@@ -81,6 +81,7 @@ struct Shared {
     has_news: AtomicBool,
     wanted: AtomicU8,
     facts: Mutex<Facts>,
+    progress: Progress,
     /// Every message is seen by the probes instead.
     is_paused: AtomicBool,
     stop: AtomicBool,
@@ -193,6 +194,12 @@ impl SharedMemory {
         self.shared.wanted.store(need as u8, Ordering::Relaxed);
     }
 
+    /// Returns for how long the thread has made no progress; `None` if it makes progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.shared.progress.stalled()
+    }
+
     /// Returns the report of the tap.
     #[must_use]
     pub fn facts(&self) -> Facts {
@@ -208,7 +215,10 @@ impl Drop for SharedMemory {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
         self.end = None;
-        if let Some(thread) = self.thread.take() {
+        // A stalled thread is left to the end of the process.
+        if let Some(thread) = self.thread.take()
+            && self.shared.progress.stalled().is_none()
+        {
             // The thread has ended in any case; its result has no user.
             let _ = thread.join();
         }
@@ -241,6 +251,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
     let (mut is_first, mut may_be_first) = (false, true);
     let (mut found, mut looks, mut reported, mut cpu) = (Vec::new(), 0, 0, 0.0);
     while !shared.stop.load(Ordering::Acquire) {
+        shared.progress.step();
         if shared.has_news.swap(false, Ordering::Acquire) {
             let interest = shared.interest.lock();
             let mut interest = interest.unwrap_or_else(PoisonError::into_inner);
@@ -252,6 +263,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
             tap.close_all();
             reported = 0;
             shared.report(&tap, looks, interval.stretch());
+            shared.progress.rest();
             std::thread::sleep(PAUSE);
             continue;
         }
@@ -292,6 +304,7 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
         }
         // If files appear without end, events about them wait as well.
         let Some(watch) = watch.as_mut().filter(|_| tap.may_list(now)) else {
+            shared.progress.rest();
             std::thread::sleep(sleep);
             continue;
         };
@@ -311,13 +324,16 @@ fn poll(shared: &Shared, directories: ShmDirectories, budget: Budget, ended: &Pi
         // Creation of a file ends the sleep, and nothing else is to be noticed.
         let sleep = idle.map_or(sleep, |idle| sleep.max(Duration::from_nanos(idle)));
         let before = thread_cpu();
+        shared.progress.rest();
         let ready = wait(&[watch.as_fd(), ended.as_fd()], sleep);
+        shared.progress.step();
         if matches!(ready, Ok(Some(0))) && watch.created(|name| Name::parse(name).is_some()) {
             tap.spend(thread_cpu().saturating_sub(before));
             tap.expect_participant();
             interval.newcomer(at);
         }
     }
+    shared.progress.rest();
 }
 
 #[expect(

@@ -183,9 +183,13 @@ impl Tap {
         self.allowance.spend(nanoseconds);
     }
 
-    /// Lists directories and polls every port at the next poll, even silent ones.
+    /// Lists directories and polls every port at the next poll, even silent ones. If no directory is
+    /// known, looks for the one with the new file.
     pub fn expect_participant(&mut self) {
         self.listed = 0;
+        if self.directories.directories.is_empty() {
+            self.found = 0;
+        }
         for open in &mut self.ports {
             (open.due, open.busy) = (0, open.busy.max(self.now));
         }
@@ -454,10 +458,11 @@ impl Tap {
         } else {
             FIND_EVERY
         };
-        let finds = now.saturating_sub(self.found) >= every || self.found == 0;
+        let is_lost = self.found == 0 || !self.directories.are_reachable();
+        let finds = is_lost || now.saturating_sub(self.found) >= every;
         if finds {
             self.found = now;
-            if self.ports.is_empty() && self.unborn.is_empty() {
+            if !is_lost && self.ports.is_empty() && self.unborn.is_empty() {
                 self.directories.find_new();
             } else {
                 self.directories.find();

@@ -6,7 +6,7 @@
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Read as _};
 use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -22,6 +22,10 @@ pub const RETRY: Duration = Duration::from_secs(5);
 /// Most libraries with a probe: images of containers on one host.
 pub const MAX_LIBRARIES: usize = 64;
 
+/// Beginning of the names of file systems in user space.
+const USER_SPACE: &str = "fuse";
+/// Most bytes read of a process's mounts.
+const MAX_MOUNTS: u64 = 1 << 20;
 /// Directories of installed libraries and of ROS distributions.
 const INSTALLED: [&str; 5] = [
     "/usr/lib/x86_64-linux-gnu",
@@ -61,6 +65,14 @@ pub enum Refusal {
     /// Its path is a directory or a device.
     #[error("not a file")]
     NoFile,
+    /// Its file system is a program of a user, which may never answer.
+    #[error(
+        "it lies in a file system of {0}, which may never answer: copy it to a disk of this host"
+    )]
+    MayNotAnswer(String),
+    /// Its path in the process's file system names another file by now.
+    #[error("it was replaced while the process uses it: restart the process")]
+    Replaced,
     /// It is malformed, or lacks the function.
     #[error(transparent)]
     Library(#[from] LibraryError),
@@ -161,7 +173,8 @@ impl<P> Attachments<P> {
         if !is_known && (self.libraries.contains_key(id) || self.libraries.len() < MAX_LIBRARIES) {
             // Refers to the file that the process maps, even if its path now names another one.
             let file = PathBuf::from(format!("/proc/{process}/map_files/{range}"));
-            let probe = open(&file).and_then(|file| (self.attach)(&file));
+            let opened = answers(process, id).and_then(|()| open_mapped(&file, process, mapped));
+            let probe = opened.and_then(|file| (self.attach)(&file));
             let probe = probe.map_err(|refusal| in_words(&refusal));
             let (library, is_new) = (path.display(), !self.libraries.contains_key(id));
             match &probe {
@@ -222,6 +235,56 @@ pub fn installed(is_library: fn(&str) -> bool) -> Vec<PathBuf> {
     libraries.map(|entry| entry.path()).collect()
 }
 
+/// Opens the file that a process maps. Only root may use `map_files` of another user's process: else
+/// the path in the process's file system must still name that file.
+fn open_mapped(file: &Path, process: u32, mapped: &Mapped) -> Result<File, Refusal> {
+    match open(file) {
+        Err(Refusal::Open(error)) if error.kind() == io::ErrorKind::PermissionDenied => {
+            open_by_path(error, process, mapped)
+        }
+        opened => opened,
+    }
+}
+
+fn open_by_path(refused: io::Error, process: u32, mapped: &Mapped) -> Result<File, Refusal> {
+    let Ok(relative) = mapped.path.strip_prefix("/") else {
+        return Err(Refusal::Open(refused));
+    };
+    let file = open(&PathBuf::from(format!("/proc/{process}/root")).join(relative))?;
+    match file.metadata().map_err(Refusal::Open)?.ino() == mapped.id.inode {
+        true => Ok(file),
+        false => Err(Refusal::Replaced),
+    }
+}
+
+/// Fails if a library lies in a file system in user space. A thread that reads such a file may wait
+/// without end.
+fn answers(process: u32, library: &LibraryId) -> Result<(), Refusal> {
+    let mut text = Vec::new();
+    // Without the list, the library is opened: it usually lies on a disk.
+    if let Ok(file) = File::open(format!("/proc/{process}/mountinfo")) {
+        let _ = file.take(MAX_MOUNTS).read_to_end(&mut text);
+    }
+    match file_system(&String::from_utf8_lossy(&text), &library.device) {
+        Some(name) if name.starts_with(USER_SPACE) => Err(Refusal::MayNotAnswer(name.to_owned())),
+        _ => Ok(()),
+    }
+}
+
+/// Returns the type of the file system on a device, from the lines of `mountinfo`
+/// (proc_pid_mountinfo(5)). `device` is in hexadecimal, as in a process's map.
+fn file_system<'a>(mounts: &'a str, device: &str) -> Option<&'a str> {
+    let (major, minor) = device.split_once(':')?;
+    let number = |digits| u32::from_str_radix(digits, 16).ok();
+    let device = format!("{}:{}", number(major)?, number(minor)?);
+    let mut mounts = mounts.lines();
+    mounts.find_map(|line| {
+        let (place, system) = line.split_once(" - ")?;
+        let is_it = place.split(' ').nth(2) == Some(&*device);
+        system.split(' ').next().filter(|_| is_it)
+    })
+}
+
 fn open(path: &Path) -> Result<File, Refusal> {
     // A file whose open blocks is not a library.
     let file = OpenOptions::new()
@@ -233,4 +296,55 @@ fn open(path: &Path) -> Result<File, Refusal> {
         return Err(Refusal::NoFile);
     }
     Ok(file)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MOUNTS: &str = "\
+        22 1 254:0 / / rw,relatime shared:1 - ext4 /dev/vda rw\n\
+        61 22 0:55 / /home/u/my\\040lib rw,nosuid - fuse.sshfs u@h:/ rw,user_id=1000\n\
+        62 22 0:56 / /mnt rw - fuseblk /dev/sda1 rw\n";
+
+    #[test]
+    fn the_file_system_of_a_library_is_that_of_its_device() {
+        for (device, name) in [
+            ("fe:00", Some("ext4")),
+            ("00:37", Some("fuse.sshfs")),
+            ("00:38", Some("fuseblk")),
+            ("00:39", None),
+            ("zz:00", None),
+            ("", None),
+        ] {
+            assert_eq!(file_system(MOUNTS, device), name, "{device}");
+        }
+    }
+
+    #[test]
+    fn a_library_whose_path_names_another_file_is_not_opened() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("libtracetools.so");
+        fs::write(&path, "old").unwrap();
+        let inode = fs::metadata(&path).unwrap().ino();
+        let mapped = |inode| Mapped {
+            id: LibraryId {
+                device: String::new(),
+                inode,
+            },
+            path: path.clone(),
+            range: String::new(),
+        };
+        // As map_files of another user's process: it exists, and cannot be opened.
+        let closed = Path::new("/proc/self/map_files-of-another-user");
+        let own = std::process::id();
+        let opened = open_mapped(closed, own, &mapped(inode));
+        assert!(matches!(opened, Err(Refusal::Open(_))));
+        let denied = io::Error::from(io::ErrorKind::PermissionDenied);
+        let opened = open_by_path(denied, own, &mapped(inode));
+        assert!(opened.is_ok());
+        let denied = io::Error::from(io::ErrorKind::PermissionDenied);
+        let opened = open_by_path(denied, own, &mapped(inode + 1));
+        assert!(matches!(opened, Err(Refusal::Replaced)));
+    }
 }

@@ -42,6 +42,10 @@ const MAX_ENTRIES: u16 = 1024;
 /// all debugging symbols, ten times that.
 const MAX_TABLE: u64 = 16 << 20;
 const MAX_NAMES: u64 = 32 << 20;
+/// Most bytes of all symbols and names of a library: one table of each kind of the largest size.
+const MAX_READ: u64 = 2 * (MAX_TABLE + MAX_NAMES);
+/// Longest name of a function that is compared.
+const MAX_NAME: usize = 512;
 /// x86-64: `endbr64`, the landing pad of indirect calls. The kernel single-steps a breakpoint on
 /// it, which is slow, but emulates the `push` that follows.
 const LANDING: [u8; 4] = [0xf3, 0x0f, 0x1e, 0xfa];
@@ -150,6 +154,7 @@ fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, Librar
         .iter()
         .map(|bytes| section(bytes))
         .collect::<Result<Vec<_>, _>>()?;
+    let mut left = MAX_READ;
     // A stripped library has only the first kind, which is sufficient.
     for kind in SYMBOL_TABLES {
         let tables = sections.iter().filter(|section| section.kind == kind);
@@ -158,6 +163,8 @@ fn visit(file: &File, mut with: impl FnMut(&[u8], u64)) -> Result<Header, Librar
             let Some(names) = names.and_then(|index| sections.get(index)) else {
                 continue;
             };
+            let needed = symbols.size.saturating_add(names.size);
+            left = left.checked_sub(needed).ok_or(LibraryError::Foreign)?;
             search(file, symbols, names, &mut with)?;
         }
     }
@@ -228,7 +235,8 @@ fn search(
         }
         let name = usize::try_from(name).ok().and_then(|at| names.get(at..));
         if let Some(name) = name {
-            with(name, address);
+            // A name without an end must not cost the whole table for each symbol.
+            with(name.get(..MAX_NAME).unwrap_or(name), address);
         }
     }
     Ok(())
@@ -417,6 +425,41 @@ pub(super) mod tests {
                 let _ = found(&bad);
             }
         }
+    }
+
+    #[test]
+    fn names_without_an_end_cost_a_bounded_part_of_their_table() {
+        let mut file = tempfile::tempfile().unwrap();
+        file.write_all(&image(&"x".repeat(50_000), &LANDING))
+            .unwrap();
+        let mut lengths = Vec::new();
+        visit(&file, |name, _| lengths.push(name.len())).unwrap();
+        assert_eq!(lengths, [MAX_NAME]);
+    }
+
+    #[test]
+    fn tables_that_repeat_a_part_of_the_file_are_read_within_a_budget() {
+        let mut bytes = image(&format!("{FUNCTION}{OF_2}"), &LANDING);
+        let sections = bytes.len() as u64;
+        bytes[40..48].copy_from_slice(&sections.to_le_bytes());
+        bytes[60..62].copy_from_slice(&21_u16.to_le_bytes());
+        let headers = (0..21).map(|number| match number {
+            0 => (3_u32, 1_u64),
+            _ => (SYMBOLS, MAX_TABLE),
+        });
+        for (kind, size) in headers {
+            bytes.extend([0; 4]);
+            bytes.extend(kind.to_le_bytes());
+            bytes.extend([0; 24]);
+            bytes.extend(size.to_le_bytes());
+            bytes.extend([0; 24]);
+        }
+        let mut file = tempfile::tempfile().unwrap();
+        file.write_all(&bytes).unwrap();
+        file.set_len(2 * MAX_TABLE).unwrap();
+        let mut symbols = 0;
+        let visited = visit(&file, |_, _| symbols += 1);
+        assert!(matches!(visited, Err(LibraryError::Foreign)));
     }
 
     #[test]

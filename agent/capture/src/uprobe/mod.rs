@@ -15,6 +15,7 @@ use std::io;
 use std::os::fd::BorrowedFd;
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use self::search::{Facts, LibrarySearch};
 use super::filter::{Filter, FilterError, FilterSettings};
@@ -193,6 +194,13 @@ impl Uprobe {
     #[must_use]
     pub fn facts(&self) -> Facts {
         self.search.facts()
+    }
+
+    /// Returns for how long the thread that attaches probes has made no progress; `None` if it makes
+    /// progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.search.stalled()
     }
 
     /// Returns whether every process that uses Fast DDS's shared memory is covered.

@@ -19,7 +19,7 @@ use crate::filter::{Probe, Probes};
 use crate::mappings::{MappingEvents, UNCONCERNED};
 use crate::shm::directories::{Name, Scope, ShmDirectories};
 use crate::system::{DirectoryWatch, wait};
-use crate::threads::{Spawn, Task};
+use crate::threads::{Progress, Spawn, Task};
 
 /// Interval of visiting processes if nothing happens.
 const EVERY: Duration = Duration::from_secs(1);
@@ -62,6 +62,7 @@ struct Shared {
     attached: AtomicBool,
     /// Whether probes are attached only while they are needed.
     on_demand: bool,
+    progress: Arc<Progress>,
     stop: AtomicBool,
 }
 
@@ -94,11 +95,13 @@ impl LibrarySearch {
     /// they are needed.
     #[must_use]
     pub fn new(probes: Probes, scope: Scope, on_demand: bool) -> Self {
-        let mut attachments = attachments(probes);
+        let progress = Arc::new(Progress::default());
+        let mut attachments = attachments(probes, Arc::clone(&progress));
         // A participant announces its names once, within a tenth of a second: installed libraries
         // are attached in advance.
         if !on_demand {
             attachments.install(&installed(is_library), Instant::now());
+            progress.rest();
         }
         let facts = match on_demand {
             true => Facts::resting(),
@@ -106,6 +109,7 @@ impl LibrarySearch {
         };
         let shared = Arc::new(Shared {
             facts: Mutex::new(facts),
+            progress,
             covers_all: AtomicBool::new(!on_demand),
             wanted: AtomicBool::new(!on_demand),
             attached: AtomicBool::new(!on_demand),
@@ -165,10 +169,17 @@ impl LibrarySearch {
         facts.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Returns whether every process that uses Fast DDS's shared memory is covered.
+    /// Returns for how long the thread has made no progress; `None` if it makes progress.
+    #[must_use]
+    pub fn stalled(&self) -> Option<Duration> {
+        self.shared.progress.stalled()
+    }
+
+    /// Returns whether every process that uses Fast DDS's shared memory is covered. A stalled thread
+    /// meets no new ones.
     #[must_use]
     pub fn covers_all(&self) -> bool {
-        self.shared.covers_all.load(Ordering::Acquire)
+        self.shared.covers_all.load(Ordering::Acquire) && self.stalled().is_none()
     }
 }
 
@@ -196,6 +207,7 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
     let mut watched = BTreeSet::new();
     let (mut somebody_came, mut asked_all) = (true, None::<Instant>);
     while !shared.stop.load(Ordering::Acquire) {
+        shared.progress.step();
         if !shared.wanted.load(Ordering::Acquire) {
             if shared.attached.load(Ordering::Acquire) {
                 // Polling of shared memory resumes before the probes are detached.
@@ -207,6 +219,7 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
             }
             somebody_came = true;
             asked_all = None;
+            shared.progress.rest();
             std::thread::park_timeout(EVERY);
             continue;
         }
@@ -240,6 +253,7 @@ fn follow(shared: &Shared, attachments: Attachments<Probe>, scope: Scope) {
         let is_created = followed.wait_attaching(Some(watch), EVERY, shared);
         somebody_came = is_created && watch.created(|name| Name::parse(name).is_some());
     }
+    shared.progress.rest();
 }
 
 /// The processes, and the libraries that they use.
@@ -276,7 +290,10 @@ impl Followed {
             let created = watch.map(AsFd::as_fd);
             let mapped = self.mappings.iter().flat_map(MappingEvents::descriptors);
             let descriptors: Vec<_> = created.into_iter().chain(mapped).collect();
-            match wait(&descriptors, rest) {
+            shared.progress.rest();
+            let ready = wait(&descriptors, rest);
+            shared.progress.step();
+            match ready {
                 Ok(Some(0)) if watch.is_some() => return true,
                 Ok(Some(_)) => self.attach_mapped(shared),
                 Ok(None) | Err(_) => return false,
@@ -319,10 +336,11 @@ impl Shared {
 }
 
 /// Returns attachments of the function that copies a message into shared memory.
-fn attachments(mut probes: Probes) -> Attachments<Probe> {
+fn attachments(mut probes: Probes, progress: Arc<Progress>) -> Attachments<Probe> {
     Attachments::new(
         "every message is seen",
         Box::new(move |file| {
+            progress.step();
             let entry = library::find(file)?;
             let probe = probes.attach(file, entry.offset, entry.form);
             probe.map_err(|error| Refusal::Probe(error.into()))
@@ -402,7 +420,7 @@ mod tests {
         let all = Processes::of(process, used.clone());
         let (_filter, probes) = Filter::load_uprobe(&FilterSettings::default(), None)
             .expect("loading the kernel filter needs root: run the tests with sudo");
-        let mut attachments = attachments(probes);
+        let mut attachments = attachments(probes, Arc::default());
         let start = Instant::now();
         attachments.follow(&all, start);
         attachments.follow(&all, start + RETRY);

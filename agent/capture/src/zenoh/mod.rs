@@ -13,7 +13,7 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::time::Duration;
 
-use ros2probe_model::size::Size;
+use crate::size::Size;
 use ros2probe_model::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::quic;
@@ -25,7 +25,7 @@ use stream::{Stream, Took};
 /// Most directions of connections that are followed.
 const MAX_STREAMS: usize = 4096;
 /// Most bytes of unfinished batches and of segments out of order, of all connections.
-const MAX_BYTES: usize = 16 << 20;
+const MAX_BYTES: usize = 12 << 20;
 /// Interval at which segments that wait are examined.
 const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
 

@@ -32,7 +32,7 @@ pub struct Search {
 impl Search {
     /// Returns the number of bytes collected.
     pub const fn held(&self) -> usize {
-        self.held.len()
+        self.held.capacity()
     }
 
     /// Returns whether nothing is collected.

@@ -69,6 +69,13 @@ struct Ahead {
     bytes: Box<[u8]>,
 }
 
+impl Ahead {
+    /// Returns the bytes that it takes, with those of an allocation.
+    const fn held(&self) -> usize {
+        size_of::<Self>() + 32 + self.bytes.len()
+    }
+}
+
 /// One direction of a connection.
 #[derive(Debug)]
 pub struct Stream {
@@ -119,7 +126,7 @@ impl Stream {
     pub fn held(&self) -> usize {
         let partial = match &self.position {
             Position::Searching(search) | Position::Beginning(search) => search.held(),
-            Position::Batch(partial) => partial.captured.len(),
+            Position::Batch(partial) => partial.captured.capacity(),
             Position::Other => 0,
         };
         partial + self.ahead_bytes
@@ -225,7 +232,6 @@ impl Stream {
         let position = self
             .ahead
             .partition_point(|other| other.sequence_number.wrapping_sub(next) <= distance);
-        self.ahead_bytes += chunk.bytes.len();
         let ahead = Ahead {
             sequence_number: start,
             length: chunk.length,
@@ -233,6 +239,7 @@ impl Stream {
             before: chunk.before,
             bytes: chunk.bytes.into(),
         };
+        self.ahead_bytes += ahead.held();
         self.ahead.insert(position, ahead);
     }
 
@@ -247,7 +254,7 @@ impl Stream {
                 self.ahead.push_front(first);
                 break;
             }
-            self.ahead_bytes -= first.bytes.len();
+            self.ahead_bytes -= first.held();
             let (start, length) = (first.sequence_number, first.length);
             self.read(
                 start,

@@ -2,6 +2,7 @@ use std::path::Path;
 
 use proptest::prelude::*;
 use ros2probe_model::zenoh::Flow;
+use ros2probe_wire::Expansion;
 
 use super::*;
 use crate::pcap::PcapReader;
@@ -49,7 +50,7 @@ fn segments() -> Vec<Segment> {
 
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../testing/data/zenoh/lifecycle-1host/capture.pcap.gz");
-    let mut reader = PcapReader::open(&path).unwrap();
+    let mut reader = PcapReader::open(&path, Expansion::Limited).unwrap();
     let mut segments = Vec::new();
     while let Some(captured) = reader.next_packet().unwrap() {
         let frame = frame::parse(captured.link, captured.bytes, captured.length).unwrap();
@@ -321,11 +322,13 @@ fn so_many_bytes_wait_for_missing_ones_that_then_are_given_up() {
     };
     streams.chunk(&first, |_| {});
     let segment = vec![0; 1 << 16];
-    for number in 0..64 {
+    // Each segment takes some bytes besides its own.
+    for number in 0..63 {
         streams.chunk(&chunk(1, 100 + (number << 16), &segment), |_| {});
     }
-    assert_eq!((streams.counters().gaps, streams.bytes()), (0, 4 << 20));
-    streams.chunk(&chunk(1, 100 + (64 << 16), &[1, 0, 4]), |_| {});
+    assert_eq!(streams.counters().gaps, 0);
+    assert!((63 << 16..4 << 20).contains(&streams.bytes()));
+    streams.chunk(&chunk(1, 100 + (63 << 16), &segment), |_| {});
     assert_eq!(streams.counters().gaps, 1);
 }
 
@@ -343,7 +346,8 @@ fn bytes_that_may_be_batches_are_collected_up_to_three_of_the_largest() {
             most = most.max(streams.bytes());
         }
     }
-    assert_eq!(most, 3 * 65_537);
+    // Memory is reserved ahead.
+    assert!((3 * 65_537..=6 * 65_537).contains(&most), "{most} bytes");
     assert_eq!(streams.counters().batches, 0);
 }
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use ros2probe_capture::inside::programs::{self, Attached, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
+use ros2probe_capture::memory_reader::read_memory;
 use ros2probe_capture::system::Clocks;
 use ros2probe_model::inside::report::{ProcessReport, Trigger};
 use ros2probe_testing::harness::traced_program::TracedProgram;
@@ -39,7 +40,7 @@ impl Robot {
             program,
             programs,
             tables,
-            table: ProcessTable::new(has_callbacks),
+            table: ProcessTable::new(has_callbacks, Box::new(read_memory)),
             attached: None,
         }
     }

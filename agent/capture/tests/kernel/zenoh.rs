@@ -27,13 +27,13 @@ use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::zenoh as forged;
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::filter::{Budget, CANDIDATE_CAPACITY, CONNECTION_CAPACITY, Counter};
 use ros2probe_wire::frame::{self, Payload};
 use ros2probe_wire::host::{Piece, chunk};
 use ros2probe_wire::record::flag;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::zenoh::Gid;
+use ros2probe_wire::{Expansion, Timestamp};
 
 mod bounds;
 mod ends;
@@ -168,7 +168,7 @@ fn connections(capture: &str) -> Result<Vec<Vec<Sent>>> {
     let path = Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../..")
         .join(capture);
-    let mut reader = PcapReader::open(&path)?;
+    let mut reader = PcapReader::open(&path, Expansion::Limited)?;
     let mut streams = Streams::default();
     let mut order: Vec<(Flow, Vec<Sent>)> = Vec::new();
     while let Some(captured) = reader.next_packet()? {

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use anyhow::Result;
 use clap::error::ErrorKind;
 use clap::{Args, CommandFactory as _, Subcommand, ValueEnum};
+use ros2probe::client::Compressed;
 use ros2probe::ros2::bag::{self, Sort};
 use ros2probe::ros2::{Dialect, dialect};
 use ros2probe_bag::info;
@@ -59,6 +60,8 @@ struct Info {
     /// Distribution whose output to print [default: ROS_DISTRO, else jazzy]
     #[arg(long, value_parser = dialect::parser())]
     distro: Option<Dialect>,
+    #[command(flatten)]
+    compressed: Compressed,
 }
 
 #[derive(Args, Debug)]
@@ -68,6 +71,8 @@ struct Reindex {
     /// Accepted without effect: the storage is detected
     #[arg(short, long, value_enum)]
     storage: Option<Storage>,
+    #[command(flatten)]
+    compressed: Compressed,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -111,7 +116,7 @@ impl Info {
                 ignored.\n",
             )?;
         }
-        let opened = info::Bag::open(&self.bag_path)?;
+        let opened = info::Bag::open(&self.bag_path, self.compressed.into())?;
         let details = self.verbose.then(|| opened.details()).transpose()?;
         let text = match self.topic_name && !self.verbose {
             true => bag::names(&opened, dialect, self.sort),
@@ -129,7 +134,7 @@ impl Reindex {
             let path = self.bag_path.display();
             return Err(UserError(format!("{path} is a file: pass the bag's directory")).into());
         }
-        let report = reindex::reindex(&self.bag_path)?;
+        let report = reindex::reindex(&self.bag_path, self.compressed.into())?;
         let mut output = Output::new();
         for file in &report.files {
             // A file name can contain control characters.

@@ -86,14 +86,20 @@ impl Chain {
         let times = (self.target.from, self.target.until);
         let is_shown = stderr().is_terminal();
         let mut last = Instant::now();
-        let bag = BagChains::read(path, times, &ends, &mut |messages, total| {
-            if is_shown && last.elapsed() >= PROGRESS {
-                last = Instant::now();
-                let all = total.map(|total| format!(" of {total}"));
-                let all = all.unwrap_or_default();
-                eprint!("\rread {messages}{all} messages\x1b[K");
-            }
-        });
+        let bag = BagChains::read(
+            path,
+            self.target.compressed.into(),
+            times,
+            &ends,
+            &mut |messages, total| {
+                if is_shown && last.elapsed() >= PROGRESS {
+                    last = Instant::now();
+                    let all = total.map(|total| format!(" of {total}"));
+                    let all = all.unwrap_or_default();
+                    eprint!("\rread {messages}{all} messages\x1b[K");
+                }
+            },
+        );
         if is_shown {
             eprint!("\r\x1b[K");
         }

@@ -60,6 +60,9 @@ pub(crate) enum Command {
     },
     /// Request that participants repeat their announcements: the only command that sends
     Discover(Discover),
+    /// Read memory of other processes for an agent, which starts it
+    #[command(hide = true)]
+    MemoryReader,
     /// Print completions for a shell
     Completions(reference::Completions),
     /// Print or write man pages

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
+use ros2probe::client::Compressed;
 use ros2probe_daemon::agent::{Listen, Options, Speed};
 use ros2probe_daemon::config::{Access, Watch};
 
@@ -27,6 +28,8 @@ pub(crate) struct Run {
     /// How fast to replay: a factor, or `max` [default: 1, with --report max]
     #[arg(long, value_name = "N|max", requires = "replay")]
     pub(crate) speed: Option<Speed>,
+    #[command(flatten)]
+    pub(crate) compressed: Compressed,
     /// At the end of the capture, print the metrics on stdout and exit
     #[arg(long, requires = "replay")]
     pub(crate) report: bool,
@@ -61,6 +64,7 @@ impl From<Run> for Options {
             config: run.config,
             replay: run.replay,
             speed: run.speed,
+            expansion: run.compressed.into(),
             report: run.report,
             watch: run.watch,
             metrics: run.metrics,

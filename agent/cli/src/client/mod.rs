@@ -7,6 +7,7 @@
 //! The client sends requests and decodes answers; other modules interpret them. It reads no clock
 //! for its output and keeps nothing between requests.
 
+mod compressed;
 mod error;
 mod lines;
 mod samples;
@@ -32,6 +33,7 @@ use ros2probe_daemon::escape::visible;
 use ros2probe_daemon::replay_agent::Pace;
 use ros2probe_daemon::run::CaptureTime;
 
+pub use compressed::Compressed;
 pub use error::{ClientError, Refusal};
 pub use lines::{Lines, Next};
 pub use ros2probe_daemon::replay_agent::Outcome;

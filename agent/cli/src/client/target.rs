@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::ClientError;
+use super::{ClientError, Compressed};
 use crate::ros2::{Dialect, dialect};
 use ros2probe_api::MAX_DOMAIN_ID;
 use ros2probe_daemon::run::CaptureTime;
@@ -35,6 +35,9 @@ pub struct Target {
     /// End at this time of the capture
     #[arg(long, value_name = "T", requires = "replay")]
     pub until: Option<CaptureTime>,
+    /// How far a compressed capture may expand.
+    #[command(flatten)]
+    pub compressed: Compressed,
     /// The robot's domain [default: $ROS_DOMAIN_ID, else 0]
     #[arg(long = "domain", value_name = "N",
         value_parser = clap::value_parser!(u32).range(..=i64::from(MAX_DOMAIN_ID)))]

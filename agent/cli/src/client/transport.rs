@@ -55,6 +55,7 @@ impl Transport {
                 until: target.until,
                 measured,
                 pace,
+                expansion: target.compressed.into(),
             };
             let report = |line: &str| eprintln!("rp: {line}");
             let replayed = ReplayAgent::start(capture, options, report).await;

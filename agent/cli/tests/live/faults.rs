@@ -13,7 +13,9 @@ mod killed;
 mod log;
 mod memory;
 mod receivers;
+mod short_processes;
 mod unit;
+mod zenoh_storm;
 
 use std::io::{Read, Write};
 use std::net::TcpStream;

@@ -3,7 +3,7 @@
 
 use std::fs::Permissions;
 use std::os::unix::fs::PermissionsExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -14,8 +14,10 @@ use ros2probe_testing::forged::{self, Carrier, Sender, Talker, introduce, talk};
 use ros2probe_testing::harness::agent::{Agent, ON_THE_WIRE, Scrape, at_the_sockets_of};
 use ros2probe_testing::harness::network::{Link, Namespace};
 use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
+use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::local_agent;
+use tempfile::TempDir;
 
 /// A port without a socket on the robot: only the agent observes the storm.
 const NOBODY: u16 = 7399;
@@ -26,6 +28,19 @@ const GROWTH: u64 = 72 << 20;
 /// Forged participants are removed after 5 s of silence, or when their lease ends if they sent for
 /// longer than that.
 const SILENCE: Duration = Duration::from_secs(6);
+/// User and group of an agent, and of a file system that never answers.
+const STUCK: u32 = 65_533;
+/// Mounts that file system at `/dev/shm` of its own namespace, until its input ends.
+const STUCK_MOUNT: &str = r#"
+import ctypes, os, sys
+device = os.open("/dev/fuse", os.O_RDWR)
+options = f"fd={device},rootmode=40000,user_id=USER,group_id=USER"
+libc = ctypes.CDLL(None, use_errno=True)
+if libc.mount(b"stuck", b"/dev/shm", b"fuse", 0, options.encode()) != 0:
+    sys.exit(os.strerror(ctypes.get_errno()))
+print("ready", flush=True)
+sys.stdin.read()
+"#;
 /// Cyclone DDS repeats itself every 8 s.
 const RECOVERY: Duration = Duration::from_secs(30);
 
@@ -108,22 +123,10 @@ fn a_robot_that_starts_behind_a_flood_of_forged_participants_is_counted_exactly_
 fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     let link = Link::new()?;
     let directory = tempfile::tempdir()?;
-    let file = |name: &str| directory.path().join(name);
-    // The unprivileged user may be unable to read the build directory.
-    std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
-    let configuration = format!("watch: [/**]\n{ON_THE_WIRE}");
-    std::fs::write(file("ros2probe.yaml"), configuration)?;
-    let only = "-all,+net_raw,+bpf,+perfmon";
-    let script = format!(
-        "#!/bin/sh\nexec setpriv --reuid 65534 --regid 65534 --clear-groups --inh-caps {only} \
-         --ambient-caps {only} --bounding-set {only} {} \"$@\"\n",
-        file("rp").display()
-    );
-    std::fs::write(file("start"), script)?;
-    for open in ["", "start", "rp"] {
-        std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
-    }
-    let agent = Agent::start(&link.monitor, file("start"), &file("ros2probe.yaml"))?;
+    let file = directory.path().join("ros2probe.yaml");
+    std::fs::write(&file, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+    let start = start_as(65_534, "-all,+net_raw,+bpf,+perfmon", &directory)?;
+    let agent = Agent::start(&link.monitor, start, &file)?;
     let status = std::fs::read_to_string(format!("/proc/{}/status", agent.process.pid()))?;
     assert!(
         status.contains("\nUid:\t65534\t65534\t65534\t65534\n"),
@@ -141,6 +144,79 @@ fn three_capabilities_suffice_for_an_unprivileged_user() -> Result<()> {
     assert!(metered > 400.0, "{metered} of 500 metered");
     assert_eq!(page.sum("ros2probe_filter_refused_updates_total", &[]), 0.0);
     Ok(())
+}
+
+#[test]
+fn shared_memory_that_never_answers_is_named_and_delays_neither_the_rest_nor_the_end() -> Result<()>
+{
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let file = directory.path().join("ros2probe.yaml");
+    std::fs::write(&file, format!("watch: [/**]\n{ON_THE_WIRE}"))?;
+    // The file system below admits one user, so that it stops the agent of no other test.
+    let start = start_as(STUCK, "-all,+net_raw,+bpf,+perfmon,+sys_ptrace", &directory)?;
+    let mut agent = Agent::start(&link.robot, start, &file)?;
+    let is_able = |page: &Scrape| {
+        let ability = [("ability", "shared_memory")];
+        page.sum("ros2probe_capture_ability", &ability) == 1.0
+    };
+    agent.scrape_until("shared memory is seen", is_able)?;
+
+    let mut enter = link.robot.on_network();
+    enter.extend(["unshare", "--mount"].map(str::to_owned));
+    let script = STUCK_MOUNT.replace("USER", &STUCK.to_string());
+    let hold = || -> Result<Process> {
+        let mut holder = Process::start(&enter, "python3", ["-c", &script])?;
+        holder.wait_for("ready", Duration::from_secs(10))?;
+        Ok(holder)
+    };
+    let holder = hold()?;
+    let came = Instant::now();
+    agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
+    eprintln!("it is noticed after {:?}", came.elapsed());
+    let reason = agent.request("/readyz").unwrap_err().to_string();
+    let said = "capture.shm: its thread has made no progress for ";
+    assert!(reason.contains(said), "{reason}");
+
+    // The rest goes on.
+    let mut sender = Sender::between(&link.monitor, &link.robot)?;
+    let mut talker = Talker::new(1, "/beside");
+    introduce(&talker, &mut sender)?;
+    talk(&mut talker, &mut sender, [320; 500])?;
+    let page = agent.settled_scrape("/beside", 500)?;
+    let counted = page.sum("ros2_topic_messages_total", &[("topic", "/beside")]);
+    assert_eq!(counted, 500.0, "{}", page.0);
+
+    // The kernel ends the wait with the file system.
+    drop(holder);
+    agent.scrape_until("shared memory is seen again", is_able)?;
+    agent.wait_ready(Duration::from_secs(10))?;
+    let _holder = hold()?;
+    agent.scrape_until("shared memory is not seen", |page| !is_able(page))?;
+    agent.process.signal("TERM")?;
+    let began = Instant::now();
+    let status = agent.process.wait(Duration::from_secs(8))?;
+    assert!(status.success(), "{status}");
+    eprintln!("it ends within {:?}", began.elapsed());
+    Ok(())
+}
+
+/// Writes a program that starts `rp` as a user and group with these capabilities alone. The user may
+/// be unable to read the build directory, so the program starts a copy.
+fn start_as(user: u32, capabilities: &str, directory: &TempDir) -> Result<PathBuf> {
+    let file = |name: &str| directory.path().join(name);
+    std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
+    let script = format!(
+        "#!/bin/sh\nexec setpriv --reuid {user} --regid {user} --clear-groups \
+         --inh-caps {capabilities} --ambient-caps {capabilities} --bounding-set {capabilities} \
+         {} \"$@\"\n",
+        file("rp").display()
+    );
+    std::fs::write(file("start"), script)?;
+    for open in ["", "start", "rp"] {
+        std::fs::set_permissions(file(open), Permissions::from_mode(0o755))?;
+    }
+    Ok(file("start"))
 }
 
 /// Sends announcements of more participants than the table holds, each every other second as a real

@@ -2,7 +2,7 @@
 //! inside by a running agent.
 
 use std::path::Path;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context as _, Result, ensure};
 use ros2probe_api::chains::ChainList;
@@ -11,6 +11,7 @@ use ros2probe_testing::harness::agent::Agent;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
 use ros2probe_testing::harness::traced_program::TracedProgram;
+use ros2probe_testing::harness::usage::Usage;
 use ros2probe_testing::harness::{run, wait_until};
 
 const RP: &str = env!("CARGO_BIN_EXE_rp");
@@ -103,7 +104,8 @@ fn a_chain_by_causality_takes_as_long_as_its_processes_say() -> Result<()> {
 
 /// Images of containers: each has a library of its own, which is in no usual place.
 const IMAGES: usize = 4;
-/// Time from the start of a process to its first call; rclcpp takes longer.
+/// CPU time from the start of a process to its first call. rclcpp takes longer, and a busy machine
+/// delays it as it delays the agent.
 const LOADING: Duration = Duration::from_millis(150);
 
 #[test]
@@ -117,7 +119,9 @@ fn a_library_of_another_inode_is_observed_from_the_first_call_on() -> Result<()>
         let (node, topic) = (format!("node{image}"), format!("/topic{image}"));
         let arguments = ["/in", &topic, &node];
         let mut process = Process::start(&host.inside(), program.program(), arguments)?;
-        std::thread::sleep(LOADING);
+        let own = std::process::id();
+        let before = Usage::of(own)?;
+        while Usage::of(own)?.since(&before).cpu < LOADING {}
         process.write_line("init")?;
         process.wait_for("init", PATIENCE)?;
         process.write_line(&format!("publish {MESSAGES}"))?;
@@ -155,4 +159,51 @@ fn agent<'n>(host: &'n Namespace, directory: &Path) -> Result<Agent<'n>> {
     let text = format!("{capture}api: {{socket: {}}}\n", socket.display());
     std::fs::write(&configuration, text)?;
     Agent::start(host, RP, &configuration)
+}
+
+/// More than a robot has; 64 are attached to at most.
+const LIBRARIES: usize = 8;
+/// Maps each of its arguments as code, and waits.
+const MAP: &str = "
+import mmap, sys
+code = [open(path, 'rb') for path in sys.argv[1:]]
+maps = [mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ | mmap.PROT_EXEC) for file in code]
+print('mapped', flush=True)
+sys.stdin.readline()
+";
+
+#[test]
+fn the_end_with_many_libraries_attached_is_within_the_time_that_the_unit_allows() -> Result<()> {
+    let unit = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../systemd/ros2probe.service");
+    let text = std::fs::read_to_string(unit)?;
+    let allowed = text.lines().find_map(|line| {
+        let seconds = line.strip_prefix("TimeoutStopSec=")?.strip_suffix('s')?;
+        seconds.parse().ok().map(Duration::from_secs)
+    });
+    let allowed = allowed.context("no TimeoutStopSec in seconds")?;
+    let host = Namespace::alone()?;
+    let directory = tempfile::tempdir()?;
+    let program = TracedProgram::build(248, &[])?;
+    let mut arguments = vec!["-c".to_owned(), MAP.to_owned()];
+    for number in 0..LIBRARIES {
+        let place = directory.path().join(number.to_string());
+        std::fs::create_dir(&place)?;
+        let library = place.join("libtracetools.so");
+        std::fs::copy(program.library(), &library)?;
+        arguments.push(library.to_str().context("path")?.to_owned());
+    }
+    let mut agent = agent(&host, directory.path())?;
+    let mut process = Process::start(&host.inside(), "python3", &arguments)?;
+    process.wait_for("mapped", PATIENCE)?;
+    agent.scrape_until("all libraries are attached", |page| {
+        let attached = [("state", "attached")];
+        page.sum("ros2probe_inside_library_info", &attached) >= LIBRARIES as f64
+    })?;
+    let began = Instant::now();
+    agent.process.signal("TERM")?;
+    let status = agent.process.wait(allowed)?;
+    let took = began.elapsed();
+    println!("the end took {took:.1?} with {LIBRARIES} libraries");
+    ensure!(status.success(), "{status}");
+    Ok(())
 }

@@ -26,6 +26,7 @@ use ros2probe_testing::harness::PREFIX;
 use ros2probe_testing::harness::cgroup::Cgroup;
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::witness::{Testimony, Witness};
+use ros2probe_wire::Expansion;
 
 /// Every topic, hidden ones too.
 const EVERYTHING: &str = "watch: ['/**', '/**/_action/*', '/**/_service_event']\n";
@@ -140,7 +141,10 @@ impl Counts {
         let mut observer = Observer::new(Settings::default());
         observer.input(Input::Watchlist(Arc::new(Watchlist::new(config.watches)?)));
         let mut feed = FrameDecoder::new(Limits::default());
-        feed.run(&mut PcapReader::open(capture)?, &mut observer)?;
+        feed.run(
+            &mut PcapReader::open(capture, Expansion::Limited)?,
+            &mut observer,
+        )?;
         let losses = observer.journal().losses();
         Ok(Counts::of(&observer.snapshot(feed.last()), losses))
     }

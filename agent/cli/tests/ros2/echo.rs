@@ -204,7 +204,7 @@ fn bytes(hex: &str) -> Vec<u8> {
         .collect()
 }
 
-/// The names of all `.msg` files below the prefix.
+/// The names of all messages below the prefix. Code was generated of a file with an `.idl` beside it.
 fn installed_types() -> BTreeSet<String> {
     let share = installed::prefix().join("share");
     let entries = |directory: PathBuf| {
@@ -215,6 +215,7 @@ fn installed_types() -> BTreeSet<String> {
     entries(share)
         .flat_map(|package| entries(package.join("msg")))
         .filter(|path| path.extension().is_some_and(|extension| extension == "msg"))
+        .filter(|path| path.with_extension("idl").exists())
         .map(|path| {
             let package = path.parent().unwrap().parent().unwrap();
             format!("{}/msg/{}", stem(package), stem(&path))

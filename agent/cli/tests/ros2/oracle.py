@@ -211,7 +211,9 @@ def printed(type_name, payload, options):
 def types():
     for package, prefix in sorted(get_packages_with_prefixes().items()):
         for path in sorted(Path(prefix, "share", package, "msg").glob("*.msg")):
-            yield f"{package}/msg/{path.stem}"
+            # Without it no code was generated.
+            if path.with_suffix(".idl").exists():
+                yield f"{package}/msg/{path.stem}"
 
 
 def main():

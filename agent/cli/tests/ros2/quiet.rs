@@ -37,8 +37,14 @@ fn fast_dds_with_shared_memory_raises_no_alarm() -> Result<()> {
 
 #[test]
 #[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
-fn fast_dds_with_the_uprobe_raises_no_alarm() -> Result<()> {
+fn fast_dds_with_a_uprobe_on_demand_raises_no_alarm() -> Result<()> {
     raises_no_alarm(Middleware::FastExact("auto"))
+}
+
+#[test]
+#[ignore = "needs ROS 2 with rmw_fastrtps_cpp: make test-ros2"]
+fn fast_dds_whose_every_message_is_seen_raises_no_alarm() -> Result<()> {
+    raises_no_alarm(Middleware::FastExact("uprobe"))
 }
 
 #[test]
@@ -73,10 +79,17 @@ fn raises_no_alarm(middleware: Middleware) -> Result<()> {
     let mut publisher = host.python("robot.py", &["publish", &log("publish"), &length])?;
     publisher.wait_for("matched", PATIENCE)?;
     publisher.write_line("go")?;
+    // Polling may miss the only message of a slow topic; its next one comes after 50 s.
+    let is_polled = matches!(
+        middleware,
+        Middleware::FastSampled | Middleware::FastExact("auto")
+    );
     let all_measured = |page: &Scrape| {
-        EXPECTED
-            .iter()
-            .all(|(topic, ..)| page.sum("ros2_topic_messages_total", &[("topic", topic)]) > 0.0)
+        let mut expected = EXPECTED.iter();
+        expected.all(|(topic, ..)| {
+            let messages = page.sum("ros2_topic_messages_total", &[("topic", topic)]);
+            messages > 0.0 || (is_polled && *topic == "/mode")
+        })
     };
     let start = Instant::now();
     agent.scrape_until("all topics are measured", all_measured)?;

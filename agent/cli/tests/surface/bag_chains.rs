@@ -8,6 +8,7 @@ use std::process::{Command, Output, Stdio};
 
 use ros2probe_bag::messages;
 use ros2probe_testing::repository;
+use ros2probe_wire::Expansion;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -37,7 +38,7 @@ fn converted(directory: &Path) -> PathBuf {
 
 fn recorded(bag: &Path) -> Vec<Recorded> {
     let mut all = Vec::new();
-    let read = messages::read(bag, &mut |message, _| {
+    let read = messages::read(bag, Expansion::Limited, &mut |message, _| {
         all.push(Recorded {
             topic: message.topic.to_owned(),
             type_name: message.type_name.to_owned(),

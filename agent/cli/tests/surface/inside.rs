@@ -107,7 +107,9 @@ fn page(observer: &Observer, source: Option<InsideSourceFacts>) -> String {
     };
     let snapshot = observer.snapshot(Timestamp(START + 10 * SECOND));
     sources.latest.publish(snapshot, agent);
-    Exposition::new(sources).render(Format::Classic).unwrap()
+    Exposition::new(sources)
+        .render(Format::OpenMetrics)
+        .unwrap()
 }
 
 #[test]

@@ -30,6 +30,7 @@ mod http;
 mod inside;
 mod learn;
 mod limits;
+mod memory_reader;
 mod metrics;
 mod otlp;
 mod otlp_tls;

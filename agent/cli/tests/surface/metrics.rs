@@ -9,7 +9,7 @@ use std::sync::Arc;
 
 use ros2probe_daemon::agent_facts::{Ability, AgentFacts, SourceKind};
 use ros2probe_daemon::config::{Expectations, Watch};
-use ros2probe_daemon::config::{Limits, limits_markdown};
+use ros2probe_daemon::config::{Limits, limits_markdown, tables_markdown};
 use ros2probe_daemon::events;
 use ros2probe_daemon::recording::SnapshotFigures;
 use ros2probe_daemon::settings_cell::Settings;
@@ -17,9 +17,11 @@ use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind, markdown};
 use ros2probe_daemon::surface::otlp::Signal;
 use ros2probe_daemon::surface::ros2_daemon::PortState;
 use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
+use ros2probe_model::bounded::Table;
 use ros2probe_model::snapshot::{
     DeliveryFacts, Direction, Snapshot, WatchFacts, WatchState, WatchedTopicFacts,
 };
+use ros2probe_model::tables::ALL;
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_testing::local_agent::promtool;
 use ros2probe_testing::sample_robot;
@@ -136,6 +138,18 @@ fn the_book_s_tables_are_those_of_the_sources() {
             metrics_on(page),
         )
     };
+    let is_derived = |table: &Table| {
+        let derived = [
+            "calls", "chain", "inside", "services", "spans", "trace", "zenoh",
+        ];
+        derived.iter().any(|name| table.name.starts_with(name))
+    };
+    let tables = |page, derived| {
+        let tables = ALL.iter().filter(|table| is_derived(table) == derived);
+        let tables: Vec<_> = tables.copied().collect();
+        let (begin, end) = ("model/src/tables.rs -->\n", "<!-- tables: end");
+        (page, begin, end, tables_markdown(&tables))
+    };
     for (page, begin, end, wanted) in [
         metrics("metrics-graph.md"),
         metrics("metrics-topics.md"),
@@ -154,6 +168,8 @@ fn the_book_s_tables_are_those_of_the_sources() {
             "<!-- limits: end",
             limits_markdown(),
         ),
+        tables("limits-model.md", false),
+        tables("limits-tables.md", true),
     ] {
         let path = docs.join(page);
         let text = std::fs::read_to_string(&path).unwrap();
@@ -184,7 +200,8 @@ fn values_are_what_the_snapshot_says() {
         ("ros2_topic_rate_hertz", "19.98"),
         (
             "ros2_topic_last_message_timestamp_seconds",
-            "1700000000.1234567",
+            // The encoder's shortest form of 1700000000.1234567.
+            "1700000000.1234568",
         ),
         ("ros2_topic_interarrival_seconds_count", "1000"),
     ] {
@@ -195,7 +212,7 @@ fn values_are_what_the_snapshot_says() {
         );
     }
     let bucket = |le: &str| {
-        let labels = format!("{{le=\"{le}\",domain_id=\"0\",topic=\"/points\"}}");
+        let labels = format!("{{domain_id=\"0\",topic=\"/points\",le=\"{le}\"}}");
         sample(
             &page,
             &format!("ros2_topic_interarrival_seconds_bucket{labels}"),
@@ -531,8 +548,9 @@ fn both_formats_hold_the_same_samples() {
     assert!(open.contains("# TYPE ros2_topic_messages counter\n"));
     assert!(open.contains("# TYPE ros2_topic info\n"));
     assert!(open.contains("# UNIT ros2_topic_interarrival_seconds seconds\n"));
+    assert!(open.contains("_bucket{le=\"0.00001\",") && classic.contains(",le=\"1e-05\"}"));
     // Values that change from scrape to scrape are left out.
-    let samples = |page: &str| -> Vec<String> {
+    let samples = |page: &str| -> BTreeSet<String> {
         let steady = |line: &&str| {
             ![
                 "#",
@@ -543,9 +561,30 @@ fn both_formats_hold_the_same_samples() {
             .iter()
             .any(|prefix| line.starts_with(prefix))
         };
-        page.lines().filter(steady).map(str::to_owned).collect()
+        page.lines().filter(steady).map(normalised).collect()
     };
     assert_eq!(samples(&open), samples(&classic));
+}
+
+/// Returns the sample with the bound of its bucket at the end, and with numbers as Rust writes them:
+/// the formats differ in both.
+fn normalised(sample: &str) -> String {
+    let number = |text: &str| text.parse::<f64>().unwrap();
+    let (series, value) = sample.rsplit_once(' ').unwrap();
+    let value = number(value);
+    let bound = ["{le=\"", ",le=\""]
+        .iter()
+        .find_map(|label| series.split_once(label));
+    let Some((before, after)) = bound else {
+        return format!("{series} {value:?}");
+    };
+    let (bound, after) = after.split_once('"').unwrap();
+    let labels = after.trim_start_matches(',').trim_end_matches('}');
+    let separator = if before.contains('{') { ',' } else { '{' };
+    let series = format!("{before}{separator}{labels}")
+        .trim_end_matches(',')
+        .to_owned();
+    format!("{series}}} le={:?} {value:?}", number(bound))
 }
 
 #[test]

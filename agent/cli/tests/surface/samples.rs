@@ -24,7 +24,7 @@ use ros2probe_testing::local_agent::LocalAgent;
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, EntityId, Expansion, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 const START: u64 = 1_795_143_000 * SECOND;
 const WRITER: EntityId = EntityId([0, 0, 0x11, 0x03]);
@@ -76,7 +76,7 @@ pub(crate) fn replayed(capture: &Path, depth: Option<Depth>) -> (Snapshot, Vec<S
     if let Some(depth) = depth {
         observer.input(Input::SampleRequests(Arc::new(vec![request(1, depth)])));
     }
-    let mut reader = PcapReader::open(capture).unwrap();
+    let mut reader = PcapReader::open(capture, Expansion::Limited).unwrap();
     let mut feed = FrameDecoder::new(Limits::default());
     let mut news = Vec::new();
     let mut take = |observer: &mut Observer| {

@@ -4,6 +4,7 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+use ros2probe_model::bounded::{CONFIGURED, Table};
 use ros2probe_model::limits::{Limit, Limits, Row};
 use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::Deserialize;
@@ -90,4 +91,34 @@ pub fn markdown() -> String {
         );
     }
     table
+}
+
+/// Returns the bounded tables as a Markdown table, for `docs/limits-tables.md`.
+#[must_use]
+pub fn tables_markdown(tables: &[Table]) -> String {
+    let mut text = "| table | counts | entries | bytes | at a cap | reported by |\n\
+                    | --- | --- | --- | --- | --- | --- |\n"
+        .to_owned();
+    for table in tables {
+        let entries = match table.entries {
+            CONFIGURED => "configured".to_owned(),
+            entries => entries.to_string(),
+        };
+        let bytes = table
+            .bytes
+            .map_or_else(String::new, |bytes| bytes.to_string());
+        let Table {
+            name,
+            what,
+            reported,
+            ..
+        } = table;
+        let (what, effect) = (what.trim(), table.in_words());
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "| `{name}` | {what} | {entries} | {bytes} | {effect} | {reported} |"
+        );
+    }
+    text
 }

@@ -21,7 +21,7 @@ use schemars::JsonSchema;
 use serde::Deserialize;
 
 use crate::events::Trigger;
-pub use limits::markdown as limits_markdown;
+pub use limits::{markdown as limits_markdown, tables_markdown};
 pub use mistake::{Mistake, Mistakes, Position};
 pub use otlp_endpoint::otlp_endpoint;
 pub use ros2probe_capture::settings::{

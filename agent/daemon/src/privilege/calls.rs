@@ -2,8 +2,8 @@
 //!
 //! A refused call fails with `EPERM`, as without a privilege. Calls that C libraries try before an
 //! older allowed one fail with `ENOSYS`, which makes them use that one. Some calls are restricted
-//! by their arguments: memory never becomes executable, no process is created, and threads that
-//! read the network or other processes open no file for writing.
+//! by their arguments: memory never becomes executable, only the reader of memory creates
+//! processes, and threads that read the network or other processes open no file for writing.
 
 use std::collections::BTreeMap;
 
@@ -276,9 +276,17 @@ impl Allowed {
                 allowed.always(NOTICE);
                 allowed.attach_probes(&[])?;
             }
-            Role::Inside => {
-                allowed.always(&[libc::SYS_process_vm_readv]);
-                allowed.attach_probes(&command::MAPS)?;
+            Role::Inside => allowed.attach_probes(&command::MAPS)?,
+            Role::MemoryReader => {
+                let spaces = libc::CLONE_NEWUSER | libc::CLONE_NEWNS | libc::CLONE_NEWNET;
+                let plain = condition(0, SeccompCmpOp::MaskedEq(wide(spaces)), 0)?;
+                allowed.when(libc::SYS_clone, &[plain])?;
+                allowed.always(&[
+                    libc::SYS_kill,
+                    libc::SYS_pipe2,
+                    libc::SYS_process_vm_readv,
+                    libc::SYS_wait4,
+                ]);
             }
         }
         Ok(allowed)

@@ -63,8 +63,10 @@ pub enum Role {
     },
     /// Attaching uprobes to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
     Exact,
-    /// As [`Role::Exact`], and reading the programs' maps, and the environment of observed processes.
+    /// As [`Role::Exact`], and reading the programs' maps.
     Inside,
+    /// The process that reads memory of other processes: `CAP_SYS_PTRACE`. Forks, opens nothing.
+    MemoryReader,
 }
 
 /// A thread could not be confined.
@@ -151,7 +153,9 @@ impl Role {
             Self::Service | Self::Serve | Self::Export | Self::Ros2Daemon => nothing,
             Self::Capture { needs_bpf } => bpf(needs_bpf),
             Self::Reattach { needs_bpf } => CapabilitySet::NET_ADMIN | bpf(needs_bpf),
-            Self::SharedMemory { needs_nice: false } => CapabilitySet::SYS_PTRACE,
+            Self::SharedMemory { needs_nice: false } | Self::MemoryReader => {
+                CapabilitySet::SYS_PTRACE
+            }
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }

@@ -369,7 +369,13 @@ impl Run {
             if keeper.wants(revision, now) {
                 keeper.keep(self.observer.memory(), revision, now);
             }
-            facts.state = Some(keeper.facts());
+            let state = keeper.facts();
+            facts.state = Some(state);
+            let stalled = state.stalled.map(|long| {
+                let seconds = long.as_secs();
+                format!("state_directory: its file system has not answered for {seconds} s")
+            });
+            facts.stalled = facts.stalled.or(stalled);
         }
         for drop in self.drops.check(&facts, Instant::now()) {
             self.outputs.events.record(drop);

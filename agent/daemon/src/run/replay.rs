@@ -7,8 +7,8 @@ use std::path::Path;
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::{Duration, Instant};
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::frame::Link;
+use ros2probe_wire::{Expansion, Timestamp};
 use tokio::sync::watch;
 
 use super::CaptureTime;
@@ -119,8 +119,13 @@ impl Replay {
     /// # Errors
     ///
     /// The file cannot be read, is not a capture, or has an unsupported link layer.
-    pub fn open(path: &Path, speed: Speed, limits: Limits) -> Result<Self, PcapError> {
-        let reader = PcapReader::open(path)?;
+    pub fn open(
+        path: &Path,
+        expansion: Expansion,
+        speed: Speed,
+        limits: Limits,
+    ) -> Result<Self, PcapError> {
+        let reader = PcapReader::open(path, expansion)?;
         if let Some(link) = reader.link().filter(|link| !link.is_supported()) {
             return Err(PcapError::UnsupportedLink { link });
         }

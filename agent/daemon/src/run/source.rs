@@ -17,7 +17,7 @@ use crate::agent_facts::{
 };
 use crate::config::CaptureSettings;
 use ros2probe_capture::host_tap::HostTap;
-use ros2probe_capture::live::{CaptureError, LiveSource};
+use ros2probe_capture::live::{CaptureError, LiveSource, Part};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
 use ros2probe_capture::zenoh::Streams;
@@ -169,6 +169,7 @@ impl Source {
                 table,
                 size: sizes().map(|size| size.entries as u64).sum(),
                 limit: sizes().map(|size| size.cap as u64).sum(),
+                bytes: None,
                 evictions,
             }
         };
@@ -239,6 +240,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         dropped: None,
     }));
     let gone = live.gone();
+    let stalled = live.stalled().next().map(|stalled| stalled.to_string());
     let pending = live.pending();
     let counters = live.counters().unwrap_or_default();
     let value = |wanted: Counter| {
@@ -268,6 +270,7 @@ fn live_facts(live: &mut LiveSource, now: Instant) -> AgentFacts {
         on_demand: on_demand(live),
         blind: blind(live),
         gone,
+        stalled,
         pending,
         attached_anew: live.attached_anew(),
         pieces_dropped: value(Counter::PiecesLost),
@@ -311,8 +314,14 @@ fn inside(live: &LiveSource) -> Option<InsideSourceFacts> {
         },
         libraries: libraries.collect(),
         counters: facts.counters,
-        reason_off: facts.detached,
+        reason_off: facts.detached.or_else(|| stalled(live, Part::Inside)),
     })
+}
+
+/// Why a part of the source is stalled; `None` if it is not.
+fn stalled(live: &LiveSource, part: Part) -> Option<String> {
+    let stalled = live.stalled().find(|stalled| stalled.part == part);
+    stalled.map(|stalled| stalled.to_string())
 }
 
 /// State of exact mode for each library. Empty if it is off.
@@ -380,13 +389,15 @@ fn abilities(live: &LiveSource) -> Vec<Ability> {
     if live.host().is_some() && live.is_on_the_wire() {
         abilities.push(Ability::Forwarded);
     }
-    if live.looks_at_shared_memory() {
+    let is_stalled = |part| stalled(live, part).is_some();
+    if live.looks_at_shared_memory() && !is_stalled(Part::SharedMemory) {
         abilities.push(Ability::SharedMemory);
     }
-    if live.exact().is_some_and(|facts| facts.uncovered.is_none()) {
+    let is_exact = live.exact().is_some_and(|facts| facts.uncovered.is_none());
+    if is_exact && !is_stalled(Part::Exact) {
         abilities.push(Ability::SharedMemoryExact);
     }
-    if live.inside().is_some() {
+    if live.inside().is_some() && !is_stalled(Part::Inside) {
         abilities.push(Ability::Inside);
     }
     abilities
@@ -414,8 +425,12 @@ fn blind(live: &LiveSource) -> Vec<(Ability, String)> {
         .collect();
     let uncovered = live.exact().and_then(|facts| facts.uncovered);
     let exact = live.without_exact().map(str::to_owned).or(uncovered);
+    let exact = exact.or_else(|| stalled(live, Part::Exact));
     blind.extend(exact.map(|reason| (Ability::SharedMemoryExact, reason)));
+    let shared_memory = stalled(live, Part::SharedMemory);
+    blind.extend(shared_memory.map(|reason| (Ability::SharedMemory, reason)));
     let inside = live.without_inside().map(str::to_owned);
+    let inside = inside.or_else(|| stalled(live, Part::Inside));
     blind.extend(inside.map(|reason| (Ability::Inside, reason)));
     blind
 }

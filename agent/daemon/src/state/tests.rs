@@ -242,6 +242,24 @@ fn a_disk_that_cannot_be_written_costs_a_counter_and_nothing_else() {
 }
 
 #[test]
+fn a_file_system_that_never_answers_delays_neither_the_agent_nor_its_end() {
+    let (_place, directory) = directory();
+    let (answer, answers) = std::sync::mpsc::channel::<()>();
+    let keeper = StateWriter::start_with(Arc::new(directory), move |_| {
+        let _ = answers.recv();
+        Ok(())
+    });
+    let mut keeper = keeper.unwrap();
+    for revision in 0..10 {
+        keeper.keep(Memory::default(), revision, Instant::now());
+    }
+    let began = Instant::now();
+    assert!(!keeper.finish_until(Memory::default(), began + Duration::from_millis(100)));
+    assert!(began.elapsed() < Duration::from_secs(5));
+    drop(answer);
+}
+
+#[test]
 fn a_file_of_more_bytes_than_are_read_is_kept_aside() {
     let (place, directory) = directory();
     let file = File::create(place.path().join(FILE)).unwrap();

@@ -150,6 +150,13 @@ pub(super) fn model(
     sink.family(&metric::TABLE_LIMIT, |family| {
         tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.limit))
     })?;
+    let bytes = || tables().filter_map(|table| Some((table.table, table.bytes?)));
+    sink.family(&metric::TABLE_BYTES, |family| {
+        bytes().try_for_each(|(table, (bytes, _))| family.sample(&[Label::Text(table)], bytes))
+    })?;
+    sink.family(&metric::TABLE_BYTES_LIMIT, |family| {
+        bytes().try_for_each(|(table, (_, cap))| family.sample(&[Label::Text(table)], cap))
+    })?;
     sink.family(&metric::TABLE_EVICTIONS, |family| {
         tables().try_for_each(|table| family.sample(&[Label::Text(table.table)], table.evictions))
     })?;

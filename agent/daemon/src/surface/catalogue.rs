@@ -122,6 +122,14 @@ impl Metric {
         }
         .unwrap_or(self.name)
     }
+
+    /// Returns the name of the family without its unit.
+    pub(super) fn stem(&self) -> &'static str {
+        let unit = self.unit.unwrap_or_default();
+        let stem = self.family().strip_suffix(unit);
+        stem.and_then(|stem| stem.strip_suffix('_'))
+            .unwrap_or_else(|| self.family())
+    }
 }
 
 impl Kind {
@@ -552,6 +560,8 @@ pub const CATALOGUE: &[Metric] = &[
     DECODE_ERRORS,
     TABLE_ENTRIES,
     TABLE_LIMIT,
+    TABLE_BYTES,
+    TABLE_BYTES_LIMIT,
     TABLE_EVICTIONS,
     LIMIT,
     LIMIT_USED,
@@ -656,8 +666,9 @@ mod tests {
             } = metric;
             assert_eq!(name.ends_with("_total"), *kind == Kind::Counter, "{name}");
             assert_eq!(name.ends_with("_info"), *kind == Kind::Info, "{name}");
+            let of_stem = unit.map(|unit| format!("{}_{unit}", metric.stem()));
             assert!(
-                unit.is_none_or(|unit| name.contains(&format!("_{unit}"))),
+                of_stem.is_none_or(|of_stem| of_stem == metric.family()),
                 "{name}"
             );
             assert!(

@@ -1,13 +1,21 @@
 //! A scrape as text: OpenMetrics 1.0 if the client requests it, otherwise classic Prometheus text.
-//! Both use the same writer, so they cannot differ in content.
+//! `prometheus-client` writes both from one collector over the catalogue and the snapshot; its
+//! registry holds no series.
+//!
+//! Classic text stays because some clients request nothing else: VictoriaMetrics, Telegraf and
+//! Netdata by default, the Datadog agent without `use_latest_spec`, and browsers.
 
 use std::fmt::{self, Write};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, prometheus_text, text};
+use prometheus_client::registry::Registry;
+
 use super::collect::{MetricSources, collect};
 use super::metric_sink::MetricSink;
-use super::text::Text;
 
 /// The two text formats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,8 +29,15 @@ pub enum Format {
 /// Writes scrapes.
 #[derive(Debug)]
 pub struct Exposition {
+    registry: Registry,
+    last_scrape_nanoseconds: Arc<AtomicU64>,
+}
+
+/// The collector of all families.
+#[derive(Debug)]
+struct Page {
     sources: MetricSources,
-    last_scrape_nanoseconds: AtomicU64,
+    last_scrape_nanoseconds: Arc<AtomicU64>,
 }
 
 impl Format {
@@ -63,7 +78,7 @@ impl Format {
     pub const fn content_type(self) -> &'static str {
         match self {
             Self::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
-            Self::Classic => "text/plain; version=0.0.4; charset=utf-8",
+            Self::Classic => prometheus_text::CONTENT_TYPE,
         }
     }
 }
@@ -74,9 +89,15 @@ impl Exposition {
     /// Creates an exposition of these sources.
     #[must_use]
     pub fn new(sources: MetricSources) -> Self {
-        Self {
+        let last_scrape_nanoseconds = Arc::default();
+        let mut registry = Registry::default();
+        registry.register_collector(Box::new(Page {
             sources,
-            last_scrape_nanoseconds: AtomicU64::new(0),
+            last_scrape_nanoseconds: Arc::clone(&last_scrape_nanoseconds),
+        }));
+        Self {
+            registry,
+            last_scrape_nanoseconds,
         }
     }
 
@@ -90,20 +111,25 @@ impl Exposition {
         Ok(page)
     }
 
-    /// Writes the complete page.
+    /// Writes the complete page, in pieces of a few kilobytes.
     ///
     /// # Errors
     /// Fails if `page` does.
     pub fn write(&self, format: Format, page: &mut impl Write) -> fmt::Result {
         let start = Instant::now();
-        let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));
-        let mut text = MetricSink::Text(Text::new(page, format));
-        collect(&mut text, &self.sources, last)?;
-        if let MetricSink::Text(mut text) = text {
-            text.end()?;
+        match format {
+            Format::OpenMetrics => text::encode(page, &self.registry)?,
+            Format::Classic => prometheus_text::encode(page, &self.registry)?,
         }
         let took = u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX);
         self.last_scrape_nanoseconds.store(took, Ordering::Relaxed);
         Ok(())
+    }
+}
+
+impl Collector for Page {
+    fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));
+        collect(&mut MetricSink::Page(encoder), &self.sources, last)
     }
 }

@@ -1,21 +1,26 @@
-//! Metric families and samples, written from facts in the catalogue's order, as text or as OTLP
-//! data points. Writers need not know which.
+//! Metric families and samples, written from facts in the catalogue's order, to the encoder of a
+//! page or as OTLP data points. Writers need not know which.
 //!
 //! No state is kept between two pages: series vanish with their facts.
 
 use std::collections::hash_map::DefaultHasher;
-use std::fmt;
+use std::fmt::{self, Write as _};
 use std::hash::{Hash as _, Hasher as _};
 use std::net::SocketAddr;
 
+use prometheus_client::encoding::{
+    DescriptorEncoder, EncodeLabelSet, LabelSetEncoder, MetricEncoder, NoLabelSet,
+};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::metrics::exemplar::Exemplar;
+use prometheus_client::registry::Unit;
 use ros2probe_model::snapshot::Subscriber;
 use ros2probe_wire::Guid;
 use ros2probe_wire::rtps::VendorId;
 
-use super::catalogue::Metric;
+use super::catalogue::{Kind, Metric};
 use super::otlp::points::Points;
-use super::text::Text;
-use ros2probe_model::histogram::Histogram;
+use ros2probe_model::histogram::{BOUNDS, Histogram};
 
 /// Longest label value in bytes; ROS allows 255 characters, so longer ones are hostile.
 const MAX_LABEL_BYTES: usize = 256;
@@ -40,28 +45,43 @@ pub(super) enum Number {
 
 /// A scrape or export in progress.
 pub(super) enum MetricSink<'a> {
-    Text(Text<'a>),
+    Page(DescriptorEncoder<'a>),
     Points(&'a mut Points),
 }
 
 /// A family in progress; its samples are contiguous.
-pub(super) struct Family<'a, 'b> {
+pub(super) struct Family<'a> {
     metric: &'static Metric,
-    sink: &'a mut MetricSink<'b>,
+    out: FamilyOut<'a>,
 }
 
-impl<'b> MetricSink<'b> {
+enum FamilyOut<'a> {
+    Page(MetricEncoder<'a>),
+    Points(&'a mut Points),
+}
+
+impl MetricSink<'_> {
     /// Begins a family; `samples` writes its samples.
     pub(super) fn family(
         &mut self,
         metric: &'static Metric,
-        samples: impl FnOnce(&mut Family<'_, 'b>) -> fmt::Result,
+        samples: impl FnOnce(&mut Family<'_>) -> fmt::Result,
     ) -> fmt::Result {
         match self {
-            Self::Text(text) => text.begin(metric)?,
-            Self::Points(points) => points.open(metric),
+            Self::Page(encoder) => {
+                // The encoder appends the unit to the name, and for some types a suffix.
+                let (name, unit) = (metric.stem(), metric.unit.map(unit));
+                let kind = metric_type(metric.kind);
+                let family = encoder.encode_descriptor(name, metric.help, unit.as_ref(), kind)?;
+                let out = FamilyOut::Page(family);
+                samples(&mut Family { metric, out })
+            }
+            Self::Points(points) => {
+                points.open(metric);
+                let out = FamilyOut::Points(points);
+                samples(&mut Family { metric, out })
+            }
         }
-        samples(&mut Family { metric, sink: self })
     }
 
     /// Writes a family with one sample and no labels.
@@ -74,15 +94,26 @@ impl<'b> MetricSink<'b> {
     }
 }
 
-impl Family<'_, '_> {
+impl Family<'_> {
     /// Writes a sample of a counter, gauge or info; the value of an info is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
-        match self.sink {
-            MetricSink::Text(text) => text.sample(self.metric, labels, value.into()),
-            MetricSink::Points(points) => {
+        let family = match &mut self.out {
+            FamilyOut::Page(family) => family,
+            FamilyOut::Points(points) => {
                 points.number(labels, value.into());
-                Ok(())
+                return Ok(());
             }
+        };
+        let labels = LabelSet::new(self.metric, labels);
+        if self.metric.kind == Kind::Info {
+            return family.encode_info(&labels);
+        }
+        let mut sample = family.encode_family(&labels)?;
+        match (self.metric.kind, value.into()) {
+            (Kind::Counter, Number::Count(count)) => sample.encode_counter(&count, NO_EXEMPLAR),
+            (Kind::Counter, Number::Real(real)) => sample.encode_counter(&real, NO_EXEMPLAR),
+            (_, Number::Count(count)) => sample.encode_gauge(&count),
+            (_, Number::Real(real)) => sample.encode_gauge(&real),
         }
     }
 
@@ -93,12 +124,83 @@ impl Family<'_, '_> {
 
     /// Writes a histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
-        match self.sink {
-            MetricSink::Text(text) => text.histogram(self.metric, labels, values),
-            MetricSink::Points(points) => {
+        match &mut self.out {
+            FamilyOut::Page(family) => {
+                let mut buckets = [(0.0, 0); BOUNDS.len() + 1];
+                for (bucket, filled) in buckets.iter_mut().zip(values.buckets()) {
+                    *bucket = filled;
+                }
+                let labels = LabelSet::new(self.metric, labels);
+                family
+                    .encode_family(&labels)?
+                    .encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
+            }
+            FamilyOut::Points(points) => {
                 points.histogram(labels, values);
                 Ok(())
             }
+        }
+    }
+}
+
+const NO_EXEMPLAR: Option<&Exemplar<NoLabelSet, f64>> = None;
+
+fn metric_type(kind: Kind) -> MetricType {
+    match kind {
+        Kind::Counter => MetricType::Counter,
+        Kind::Gauge => MetricType::Gauge,
+        Kind::Histogram => MetricType::Histogram,
+        Kind::Info => MetricType::Info,
+    }
+}
+
+fn unit(unit: &str) -> Unit {
+    match unit {
+        "bytes" => Unit::Bytes,
+        "seconds" => Unit::Seconds,
+        other => Unit::Other(other.to_owned()),
+    }
+}
+
+/// The labels of a sample with their names.
+#[derive(Clone, Copy, Debug)]
+struct LabelSet<'a> {
+    names: &'static [&'static str],
+    values: &'a [Label<'a>],
+}
+
+impl<'a> LabelSet<'a> {
+    fn new(metric: &'static Metric, values: &'a [Label<'a>]) -> Self {
+        let names = metric.labels;
+        debug_assert_eq!(names.len(), values.len(), "{}", metric.name);
+        Self { names, values }
+    }
+}
+
+impl EncodeLabelSet for LabelSet<'_> {
+    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
+        for (name, label) in self.names.iter().zip(self.values) {
+            let mut encoder = encoder.encode_label();
+            let mut key = encoder.encode_label_key()?;
+            key.write_str(name)?;
+            let mut value = key.encode_label_value()?;
+            label.write(&mut value)?;
+            value.finish()?;
+        }
+        Ok(())
+    }
+}
+
+impl Label<'_> {
+    /// Writes the value as text.
+    fn write(&self, out: &mut impl fmt::Write) -> fmt::Result {
+        match self {
+            Self::Text(text) => write_capped(out, text),
+            Self::Number(number) => write!(out, "{number}"),
+            Self::Guid(guid) => write!(out, "{guid}"),
+            Self::Address(address) => write!(out, "{address}"),
+            Self::Vendor(vendor) => write!(out, "{vendor}"),
+            Self::Subscriber(subscriber) => write!(out, "{subscriber}"),
         }
     }
 }

@@ -22,12 +22,12 @@ mod limited_listener;
 mod listen;
 mod metric_sink;
 pub mod otlp;
+mod places;
 mod process;
 pub mod ros2_daemon;
 mod ros2_metrics;
 mod service_metrics;
 mod serving;
-mod text;
 #[cfg(feature = "tls")]
 mod tls;
 pub mod web_config;

@@ -235,7 +235,7 @@ fn place(process: &ProcessFacts) -> [Label<'_>; 4] {
 }
 
 fn per_domain(
-    family: &mut Family<'_, '_>,
+    family: &mut Family<'_>,
     domains: &BTreeMap<DomainId, (usize, usize, usize)>,
     count: fn(&(usize, usize, usize)) -> usize,
 ) -> fmt::Result {
@@ -244,7 +244,7 @@ fn per_domain(
     })
 }
 
-fn nodes(family: &mut Family<'_, '_>, snapshot: &Snapshot) -> fmt::Result {
+fn nodes(family: &mut Family<'_>, snapshot: &Snapshot) -> fmt::Result {
     let participants: BTreeMap<_, _> = snapshot
         .participants
         .iter()
@@ -449,7 +449,7 @@ pub(super) fn writers(
 
 /// Writes a sample for each topic that is measured or watched; a watched topic begins with 0.
 fn measured(
-    family: &mut Family<'_, '_>,
+    family: &mut Family<'_>,
     rows: &[TopicRow<'_>],
     value: impl Fn(&Measurement) -> Option<Number>,
 ) -> fmt::Result {
@@ -468,7 +468,7 @@ fn measured(
 /// Writes a value per second of each measured topic where it is known; 0 of a watched name without a
 /// topic.
 fn per_second(
-    family: &mut Family<'_, '_>,
+    family: &mut Family<'_>,
     rows: &[TopicRow<'_>],
     value: impl Fn(&TopicFacts) -> Option<f64>,
 ) -> fmt::Result {
@@ -484,7 +484,7 @@ fn per_second(
     Ok(())
 }
 
-fn topic_info(family: &mut Family<'_, '_>, row: &TopicRow<'_>) -> fmt::Result {
+fn topic_info(family: &mut Family<'_>, row: &TopicRow<'_>) -> fmt::Result {
     let Some(facts) = row.facts else {
         return Ok(());
     };
@@ -526,7 +526,7 @@ fn joined<'a>(values: impl Iterator<Item = &'a str>) -> String {
     text
 }
 
-fn each_writer(family: &mut Family<'_, '_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
+fn each_writer(family: &mut Family<'_>, row: &TopicRow<'_>, value: Count) -> fmt::Result {
     let mut seen = BTreeSet::new();
     for writer in row.facts.iter().flat_map(|facts| &facts.publishers) {
         let Some(measured) = &writer.measurement else {

@@ -8,8 +8,9 @@ use std::mem;
 use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use ros2probe_capture::threads::Progress;
 use ros2probe_wire::DomainId;
 use serde::{Deserialize, Serialize};
 
@@ -17,7 +18,7 @@ use crate::config::watch::{
     ExpectationValues, Expectations, Retain, Watch, check_pattern, check_trace,
 };
 use crate::config::{Limit, check_globs};
-use crate::state::{Form, Found, Newer, StateDirectory, from_json};
+use crate::state::{ENDING, Form, Found, Newer, StateDirectory, from_json, join_until};
 
 const FILE: &str = "watches.json";
 /// Version of the written format. Fields added so far may be missing in a file. Further fields need
@@ -30,7 +31,7 @@ const FORM: Form<Document> = Form {
 /// Changes within this time are written once.
 const WRITE_DELAY: Duration = Duration::from_millis(50);
 /// Time after a failure until the next attempt.
-const AGAIN: Duration = Duration::from_secs(30);
+const AGAIN: Duration = Duration::from_secs(5);
 
 /// Saved watches at the start.
 #[derive(Debug, PartialEq)]
@@ -91,6 +92,7 @@ pub(super) struct WatchWriter {
 struct Mailbox {
     pending: Mutex<Pending>,
     changed: Condvar,
+    progress: Progress,
 }
 
 #[derive(Debug, Default)]
@@ -215,19 +217,20 @@ impl WatchWriter {
         self.mailbox.changed.notify_one();
     }
 
-    /// Returns whether the last write succeeded.
+    /// Returns whether the last write succeeded, and the present one takes no longer than usual.
     pub(super) fn works(&self) -> bool {
-        !self.mailbox.pending().is_failing
+        !self.mailbox.pending().is_failing && self.mailbox.progress.stalled().is_none()
     }
 
-    /// Waits until the latest list is written, or its write has failed.
+    /// Waits until the latest list is written, or its write has failed, for at most [`ENDING`].
     pub(super) fn finish(&self) {
         self.mailbox.pending().is_closed = true;
         self.mailbox.changed.notify_one();
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(thread) = thread.take() {
-            // If it has panicked, the panic is in the log.
-            let _ = thread.join();
+        if let Some(thread) = thread.take()
+            && !join_until(thread, Instant::now() + ENDING)
+        {
+            tracing::error!("the file system does not answer: the added watches are not saved");
         }
     }
 }
@@ -243,7 +246,9 @@ impl Mailbox {
                 version: VERSION,
                 watches: watches.iter().map(|watch| Line::from(&**watch)).collect(),
             };
+            self.progress.step();
             let written = directory.replace(FILE, &document);
+            self.progress.rest();
             let mut pending = self.pending();
             let failed_before = mem::replace(&mut pending.is_failing, written.is_err());
             // At the end, a failing disk is not retried forever.
@@ -285,7 +290,6 @@ impl Mailbox {
 #[cfg(test)]
 mod tests {
     use std::fs;
-    use std::time::Instant;
 
     use super::*;
 

@@ -70,6 +70,22 @@ fn utf_16_is_put_together_also_where_a_unit_has_four_octets() {
 }
 
 #[test]
+fn a_byte_order_mark_begins_no_wide_string() {
+    for (units, shown) in [
+        (&b"\xff\xfea\0"[..], "a"),
+        (b"\xfe\xff\0a", "a"),
+        (b"\xff\xfe", ""),
+        (b"a\0\xff\xfe", "a\\ufeff"),
+        (b"\xff\xfe\xff\xfe", "\\ufeff"),
+    ] {
+        let length = u32::try_from(units.len()).unwrap().to_le_bytes();
+        let payload = [&b"\0\x07\0\0"[..], &length, units].concat();
+        let expected = format!("a.msg.B(w='{shown}')");
+        assert_eq!(text("wstring w", &payload), expected);
+    }
+}
+
+#[test]
 fn what_cannot_be_read_is_refused_by_name() {
     let refused = |id: u8| read("uint8 a", &[0, id, 0, 0, 1]).unwrap_err().to_string();
     assert_eq!(

@@ -14,8 +14,9 @@ use super::path::Paths;
 use super::spans::ChainTracer;
 use super::spans::causal::{Step, Traced};
 use super::trace::{Method, Path, Point, Trace};
+use crate::bounded::Bounded;
 use crate::names::{NodeName, TopicName};
-use crate::size::Size;
+use crate::tables::CausalPublications;
 use crate::trace::share::Share;
 
 /// Time after which a publication that no other continues ends its chain.
@@ -24,8 +25,6 @@ const QUIET: Duration = Duration::from_secs(2);
 const REMEMBERED: Duration = Duration::from_secs(5);
 /// Longest time from the begin of a publication to the source timestamp of its message.
 const WRITING: Duration = Duration::from_millis(10);
-/// Largest number of publications that are remembered.
-pub const MAX_PUBLICATIONS: usize = 8192;
 /// Number of the latest publications among which the origin of another is searched.
 const SEARCHED: usize = 2048;
 /// Largest number of hops of a chain.
@@ -58,8 +57,7 @@ pub struct CausalPublication {
 #[derive(Debug, Default)]
 pub(super) struct Causality {
     /// In the order of their arrival.
-    publications: VecDeque<Hop>,
-    evictions: u64,
+    publications: Bounded<CausalPublications, VecDeque<Hop>>,
 }
 
 /// A publication with the way to it.
@@ -173,10 +171,6 @@ impl Causality {
                     Decision::Hop(before) => Some(step.go_on(before, known, tracer)),
                 }
             });
-        if self.publications.len() >= MAX_PUBLICATIONS {
-            self.publications.pop_front();
-            self.evictions += 1;
-        }
         self.publications.push_back(Hop {
             at: now,
             domain_id: *domain_id,
@@ -207,33 +201,9 @@ impl Causality {
 
     /// Ends all chains at the end of the input.
     pub(super) fn settle(&mut self, paths: &mut Paths, expected: &mut ExpectedChains) {
-        for mut hop in std::mem::take(&mut self.publications) {
+        for mut hop in self.publications.take() {
             hop.end(paths, expected);
         }
-    }
-
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            publications,
-            evictions: _,
-        } = self;
-        let length = |hop: &Hop| {
-            let Hop {
-                at: _,
-                domain_id: _,
-                topics,
-                points,
-                traced: _,
-                is_over: _,
-            } = hop;
-            topics.len().max(points.len())
-        };
-        let longest = publications.iter().map(length).max().unwrap_or(0);
-        vec![
-            Size::new("chains.publications", publications.len(), MAX_PUBLICATIONS),
-            Size::new("chains.publication.hops", longest, MAX_HOPS + 1),
-        ]
     }
 }
 

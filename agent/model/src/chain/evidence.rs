@@ -12,7 +12,7 @@
 //! A hop is accepted after [`ENOUGH`] matches, if the node's output mostly has the stamp of some
 //! input and the input is hardly ever late.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use super::graph::{NodeView, Output};
@@ -21,15 +21,13 @@ use super::spans::ChainTracer;
 use super::spans::stamped::Stamped;
 use super::stamps::{Group, Published, Stamp};
 use super::trace::{Method, Path, Point, Trace, ways};
+use crate::bounded::Bounded;
 use crate::diagnosis::{Diagnosis, TopicKey};
 use crate::header::stamp_time;
 use crate::names::{NodeName, TopicName};
-use crate::size::{Size, largest};
+use crate::tables::{EvidenceInputs, EvidenceOutputs, LatestStamps};
 use crate::topic::TopicId;
 
-/// Largest number of outputs, and of inputs for each.
-pub const MAX_OUTPUTS: usize = 4096;
-pub const MAX_INPUTS: usize = 64;
 /// Matches from which on a hop may be accepted, for ordinary and for rounded stamps.
 const ENOUGH: u32 = 5;
 const ENOUGH_ROUNDED: u32 = 20;
@@ -41,16 +39,17 @@ const ROUNDED: u32 = 100_000;
 const RESTAMPED: u32 = 20;
 /// Age in nanoseconds below which a message is stamped at publication.
 const FRESH: i64 = 1_000_000;
-/// Number of the latest messages of a topic whose stamps are remembered.
-const LATEST: usize = 4;
 
 /// Evidence about all outputs.
 #[derive(Debug, Default)]
 pub(super) struct Evidence {
-    outputs: BTreeMap<OutputKey, Counts>,
+    outputs: Bounded<EvidenceOutputs, BTreeMap<OutputKey, Counts>>,
     /// Capture time and stamp of the latest messages of each topic.
-    latest: BTreeMap<TopicId, Vec<(u64, u64)>>,
+    latest: Bounded<EvidenceOutputs, BTreeMap<TopicId, LatestOfTopic>>,
 }
+
+/// Capture time and stamp of the latest messages of one topic.
+type LatestOfTopic = Bounded<LatestStamps, VecDeque<(u64, u64)>>;
 
 /// A node and a topic that it publishes.
 type OutputKey = (TopicKey, NodeName);
@@ -70,7 +69,7 @@ struct Counts {
     /// Those whose age was compared with that of the inputs, and those with almost no age.
     aged: u32,
     fresh: u32,
-    inputs: BTreeMap<TopicId, InputCounts>,
+    inputs: Bounded<EvidenceInputs, BTreeMap<TopicId, InputCounts>>,
 }
 
 /// Counts of one output and one input.
@@ -100,14 +99,11 @@ impl Evidence {
             return;
         };
         let (output, published) = (&message.output, message.published);
-        if output.is_read
-            && (self.latest.len() < MAX_OUTPUTS || self.latest.contains_key(&output.topic))
-        {
-            let latest = self.latest.entry(output.topic).or_default();
-            if latest.len() >= LATEST {
-                latest.remove(0);
-            }
-            latest.push((message.at.0, stamp.0));
+        if output.is_read {
+            let latest = self
+                .latest
+                .get_or_insert_with(output.topic, Bounded::default);
+            latest.map(|latest| latest.push_back((message.at.0, stamp.0)));
         }
         if output.node.inputs.is_empty() {
             return;
@@ -138,7 +134,10 @@ impl Evidence {
 
     /// Evaluates the messages with one stamp. Returns the ways along accepted hops.
     pub(super) fn conclude(&mut self, mut group: Group, tracer: &mut ChainTracer) -> Vec<Trace> {
-        group.messages.sort_by_key(|message| message.published);
+        group
+            .messages
+            .as_mut_slice()
+            .sort_by_key(|message| message.published);
         let messages = SameStamp::of(&group.messages);
         let is_rounded = group.stamp.1.is_multiple_of(ROUNDED);
         let is_shared = group.is_crowded || messages.has_several_origins(is_rounded);
@@ -204,19 +203,6 @@ impl Evidence {
         restamped.collect()
     }
 
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { outputs, latest } = self;
-        let of_topic = latest.values().map(Vec::len).max().unwrap_or(0);
-        let mut sizes = vec![
-            Size::new("chains.evidence", outputs.len(), MAX_OUTPUTS),
-            Size::new("chains.latest", latest.len(), MAX_OUTPUTS),
-            Size::new("chains.latest.stamps", of_topic, LATEST),
-        ];
-        sizes.extend(largest(outputs.values().map(Counts::size)));
-        sizes
-    }
-
     fn is_accepted(&self, cause: &Published, message: &Published) -> bool {
         let counts = key(&message.output).and_then(|key| self.outputs.get(&key));
         counts.is_some_and(|counts| counts.accepts(cause.output.topic))
@@ -236,15 +222,12 @@ impl Evidence {
 
 impl Counts {
     fn input(&mut self, topic: TopicId, name: &TopicName) -> Option<&mut InputCounts> {
-        if self.inputs.len() >= MAX_INPUTS && !self.inputs.contains_key(&topic) {
-            return None;
-        }
-        Some(self.inputs.entry(topic).or_insert_with(|| InputCounts {
+        self.inputs.get_or_insert_with(topic, || InputCounts {
             name: name.clone(),
             matched: 0,
             late: 0,
             older: 0,
-        }))
+        })
     }
 
     /// Returns whether the output continues this input.
@@ -279,21 +262,6 @@ impl Counts {
             let counts = [&mut input.matched, &mut input.late, &mut input.older];
             counts.into_iter().for_each(|count| *count /= 2);
         }
-    }
-
-    fn size(&self) -> Size {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            topic: _,
-            outputs: _,
-            matched: _,
-            rounded: _,
-            own: _,
-            aged: _,
-            fresh: _,
-            inputs,
-        } = self;
-        Size::new("chains.evidence.inputs", inputs.len(), MAX_INPUTS)
     }
 }
 
@@ -387,15 +355,14 @@ fn key(output: &Output) -> Option<OutputKey> {
 }
 
 fn counts<'a>(
-    outputs: &'a mut BTreeMap<OutputKey, Counts>,
+    outputs: &'a mut Bounded<EvidenceOutputs, BTreeMap<OutputKey, Counts>>,
     output: &Output,
 ) -> Option<&'a mut Counts> {
     let key = key(output)?;
-    if output.node.inputs.is_empty() || outputs.len() >= MAX_OUTPUTS && !outputs.contains_key(&key)
-    {
+    if output.node.inputs.is_empty() {
         return None;
     }
-    Some(outputs.entry(key).or_insert_with(|| Counts {
+    outputs.get_or_insert_with(key, || Counts {
         topic: output.topic,
         outputs: 0,
         matched: 0,
@@ -403,8 +370,8 @@ fn counts<'a>(
         own: 0,
         aged: 0,
         fresh: 0,
-        inputs: BTreeMap::new(),
-    }))
+        inputs: Bounded::default(),
+    })
 }
 
 /// Returns the ways of messages that no accepted hop continues.

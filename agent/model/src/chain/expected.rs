@@ -9,18 +9,17 @@ use ros2probe_wire::{DomainId, Timestamp};
 use super::graph::{INFRASTRUCTURE, is_stamped, key, owners};
 use super::path::Quantiles;
 use super::trace::{HopTimes, Method, Trace};
+use crate::bounded::Bounded;
 use crate::diagnosis::{Diagnosis, TopicKey};
 use crate::discovery::Discovery;
 use crate::histogram::Histogram;
 use crate::names::{DdsName, TopicName};
-use crate::size::Size;
+use crate::tables::{ExpectedProgress, ExpectedTimes};
 use crate::topic::{TopicId, Topics};
 use crate::topic_kind::TopicKind;
 
 /// Largest number of configured chains.
 pub const MAX_CHAINS: usize = 64;
-/// Number of the latest durations from which quantiles are computed.
-const RECENT: usize = 256;
 /// Time over which a chain is compared with its limit, and the fewest messages for that.
 const JUDGED: Duration = Duration::from_secs(10);
 const FEWEST: usize = 5;
@@ -72,7 +71,7 @@ pub(super) struct ExpectedChains {
     chains: Arc<Vec<ExpectedChain>>,
     /// Topics with a header that lie between the ends.
     topics: BTreeSet<(DomainId, DdsName)>,
-    progress: BTreeMap<(usize, DomainId, Method), Progress>,
+    progress: Bounded<ExpectedProgress, BTreeMap<(usize, DomainId, Method), Progress>>,
 }
 
 /// Messages of a configured chain.
@@ -80,7 +79,7 @@ pub(super) struct ExpectedChains {
 struct Progress {
     histogram: Histogram,
     /// Publication of the last message, and of the first.
-    recent: VecDeque<(Timestamp, Timestamp)>,
+    recent: Bounded<ExpectedTimes, VecDeque<(Timestamp, Timestamp)>>,
 }
 
 /// A node's topics in one domain.
@@ -115,11 +114,11 @@ impl ExpectedChains {
                 .take(MAX_CHAINS)
                 .position(|each| each == chain)
         };
-        let kept = std::mem::take(&mut self.progress).into_iter();
-        let kept = kept.filter_map(|((index, domain_id, method), progress)| {
-            Some(((place(&index)?, domain_id, method), progress))
-        });
-        self.progress = kept.collect();
+        for ((index, domain_id, method), progress) in self.progress.take() {
+            if let Some(index) = place(&index) {
+                self.progress.insert((index, domain_id, method), progress);
+            }
+        }
     }
 
     pub(super) fn needs(&self, domain_id: DomainId, dds_name: &DdsName) -> bool {
@@ -156,11 +155,9 @@ impl ExpectedChains {
                 continue;
             };
             let key = (index, path.domain_id, path.method);
-            let most = MAX_CHAINS * 4;
-            if self.progress.len() >= most && !self.progress.contains_key(&key) {
+            let Some(progress) = self.progress.get_or_insert_with(key, Progress::default) else {
                 continue;
-            }
-            let progress = self.progress.entry(key).or_default();
+            };
             let pair = (last.published, first.published);
             // The ways to several ends may share this part.
             if progress
@@ -174,9 +171,6 @@ impl ExpectedChains {
             }
             let whole = HopTimes::between(first, last).whole;
             progress.histogram.observe(whole.as_secs_f64());
-            if progress.recent.len() >= RECENT {
-                progress.recent.pop_front();
-            }
             progress.recent.push_back(pair);
         }
     }
@@ -229,28 +223,6 @@ impl ExpectedChains {
             }
         }
         facts
-    }
-
-    pub(super) fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            chains: _,
-            topics,
-            progress,
-        } = self;
-        let recent = |each: &Progress| {
-            let Progress {
-                histogram: _,
-                recent,
-            } = each;
-            recent.len()
-        };
-        let most = progress.values().map(recent).max().unwrap_or(0);
-        vec![
-            Size::new("chains.expected.topics", topics.len(), endpoints),
-            Size::new("chains.expected", progress.len(), MAX_CHAINS * 4),
-            Size::new("chains.expected.recent", most, RECENT),
-        ]
     }
 }
 

@@ -9,7 +9,6 @@ use crate::diagnosis::TopicKey;
 use crate::discovery::Discovery;
 use crate::header::begins_with_header;
 use crate::names::{NodeName, TopicName, TypeName};
-use crate::size::Size;
 use crate::topic::{Topic, TopicId, Topics, Watched};
 use crate::topic_kind::TopicKind;
 use crate::trace::share::Share;
@@ -145,27 +144,6 @@ impl Graph {
         }
         Self { outputs }
     }
-
-    pub(super) fn sizes(&self, endpoints: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { outputs } = self;
-        let inputs = outputs.values().map(|each| inputs(&each.node)).max();
-        vec![
-            Size::new("chains.outputs", outputs.len(), endpoints),
-            Size::new("chains.inputs", inputs.unwrap_or(0), endpoints),
-        ]
-    }
-}
-
-fn inputs(node: &NodeView) -> usize {
-    let NodeView {
-        domain_id: _,
-        prefix: _,
-        name: _,
-        inputs,
-        is_complete: _,
-    } = node;
-    inputs.len()
 }
 
 /// Returns the node of each endpoint.

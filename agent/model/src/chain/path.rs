@@ -8,15 +8,13 @@ use ros2probe_wire::Timestamp;
 
 use super::expected::{ExpectedChains, ExpectedFacts};
 use super::trace::{HopTimes, Path, Point, Trace};
+use crate::bounded::{Bounded, Counted};
 use crate::histogram::Histogram;
-use crate::size::{Size, largest};
+use crate::snapshot::TableFacts;
+use crate::tables::{ChainPaths, ChainTraces};
 
-/// Largest number of chains.
-pub const MAX_PATHS: usize = 64;
 /// Largest number of topics in a chain.
 pub const MAX_TOPICS: usize = 32;
-/// Number of the latest messages from which quantiles are computed.
-pub const MAX_TRACES: usize = 256;
 /// Number of messages from which on a chain is shown.
 const ENOUGH: u64 = 5;
 /// Time without a message after which a chain gives way to a new one.
@@ -25,14 +23,13 @@ const IDLE: Duration = Duration::from_secs(60);
 /// All chains with messages.
 #[derive(Debug, Default)]
 pub(super) struct Paths {
-    paths: BTreeMap<Arc<Path>, Progress>,
-    refused: u64,
+    paths: Bounded<Counted<ChainPaths>, BTreeMap<Arc<Path>, Progress>>,
 }
 
 /// The messages of one chain.
 #[derive(Debug)]
 struct Progress {
-    traces: Arc<VecDeque<Vec<Point>>>,
+    traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
     count: u64,
     whole: Histogram,
     hops: Vec<HopHistograms>,
@@ -68,7 +65,7 @@ pub struct ChainFacts {
     /// Messages that went the whole way.
     pub count: u64,
     /// The times of the latest 256 of them, one point for each topic.
-    pub traces: Arc<VecDeque<Vec<Point>>>,
+    pub traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
     /// Durations from the first publication to the last.
     pub whole: Histogram,
     /// Durations of each hop.
@@ -116,7 +113,7 @@ impl Paths {
     pub(super) fn add_found(&mut self, trace: Trace) {
         let Trace { path, points } = trace;
         if path.topics.len() > MAX_TOPICS {
-            self.refused += 1;
+            self.paths.refuse();
             return;
         }
         let last = points.last().map_or(Timestamp(0), |point| point.published);
@@ -131,23 +128,25 @@ impl Paths {
             {
                 self.paths.insert(Arc::clone(&path), progress);
             }
-            if self.paths.len() >= MAX_PATHS {
+            if self.paths.is_full() {
                 self.paths.retain(|_, known| known.last + IDLE > last);
             }
-            if self.paths.len() >= MAX_PATHS && !self.paths.contains_key(&path) {
-                self.refused += 1;
+            if self.paths.is_full() && !self.paths.contains_key(&path) {
+                self.paths.refuse();
                 return;
             }
         }
         let hops = points.len().saturating_sub(1);
-        let known = self.paths.entry(path).or_insert_with(|| Progress {
+        let new = || Progress {
             traces: Arc::default(),
             count: 0,
             whole: Histogram::default(),
             hops: vec![HopHistograms::default(); hops],
             last,
-        });
-        known.add(points, last);
+        };
+        if let Some(known) = self.paths.get_or_insert_with(path, new) {
+            known.add(points, last);
+        }
     }
 
     pub(super) fn facts(&self, expected: &ExpectedChains, now: Timestamp) -> ChainsFacts {
@@ -171,16 +170,8 @@ impl Paths {
         chains.collect()
     }
 
-    pub(super) fn size(&self) -> (usize, usize, u64) {
-        (self.paths.len(), MAX_PATHS, self.refused)
-    }
-
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { paths, refused: _ } = self;
-        let mut sizes = vec![Size::new("chains.paths", paths.len(), MAX_PATHS)];
-        sizes.extend(largest(paths.values().flat_map(Progress::sizes)));
-        sizes
+    pub(super) fn table(&self) -> TableFacts {
+        self.paths.facts()
     }
 }
 
@@ -203,27 +194,9 @@ impl Progress {
             observe(&mut histograms.node, times.node);
         }
         let traces = Arc::make_mut(&mut self.traces);
-        if traces.len() >= MAX_TRACES {
-            traces.pop_front();
-        }
         traces.push_back(points);
         self.count += 1;
         self.last = self.last.max(last);
-    }
-
-    fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            traces,
-            count: _,
-            whole: _,
-            hops,
-            last: _,
-        } = self;
-        [
-            Size::new("chains.traces", traces.len(), MAX_TRACES),
-            Size::new("chains.hops", hops.len(), MAX_TOPICS),
-        ]
     }
 }
 

@@ -12,12 +12,10 @@ use std::sync::Arc;
 use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
 
 use super::trace::Method;
+use crate::bounded::Bounded;
 use crate::identity::Identity;
 use crate::names::{NodeName, TopicName, TypeName};
-use crate::size::Size;
-
-/// Largest number of spans kept until they are taken.
-pub const MAX_FINISHED: usize = 4096;
+use crate::tables::FinishedChainSpans;
 
 /// The part of a chain that a span covers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -96,7 +94,7 @@ pub struct ChainMessage {
 #[derive(Debug, Default)]
 pub struct ChainSpans {
     /// Spans in the order in which they were completed.
-    pub spans: Vec<ChainSpan>,
+    pub spans: Bounded<FinishedChainSpans, Vec<ChainSpan>>,
     /// Number of spans dropped because the list was full.
     pub lost: u64,
 }
@@ -151,18 +149,7 @@ impl ChainTracer {
         std::mem::take(&mut self.finished)
     }
 
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { finished } = self;
-        let ChainSpans { spans, lost: _ } = finished;
-        vec![Size::new("chains.spans", spans.len(), MAX_FINISHED)]
-    }
-
     fn finish(&mut self, span: ChainSpan) {
-        if self.finished.spans.len() < MAX_FINISHED {
-            self.finished.spans.push(span);
-        } else {
-            self.finished.lost += 1;
-        }
+        self.finished.lost += u64::from(self.finished.spans.push(span).is_some());
     }
 }

@@ -10,7 +10,9 @@ use std::time::Duration;
 use ros2probe_wire::{DomainId, Guid, GuidPrefix, RtpsTime, SequenceNumber, Timestamp};
 
 use super::graph::Output;
-use crate::size::{Size, largest};
+use crate::bounded::{Bounded, Counted, Sum};
+use crate::snapshot::TableFacts;
+use crate::tables::{ChainMessages, ChainStamps, RecentMessages, StampArrivals, StampMessages};
 
 /// Time without a message after which the messages of a stamp are evaluated.
 pub(super) const QUIET: Duration = Duration::from_secs(2);
@@ -18,14 +20,6 @@ pub(super) const QUIET: Duration = Duration::from_secs(2);
 pub(super) const LONGEST: Duration = Duration::from_secs(5);
 /// Time for which later messages of an evaluated stamp are ignored.
 const REMEMBERED: Duration = Duration::from_secs(10);
-/// Largest number of stamps, and of messages that wait for evaluation.
-pub const MAX_STAMPS: usize = 32_768;
-/// Largest number of messages with one stamp; a stamp with more identifies nothing.
-pub const MAX_MESSAGES: usize = 64;
-/// Largest number of participants at which the arrival of a message is noted.
-const MAX_ARRIVALS: usize = 16;
-/// Number of the latest messages of a writer whose arrivals are noted.
-const RECENT: usize = 8;
 /// Longest time from INFO_TS to the capture for which INFO_TS is the time of publication.
 const PLAUSIBLE_DELAY: i64 = 1_000_000_000;
 
@@ -53,14 +47,14 @@ pub(super) struct Published {
     /// Whether its writer is on this host, or in the same capture.
     pub(super) is_local: bool,
     /// Times of arrival at participants of this host.
-    pub(super) arrivals: Vec<(GuidPrefix, Timestamp)>,
+    pub(super) arrivals: Bounded<StampArrivals, Vec<(GuidPrefix, Timestamp)>>,
 }
 
 /// All messages with one stamp.
 #[derive(Debug)]
 pub(super) struct Group {
     pub(super) stamp: Stamp,
-    pub(super) messages: Vec<Published>,
+    pub(super) messages: Bounded<StampMessages, Vec<Published>>,
     /// Whether it had more messages than are kept.
     pub(super) is_crowded: bool,
 }
@@ -77,15 +71,17 @@ struct Waiting {
 /// Messages that wait for evaluation.
 #[derive(Debug, Default)]
 pub(super) struct Messages {
-    stamps: HashMap<Key, Waiting>,
+    stamps: Bounded<ChainStamps, HashMap<Key, Waiting>>,
     /// Stamps in the order of their first message.
-    order: VecDeque<Key>,
+    order: Bounded<ChainStamps, VecDeque<Key>>,
     /// The latest messages of each writer.
-    recent: HashMap<Guid, VecDeque<(SequenceNumber, Key)>>,
+    recent: Bounded<ChainStamps, HashMap<Guid, RecentOfWriter>>,
     /// Number of messages in all groups.
-    open: usize,
-    evictions: u64,
+    open: Sum<Counted<ChainMessages>>,
 }
+
+/// The latest messages of one writer, with their stamps.
+type RecentOfWriter = Bounded<RecentMessages, VecDeque<(SequenceNumber, Key)>>;
 
 impl Published {
     /// Returns the time at which it reached this participant, as far as that is observed.
@@ -108,28 +104,31 @@ impl Messages {
     /// Adds a message. Returns a group that must be evaluated now because the table is full.
     pub(super) fn add(&mut self, key: Key, message: Published, now: Timestamp) -> Option<Group> {
         let (writer, number) = (message.writer, message.number);
-        let is_full = self.open >= MAX_STAMPS || self.stamps.len() >= MAX_STAMPS;
+        let is_full = self.open.is_full() || self.stamps.is_full();
         let evicted = if is_full { self.evict(key) } else { None };
-        let waiting = self.stamps.entry(key).or_insert_with(|| {
-            self.order.push_back(key);
+        let order = &mut self.order;
+        let new = || {
+            order.push_back(key);
             Waiting {
                 first: now,
                 last: now,
                 group: Some(Group {
                     stamp: key.1,
-                    messages: Vec::new(),
+                    messages: Bounded::default(),
                     is_crowded: false,
                 }),
             }
-        });
+        };
+        let Some(waiting) = self.stamps.get_or_insert_with(key, new) else {
+            return evicted;
+        };
         waiting.last = waiting.last.max(now);
         if let Some(group) = &mut waiting.group {
-            if group.messages.len() >= MAX_MESSAGES {
+            if group.messages.push(message).is_some() {
                 group.is_crowded = true;
                 return evicted;
             }
-            group.messages.push(message);
-            self.open += 1;
+            self.open.add(1);
             self.recent(writer, number, key);
         }
         evicted
@@ -147,11 +146,11 @@ impl Messages {
             }
             let waiting = self.stamps.remove(&key);
             if let Some(group) = waiting.and_then(|waiting| waiting.group) {
-                self.open = self.open.saturating_sub(group.messages.len());
-                self.evictions += 1;
+                self.open.sub(group.messages.len());
+                self.open.refuse();
                 return Some(group);
             }
-            if self.stamps.len() < MAX_STAMPS && self.open < MAX_STAMPS {
+            if !self.stamps.is_full() && !self.open.is_full() {
                 return None;
             }
         }
@@ -180,7 +179,6 @@ impl Messages {
         let message = messages.find(|each| each.writer == writer && each.number == number);
         if let Some(message) = message
             && message.arrival(prefix).is_none()
-            && message.arrivals.len() < MAX_ARRIVALS
         {
             message.arrivals.push((prefix, at));
         }
@@ -196,7 +194,7 @@ impl Messages {
             };
             if now - waiting.last >= QUIET || now - waiting.first >= LONGEST {
                 let group = waiting.group.take();
-                *open = open.saturating_sub(group.as_ref().map_or(0, |each| each.messages.len()));
+                open.sub(group.as_ref().map_or(0, |each| each.messages.len()));
                 due.extend(group);
             }
             let is_kept = waiting.group.is_some() || now - waiting.last < REMEMBERED;
@@ -217,7 +215,7 @@ impl Messages {
     /// Removes and returns all messages at the end of the input.
     pub(super) fn settle(&mut self) -> Vec<Group> {
         let stamps = &mut self.stamps;
-        self.open = 0;
+        self.open.clear();
         let groups = self
             .order
             .iter()
@@ -225,80 +223,13 @@ impl Messages {
         groups.collect()
     }
 
-    pub(super) const fn size(&self) -> (usize, usize, u64) {
-        (self.open, MAX_STAMPS, self.evictions)
-    }
-
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            stamps,
-            order,
-            recent,
-            open,
-            evictions: _,
-        } = self;
-        let mut sizes = vec![
-            Size::new("chains.open", *open, MAX_STAMPS + MAX_MESSAGES),
-            Size::new("chains.stamps", stamps.len(), MAX_STAMPS),
-            Size::new("chains.order", order.len(), MAX_STAMPS),
-            Size::new("chains.writers", recent.len(), MAX_STAMPS),
-        ];
-        let of_writer = recent.values().map(VecDeque::len).max().unwrap_or(0);
-        sizes.push(Size::new("chains.writer.recent", of_writer, RECENT));
-        sizes.extend(largest(stamps.values().flat_map(Waiting::sizes)));
-        sizes
+    pub(super) fn table(&self) -> TableFacts {
+        self.open.facts()
     }
 
     fn recent(&mut self, writer: Guid, number: SequenceNumber, key: Key) {
-        let recent = self.recent.entry(writer).or_default();
-        if recent.len() >= RECENT {
-            recent.pop_front();
-        }
-        recent.push_back((number, key));
-    }
-}
-
-impl Waiting {
-    fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            first: _,
-            last: _,
-            group,
-        } = self;
-        group.iter().flat_map(Group::sizes).collect()
-    }
-}
-
-impl Group {
-    fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            stamp: _,
-            messages,
-            is_crowded: _,
-        } = self;
-        let arrivals = |each: &Published| {
-            let Published {
-                output: _,
-                writer: _,
-                number: _,
-                published: _,
-                began: _,
-                at: _,
-                size: _,
-                sampled: _,
-                is_local: _,
-                arrivals,
-            } = each;
-            arrivals.len()
-        };
-        let most = messages.iter().map(arrivals).max().unwrap_or(0);
-        [
-            Size::new("chains.messages", messages.len(), MAX_MESSAGES),
-            Size::new("chains.arrivals", most, MAX_ARRIVALS),
-        ]
+        let recent = self.recent.get_or_insert_with(writer, Bounded::default);
+        recent.map(|recent| recent.push_back((number, key)));
     }
 }
 

@@ -4,7 +4,8 @@ use std::collections::VecDeque;
 
 use ros2probe_wire::{Guid, SequenceNumber, Timestamp};
 
-use super::{Receiver, WITHHELD};
+use super::Receiver;
+use crate::bounded::Bounded;
 use crate::journal::Journal;
 use crate::loss::DeliveryLoss;
 use crate::loss::LossCause;
@@ -13,6 +14,7 @@ use crate::measurement::{Breakdown, Delivered};
 use crate::reception::Decision;
 use crate::route::Direction;
 use crate::route::Route;
+use crate::tables::WithheldLosses;
 
 /// Sums over all deliveries of a writer.
 #[derive(Clone, Debug, Default)]
@@ -56,7 +58,7 @@ pub(super) struct Accounting<'a> {
     pub(super) totals: &'a mut Delivered,
     pub(super) journal: &'a mut Journal,
     /// The losses of a withheld delivery, which changes neither totals nor journal.
-    pub(super) withheld: Option<&'a mut VecDeque<DeliveryLoss>>,
+    pub(super) withheld: Option<&'a mut Bounded<WithheldLosses, VecDeque<DeliveryLoss>>>,
     pub(super) writer: Guid,
     pub(super) receiver: Receiver,
     pub(super) main: Route,
@@ -139,9 +141,6 @@ impl Accounting<'_> {
             self.journal.lose_delivery(loss);
             return;
         };
-        if withheld.len() >= WITHHELD {
-            withheld.pop_front();
-        }
         withheld.push_back(loss);
     }
 

@@ -6,11 +6,11 @@ use std::time::Duration;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::facts::Origin;
-use crate::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::LatestDisposals;
 
 /// Announcements older than a disposal are ignored for this long after it.
 const STALE_WITHIN: Duration = Duration::from_millis(500);
-const MAX_DISPOSALS: usize = 256;
 /// Samples that were already sent arrive within this time.
 const UNDER_WAY: Duration = Duration::from_secs(2);
 
@@ -18,25 +18,11 @@ const UNDER_WAY: Duration = Duration::from_secs(2);
 #[derive(Debug, Default)]
 pub(super) struct Disposals {
     /// The GUID, the time, and the sender and sequence number of the disposal.
-    latest: VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>,
+    latest: Bounded<LatestDisposals, VecDeque<(Guid, Timestamp, GuidPrefix, SequenceNumber)>>,
 }
 
 impl Disposals {
-    /// Returns the number of entries and its cap.
-    pub(super) fn sizes(&self) -> [Size; 1] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self { latest } = self;
-        [Size::new(
-            "discovery.disposals",
-            latest.len(),
-            MAX_DISPOSALS,
-        )]
-    }
-
     pub(super) fn add(&mut self, guid: Guid, origin: &Origin) {
-        if self.latest.len() >= MAX_DISPOSALS {
-            self.latest.pop_front();
-        }
         let disposal = (guid, origin.at, origin.sender, origin.sequence_number);
         self.latest.push_back(disposal);
     }

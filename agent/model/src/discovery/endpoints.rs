@@ -13,8 +13,7 @@ use super::eviction::{Newcomer, Table};
 use super::facts::{Endpoint, Origin};
 use super::priority::Priority;
 use super::{
-    Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT, PendingEndpoint, PendingNodes, endpoints_of,
-    is_named,
+    Change, Discovery, MAX_NAME_LEN, PendingEndpoint, PendingNodes, endpoints_of, is_named,
 };
 use crate::churn::Event;
 use crate::journal::Journal;
@@ -31,7 +30,7 @@ impl Discovery {
     ) -> bool {
         let names = [announcement.topic.as_str(), announcement.type_name.as_str()];
         if names.iter().any(|name| name.len() > MAX_NAME_LEN) {
-            self.evictions.endpoints += 1;
+            self.endpoints.refuse();
             return false;
         }
         if self.disposals.is_stale(announcement.guid, origin) {
@@ -57,7 +56,7 @@ impl Discovery {
             ..evidence
         };
         let is_crowded = self.pending_endpoints.put(guid, priority, pending);
-        self.evictions.endpoints += u64::from(is_known || is_crowded);
+        self.endpoints.refuse_all(u64::from(is_known || is_crowded));
         let is_more = !is_known && self.seen(guid.prefix, origin.at, priority);
         is_more && self.learn(guid.prefix, priority, origin.at, journal)
     }
@@ -115,10 +114,10 @@ impl Discovery {
             watched,
             ..participant.priority()
         };
-        if participant.endpoints.len() >= PER_PARTICIPANT {
+        if participant.endpoints.is_full() {
             return Some(pending);
         }
-        let is_full = self.endpoints.len() >= self.caps.endpoints;
+        let is_full = self.endpoints.is_full();
         if is_full && !self.evict_for(Table::Endpoints, Newcomer { guid, priority }, at) {
             return Some(pending);
         }

@@ -73,21 +73,6 @@ pub(super) enum Table {
 }
 
 impl Victims {
-    /// Returns the number of remaining candidates.
-    pub(super) fn len(&self) -> usize {
-        let Self {
-            silent,
-            others,
-            claims: _,
-            watched_claims: _,
-            search_after: _,
-        } = self;
-        silent.len() + others.len()
-    }
-
-    /// Largest number of candidates.
-    pub(super) const CAP: usize = 2 * FOUND;
-
     fn search(&mut self, discovery: &Discovery, table: Table, now: Timestamp) {
         self.silent.clear();
         self.others.clear();
@@ -196,15 +181,15 @@ impl Discovery {
         if table == Table::Nodes {
             if let Some(participant) = self.participants.get_mut(&victim.prefix) {
                 let nodes = std::mem::take(&mut participant.nodes);
-                self.evictions.nodes += nodes.len() as u64;
-                self.node_count = self.node_count.saturating_sub(nodes.len());
+                self.node_count.refuse_all(nodes.len() as u64);
+                self.node_count.sub(nodes.len());
                 self.named = self.named.saturating_sub(named(&nodes));
             }
         } else if victim.entity == EntityId::PARTICIPANT {
-            self.evictions.participants += 1;
+            self.participants.refuse();
             self.remove(victim.prefix, now, None, &mut Journal::default());
         } else {
-            self.evictions.endpoints += 1;
+            self.endpoints.refuse();
             if let Some(participant) = self.participants.get_mut(&victim.prefix) {
                 participant.endpoints.remove(&victim);
             }

@@ -13,7 +13,9 @@ use serde::{Deserialize, Serialize};
 
 use super::eviction::MAX_SILENCE;
 use super::priority::Priority;
+use crate::bounded::Bounded;
 use crate::names::{DdsName, NodeName, TypeName};
+use crate::tables::ParticipantEndpoints;
 
 /// Largest number of addresses kept per participant and kind.
 pub(super) const ADDRESSES: usize = 16;
@@ -93,7 +95,7 @@ pub struct Participant {
     /// Time of its last packet.
     pub last_seen: Timestamp,
     /// Its endpoints.
-    pub endpoints: BTreeSet<Guid>,
+    pub endpoints: Bounded<ParticipantEndpoints, BTreeSet<Guid>>,
     /// Its nodes.
     pub nodes: Vec<Node>,
     /// Number of its endpoints whose topics are watched by exact name.
@@ -244,46 +246,6 @@ pub(super) fn named(nodes: &[Node]) -> usize {
         writers.len() + readers.len()
     };
     nodes.iter().map(named).sum()
-}
-
-/// Lengths of a participant's lists.
-pub(super) struct Lists {
-    pub(super) endpoints: usize,
-    pub(super) nodes: usize,
-    pub(super) named: usize,
-    /// Length of the longer address list.
-    pub(super) addresses: usize,
-}
-
-impl Participant {
-    pub(super) fn lists(&self) -> Lists {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            proxy: _,
-            addresses,
-            restored: _,
-            domain_id: _,
-            first_seen: _,
-            last_seen: _,
-            endpoints,
-            nodes,
-            domain_source: _,
-            nodes_from: _,
-            watched: _,
-            local: _,
-            sends: _,
-        } = self;
-        let Addresses {
-            metatraffic,
-            default,
-        } = addresses;
-        Lists {
-            endpoints: endpoints.len(),
-            nodes: nodes.len(),
-            named: named(nodes),
-            addresses: metatraffic.len().max(default.len()),
-        }
-    }
 }
 
 /// Returns the participant's domain and its source. Without an announced domain, it follows from

@@ -5,7 +5,6 @@
 //! within it stays, with all its entries. Encoding and files are the caller's task. Restored data
 //! is validated like any other external input.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -22,7 +21,9 @@ use ros2probe_wire::{
 use serde::{Deserialize, Serialize};
 
 use super::facts::{Addresses, DomainSource, Endpoint, Node, Participant, ParticipantProxy, named};
-use super::{Change, Discovery, MAX_NAME_LEN, PER_PARTICIPANT};
+use super::{Change, Discovery, MAX_NAME_LEN};
+use crate::bounded::Bounded;
+use crate::tables::ParticipantEndpoints;
 use crate::zenoh::ZenohMemory;
 
 /// All participants with their endpoints and nodes.
@@ -136,27 +137,28 @@ impl Discovery {
             if self.participants.contains_key(&prefix) {
                 continue;
             }
-            if self.participants.len() >= self.caps.participants {
-                self.evictions.participants += 1;
+            if self.participants.is_full() {
+                self.participants.refuse();
                 continue;
             }
-            let room = self.caps.nodes.saturating_sub(self.node_count);
-            self.evictions.nodes += participant.nodes.len().saturating_sub(room) as u64;
+            let room = self.node_count.room();
+            let cut = participant.nodes.len().saturating_sub(room) as u64;
+            self.node_count.refuse_all(cut);
             participant.nodes.truncate(room);
-            self.node_count += participant.nodes.len();
+            self.node_count.add(participant.nodes.len());
             let mut names = self.caps.endpoints.saturating_sub(self.named);
-            names = names.min(PER_PARTICIPANT);
+            names = names.min(ParticipantEndpoints::CAP);
             for node in &mut participant.nodes {
-                self.evictions.nodes += u64::from(node.cut(&mut names));
+                self.node_count.refuse_all(node.cut(&mut names).into());
             }
             self.named += named(&participant.nodes);
-            for endpoint in remembered.endpoints.iter().take(PER_PARTICIPANT) {
+            for endpoint in remembered.endpoints.iter().take(ParticipantEndpoints::CAP) {
                 let domain_id = participant.domain_id;
                 let Some((guid, endpoint)) = endpoint.endpoint(prefix, domain_id, now) else {
                     continue;
                 };
-                if self.endpoints.len() >= self.caps.endpoints {
-                    self.evictions.endpoints += 1;
+                if self.endpoints.is_full() {
+                    self.endpoints.refuse();
                     continue;
                 }
                 if participant.endpoints.insert(guid) {
@@ -225,7 +227,7 @@ impl Remembered {
             domain_id: DomainId(self.domain_id),
             first_seen: now,
             last_seen: now,
-            endpoints: BTreeSet::new(),
+            endpoints: Bounded::default(),
             nodes: self.nodes.iter().filter_map(RememberedNode::node).collect(),
             watched: 0,
             local: false,

@@ -7,12 +7,12 @@ use super::entity::DiscoveredEntity;
 use super::eviction::{Newcomer, Table};
 use super::facts::{Node, Origin, named};
 use super::priority::Priority;
-use super::{
-    Discovery, PENDING_NODE_BYTES, PENDING_NODES, PER_PARTICIPANT, PendingNodes, endpoints_of,
-};
+use super::{Discovery, PendingNodes, endpoints_of};
+use crate::bounded;
 use crate::churn::Event;
 use crate::journal::Journal;
 use crate::names::NodeName;
+use crate::tables::{ParticipantEndpoints, PendingNodeBytes};
 
 /// Returns the names in `one` that `other` lacks, repeated as often as they are missing.
 pub(super) fn difference(one: &[NodeName], other: &[NodeName]) -> Vec<NodeName> {
@@ -48,7 +48,7 @@ impl Discovery {
         let newcomer = priority.map(|priority| Newcomer { guid, priority });
         let wanted = entities.nodes.iter();
         let wanted = wanted.map(|node| node.writers.len() + node.readers.len());
-        let wanted = wanted.sum::<usize>().min(PER_PARTICIPANT);
+        let wanted = wanted.sum::<usize>().min(ParticipantEndpoints::CAP);
         let (eviction, mut names) = loop {
             let (eviction, names) = self.node_quota(prefix);
             let fits = entities.nodes.len() <= eviction && wanted <= names;
@@ -56,13 +56,14 @@ impl Discovery {
             let is_more =
                 newcomer.is_some_and(|newcomer| self.evict_for(Table::Nodes, newcomer, origin.at));
             if !is_more {
-                break (eviction, names.min(PER_PARTICIPANT));
+                break (eviction, names.min(ParticipantEndpoints::CAP));
             }
         };
         let mut nodes: Vec<Node> = entities.nodes.iter().take(eviction).map(Node::of).collect();
-        self.evictions.nodes += (entities.nodes.len() - nodes.len()) as u64;
+        let cut = entities.nodes.len() - nodes.len();
+        self.node_count.refuse_all(cut as u64);
         for node in &mut nodes {
-            self.evictions.nodes += u64::from(node.cut(&mut names));
+            self.node_count.refuse_all(node.cut(&mut names).into());
         }
         if self.participants.contains_key(&prefix) {
             self.set_nodes(
@@ -85,10 +86,11 @@ impl Discovery {
         let bytes = nodes.iter().map(Node::bytes).sum();
         let waiting = self.pending_endpoints.range(endpoints_of(prefix));
         let priority = waiting.fold(evidence, |priority, (_, other)| priority.or(other));
-        while self.pending_nodes.len() >= PENDING_NODES
-            || self.pending_node_bytes() + bytes > PENDING_NODE_BYTES
+        while self.pending_nodes.is_full()
+            || self.pending_node_bytes() + bytes > PendingNodeBytes::CAP
         {
-            self.evictions.nodes += 1;
+            self.pending_nodes.refuse();
+            self.node_count.refuse();
             let pending = self.pending_nodes.iter();
             let oldest = pending.min_by_key(|(_, pending)| (pending.priority, pending.at));
             match oldest.map(|(prefix, pending)| (*prefix, pending.priority)) {
@@ -106,6 +108,7 @@ impl Discovery {
             bytes,
         };
         self.pending_nodes.insert(prefix, pending);
+        bounded::note::<PendingNodeBytes>(self.pending_node_bytes());
     }
 
     /// Returns how many nodes this participant may have, and how many endpoints they may list.
@@ -114,7 +117,7 @@ impl Discovery {
             Some(known) => &known.nodes,
             None => &[],
         };
-        let eviction = self.caps.nodes.saturating_sub(self.node_count);
+        let eviction = self.node_count.room();
         let names = self.caps.endpoints.saturating_sub(self.named);
         (eviction + known.len(), names + named(known))
     }
@@ -152,7 +155,8 @@ impl Discovery {
             .iter()
             .map(|node| node.name.clone())
             .collect();
-        self.node_count = self.node_count + after.len() - before.len().min(self.node_count);
+        self.node_count.sub(before.len());
+        self.node_count.add(after.len());
         let before: Vec<_> = before.into_iter().map(|node| node.name).collect();
         let guid = Guid::new(prefix, EntityId::PARTICIPANT);
         for name in difference(&before, &after) {

@@ -7,13 +7,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::ops::RangeInclusive;
 
 use super::priority::Priority;
+use crate::bounded::{Bounded, Declared};
 
 /// Entries by key, and in the order of eviction.
 #[derive(Debug)]
-pub(super) struct PendingTable<K, T> {
-    cap: usize,
-    entries: BTreeMap<K, Entry<T>>,
-    order: BTreeSet<(Priority, u64, K)>,
+pub(super) struct PendingTable<D, K: Ord, T> {
+    entries: Bounded<D, BTreeMap<K, Entry<T>>>,
+    order: Bounded<D, BTreeSet<(Priority, u64, K)>>,
     age: u64,
 }
 
@@ -24,34 +24,23 @@ struct Entry<T> {
     value: T,
 }
 
-impl<K: Copy + Ord, T> PendingTable<K, T> {
-    /// Creates an empty table for at most `cap` entries.
-    pub(super) const fn new(cap: usize) -> Self {
+impl<D: Declared + Default, K: Copy + Ord, T> PendingTable<D, K, T> {
+    /// Creates an empty table.
+    pub(super) fn new() -> Self {
         Self {
-            cap,
-            entries: BTreeMap::new(),
-            order: BTreeSet::new(),
+            entries: Bounded::default(),
+            order: Bounded::default(),
             age: 0,
         }
-    }
-
-    /// Returns the number of entries and of places in their order.
-    pub(super) fn sizes(&self) -> (usize, usize) {
-        let Self {
-            cap: _,
-            entries,
-            order,
-            age: _,
-        } = self;
-        (entries.len(), order.len())
     }
 
     /// Inserts or replaces an entry. Returns whether an entry was dropped for it; that is the new
     /// entry if all others have a higher priority.
     pub(super) fn put(&mut self, key: K, priority: Priority, value: T) -> bool {
         self.remove(&key);
-        let is_full = self.entries.len() >= self.cap;
+        let is_full = self.entries.is_full();
         if is_full {
+            self.entries.refuse();
             match self.order.first().copied() {
                 Some((least, _, oldest)) if least <= priority => self.remove(&oldest),
                 _ => return true,
@@ -113,6 +102,14 @@ impl<K: Copy + Ord, T> PendingTable<K, T> {
 mod tests {
     use super::*;
 
+    mod declared {
+        crate::tables! {
+            /// Numbers
+            Waiting { name: "waiting", entries: 3 }
+        }
+    }
+    use declared::Waiting;
+
     const WATCHED: Priority = Priority {
         watched: true,
         ..Priority::NOTHING
@@ -120,7 +117,7 @@ mod tests {
 
     #[test]
     fn the_oldest_of_the_least_worth_goes_first_and_nothing_worth_more_than_the_newcomer() {
-        let mut waiting = PendingTable::new(3);
+        let mut waiting: PendingTable<Waiting, _, _> = PendingTable::new();
         assert!(!waiting.put(1, WATCHED, 'a'));
         assert!(!waiting.put(2, Priority::NOTHING, 'b'));
         assert!(!waiting.put(3, Priority::NOTHING, 'c'));
@@ -129,7 +126,7 @@ mod tests {
         assert!(waiting.put(5, WATCHED, 'e') && waiting.put(6, WATCHED, 'f'));
         assert!(waiting.put(7, Priority::NOTHING, 'g'));
         let left: Vec<_> = waiting.range(0..=9).map(|(key, _)| key).collect();
-        assert_eq!((left, waiting.sizes()), (vec![1, 5, 6], (3, 3)));
+        assert_eq!((left, waiting.order.len()), (vec![1, 5, 6], 3));
         // Replacing an entry drops no other entry.
         assert!(!waiting.put(5, Priority::NOTHING, 'h'));
         assert_eq!(waiting.priority(&5), Some(Priority::NOTHING));
@@ -146,6 +143,6 @@ mod tests {
             (None, Some(WATCHED))
         );
         waiting.retain(|key, _| *key == 8);
-        assert_eq!(waiting.sizes(), (1, 1));
+        assert_eq!((waiting.entries.len(), waiting.order.len()), (1, 1));
     }
 }

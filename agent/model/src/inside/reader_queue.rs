@@ -19,12 +19,10 @@ use std::time::Duration;
 use ros2probe_wire::{Guid, Timestamp};
 
 use super::findings::{Alarm, GRACE, is_many};
-use super::state::HANDLES;
 use super::tracked::HALF_WINDOW;
-use crate::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::QueueTotals;
 
-/// States kept to find what had arrived at an earlier time, one per report.
-const PAST: usize = 64;
 /// Writers of one queue; a queue with more is not judged.
 const WRITERS: usize = 256;
 /// Time without arrivals and takes after which nothing waits.
@@ -85,7 +83,7 @@ pub(super) struct ReaderQueue {
     excluded: u64,
     /// Messages that arrived, now and at earlier reports.
     arrived: u64,
-    past: VecDeque<(Timestamp, u64)>,
+    past: Bounded<QueueTotals, VecDeque<(Timestamp, u64)>>,
     lost: u64,
     /// Whether the begin of the arrivals is known: a report after that of the takes.
     has_begun: bool,
@@ -119,7 +117,7 @@ impl ReaderQueue {
             taken: takes.taken,
             excluded: if is_whole { 0 } else { takes.taken },
             arrived,
-            past: VecDeque::from([(now + AHEAD, arrived)]),
+            past: [(now + AHEAD, arrived)].into_iter().collect(),
             lost: 0,
             has_begun: is_whole,
             changed: now,
@@ -170,9 +168,6 @@ impl ReaderQueue {
         }
         let lost = gone.saturating_sub(taken).saturating_sub(self.lost);
         self.lost += lost;
-        if self.past.len() >= PAST {
-            self.past.pop_front();
-        }
         self.past.push_back((now + AHEAD, self.arrived));
         lost
     }
@@ -212,36 +207,6 @@ impl ReaderQueue {
             [only] => Some(only.writer),
             _ => None,
         }
-    }
-
-    /// Returns the lengths and caps of its lists.
-    pub(super) fn sizes(&self) -> [Size; 4] {
-        // The destructuring makes a new list fail to compile until it is listed here. A queue is
-        // compared only if it has as many readers as handles.
-        let Self {
-            handles,
-            readers,
-            writers,
-            depth: _,
-            taken: _,
-            excluded: _,
-            arrived: _,
-            past,
-            lost: _,
-            has_begun: _,
-            changed: _,
-            took: _,
-            longest_gap: _,
-            since: _,
-            marks: _,
-            alarm: _,
-        } = self;
-        [
-            Size::new("inside.queue_handles", handles.len(), HANDLES),
-            Size::new("inside.queue_readers", readers.len(), HANDLES),
-            Size::new("inside.queue_writers", writers.len(), WRITERS),
-            Size::new("inside.queue_past", past.len(), PAST),
-        ]
     }
 
     /// Adds what has arrived. Of a writer that is new, only what is certainly new counts.

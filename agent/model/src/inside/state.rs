@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::time::Duration;
 
-use ros2probe_wire::inside::{HANDLE_CAPACITY, PROCESS_CAPACITY};
 use ros2probe_wire::{DomainId, GuidPrefix, Timestamp};
 
 use super::attribution::Attribution;
@@ -15,23 +14,17 @@ use super::source::{Seen, Source};
 use super::topics::{Evidence, InsideTopic, InsideTopics, Live, TopicAdded};
 use super::tracked::{Added, Figures, HALF_WINDOW, Kind, Tracked, ratio};
 use super::witness::Witness;
+use crate::bounded::{Bounded, Counted, Sum};
 use crate::diagnosis::Diagnosis;
 use crate::discovery::Discovery;
 use crate::measurement::Measurement;
 use crate::names::{NodeName, TopicName};
 use crate::naming::Naming;
 use crate::receivers::Receivers;
-use crate::size::{Size, largest};
+use crate::snapshot::TableFacts;
+use crate::tables::{InsideHandles, LifecycleStates, ObservedProcesses, ReportedNodes};
 use crate::topic::TopicId;
 
-/// Processes.
-const PROCESSES: usize = PROCESS_CAPACITY as usize;
-/// Handles of all processes.
-pub(super) const HANDLES: usize = HANDLE_CAPACITY as usize;
-/// Nodes kept per process.
-const NODES: usize = 256;
-/// Managed nodes with a state.
-const STATES: usize = 1_024;
 /// Without a report for this long, the source has stopped.
 const STALE: Duration = Duration::from_secs(10);
 
@@ -41,20 +34,18 @@ pub struct Inside {
     /// Time of the last report; `None` without one, or if the source has stopped.
     at: Option<Timestamp>,
     has_callbacks: bool,
-    pub(super) processes: BTreeMap<u32, Process>,
+    pub(super) processes: Bounded<ObservedProcesses, BTreeMap<u32, Process>>,
     /// Handles of all processes.
-    handles: usize,
+    handles: Sum<Counted<InsideHandles>>,
     pub(super) topics: InsideTopics,
     /// Participants of observed processes.
     participants: HashSet<GuidPrefix>,
     /// Last state of each managed node, by process and node.
-    states: BTreeMap<(u32, Option<NodeName>), LifecycleState>,
+    states: Bounded<LifecycleStates, BTreeMap<(u32, Option<NodeName>), LifecycleState>>,
     /// Revisions of the graph that determined nodes and domains.
     graph: Option<(u64, u64)>,
     /// Changes of the findings.
     pub(super) revision: u64,
-    /// Processes, handles, topics and states dropped or refused because of a cap.
-    evictions: u64,
 }
 
 /// An observed process.
@@ -68,11 +59,11 @@ pub(super) struct Process {
     /// Its domain according to its environment.
     reported_domain_id: DomainId,
     /// Nodes that it created while it was observed.
-    reported: Vec<NodeName>,
+    reported: Bounded<ReportedNodes, Vec<NodeName>>,
     cpu: Duration,
     /// The earlier and the later begin of a window: time, CPU time and calls.
     marks: [(Timestamp, Duration, u64); 2],
-    pub(super) handles: BTreeMap<(Kind, u64), Tracked>,
+    pub(super) handles: Bounded<InsideHandles, BTreeMap<(Kind, u64), Tracked>>,
     /// Queues of its subscriptions.
     pub(super) queues: BTreeMap<(DomainId, TopicName), ReaderQueue>,
     /// Topics whose receptions within the process may show further publications.
@@ -88,62 +79,12 @@ struct HandleAdded {
 }
 
 impl Inside {
-    /// Returns the size and cap of each table.
+    /// Returns the row of the metrics: handles, and what was dropped or refused because of caps.
     #[must_use]
-    pub fn sizes(&self, participants: usize) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            at: _,
-            has_callbacks: _,
-            processes,
-            handles,
-            topics,
-            participants: observed,
-            states,
-            graph: _,
-            revision: _,
-            evictions: _,
-        } = self;
-        let of_processes = processes.values().flat_map(|process| {
-            let Process {
-                facts,
-                reported_domain_id: _,
-                reported,
-                born: _,
-                participants: own,
-                cpu: _,
-                marks: _,
-                handles,
-                queues,
-                witnesses,
-            } = process;
-            let of_queues = queues.values().flat_map(ReaderQueue::sizes);
-            let of_process = [
-                Size::new("inside.nodes", facts.nodes.len(), NODES),
-                Size::new("inside.reported_nodes", reported.len(), NODES),
-                Size::new("inside.handles_of_process", handles.len(), HANDLES),
-                Size::new("inside.witnesses", witnesses.len(), HANDLES),
-                Size::new("inside.queues", queues.len(), HANDLES),
-                Size::new("inside.participants_of_process", own.len(), participants),
-            ];
-            of_process.into_iter().chain(of_queues)
-        });
-        let mut sizes = largest(of_processes);
-        sizes.extend(topics.sizes());
-        sizes.extend([
-            Size::new("inside.processes", processes.len(), PROCESSES),
-            Size::new("inside.handles", *handles, HANDLES),
-            Size::new("inside.participants", observed.len(), participants),
-            Size::new("inside.states", states.len(), STATES),
-        ]);
-        sizes
-    }
-
-    /// Returns the number of handles, its cap, and what was dropped or refused because of caps.
-    #[must_use]
-    pub const fn size(&self) -> (usize, usize, u64) {
-        let evictions = self.evictions + self.topics.evictions;
-        (self.handles, HANDLES, evictions)
+    pub fn table(&self) -> TableFacts {
+        let mut facts = self.handles.facts();
+        facts.evictions += self.topics.evictions;
+        facts
     }
 
     /// Takes a report, with times of the model. Returns the transitions of managed nodes in it.
@@ -192,7 +133,7 @@ impl Inside {
         self.at = None;
         self.graph = None;
         self.revision += 1;
-        self.handles = 0;
+        self.handles.clear();
         self.processes.clear();
         self.participants.clear();
         self.states.clear();
@@ -313,28 +254,28 @@ impl Inside {
         began: Option<Timestamp>,
         into: &mut Vec<HandleAdded>,
     ) {
-        if !self.processes.contains_key(&report.id) && self.processes.len() >= PROCESSES {
-            self.evictions += 1;
-            return;
-        }
         let id = report.id;
         let mark = (at, report.cpu, report.hits);
-        let process = self.processes.entry(id).or_insert_with(|| Process {
+        let new = || Process {
             facts: ObservedProcess {
                 id,
                 domain_id: report.domain_id,
                 ..ObservedProcess::default()
             },
             reported_domain_id: report.domain_id,
-            reported: Vec::new(),
+            reported: Bounded::default(),
             born: began,
             participants: BTreeSet::new(),
             cpu: report.cpu,
             marks: [mark, mark],
-            handles: BTreeMap::new(),
+            handles: Bounded::default(),
             queues: BTreeMap::new(),
             witnesses: BTreeMap::new(),
-        });
+        };
+        let Some(process) = self.processes.get_or_insert_with(id, new) else {
+            self.handles.refuse();
+            return;
+        };
         self.revision += u64::from(process.facts.is_suspended != report.is_suspended);
         let facts = &mut process.facts;
         if report.name.is_some() {
@@ -347,8 +288,7 @@ impl Inside {
         process.cpu = report.cpu;
         process.reported_domain_id = report.domain_id;
         for node in report.nodes {
-            if process.reported.len() < NODES && !process.reported.contains(&node) {
-                process.reported.push(node);
+            if !process.reported.contains(&node) && process.reported.push(node).is_none() {
                 self.graph = None;
             }
         }
@@ -373,12 +313,12 @@ impl Inside {
                     tracked.took(&added);
                     added
                 }
-                None if self.handles >= HANDLES => {
-                    self.evictions += 1;
+                None if self.handles.is_full() => {
+                    self.handles.refuse();
                     continue;
                 }
                 None => {
-                    self.handles += 1;
+                    self.handles.add(1);
                     self.graph = None;
                     let added = Added {
                         counts: figures.counts,
@@ -413,7 +353,7 @@ impl Inside {
             let domain_id = process.reported_domain_id;
             process.facts.domain_id = attribution.domain(*id, domain_id);
             let nodes = attribution.nodes(*id, reported);
-            process.facts.nodes = nodes.into_iter().take(NODES).collect();
+            process.facts.nodes = nodes.into_iter().take(ReportedNodes::CAP).collect();
             process.participants = attribution.participants(*id);
             for tracked in process.handles.values_mut() {
                 attribution.resolve(*id, domain_id, reported, tracked);
@@ -501,10 +441,8 @@ impl Inside {
             before: start,
             at,
         };
-        if self.states.contains_key(&key) || self.states.len() < STATES {
-            self.states.insert(key, state.clone());
-        } else {
-            self.evictions += 1;
+        if self.states.insert(key, state.clone()).is_some() {
+            self.handles.refuse();
         }
         state
     }
@@ -512,7 +450,7 @@ impl Inside {
     /// Removes an ended process; the sums of its topics remain.
     fn remove(&mut self, id: u32) {
         if let Some(process) = self.processes.remove(&id) {
-            self.handles -= process.handles.len();
+            self.handles.sub(process.handles.len());
             self.states.retain(|(process, _), _| *process != id);
             self.graph = None;
             self.revision += 1;

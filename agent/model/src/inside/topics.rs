@@ -6,7 +6,6 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use ros2probe_wire::inside::HANDLE_CAPACITY;
 use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::{DomainId, Timestamp};
 
@@ -14,23 +13,19 @@ use super::facts::{TopicCounts, TopicInside};
 use super::report::Durations;
 use super::source::{Choice, Seen, Source};
 use super::witness::Witness;
+use crate::bounded::Bounded;
 use crate::diagnosis::TopicKey;
 use crate::measurement::Measurement;
 use crate::names::TopicName;
 use crate::naming::Naming;
 use crate::rate::{SECONDS, Slot};
-use crate::size::{Size, largest};
+use crate::tables::{InsideTopicSums, TopicTotals};
 use crate::topic::TopicId;
-
-/// Topics with sums.
-const TOPICS: usize = HANDLE_CAPACITY as usize;
-/// Totals kept for rates, one per report.
-const PAST: usize = SECONDS as usize + 2;
 
 /// All topics of observed processes, and those that had one within the grace period.
 #[derive(Debug, Default)]
 pub(super) struct InsideTopics {
-    topics: BTreeMap<(DomainId, TopicName), InsideTopic>,
+    topics: Bounded<InsideTopicSums, BTreeMap<(DomainId, TopicName), InsideTopic>>,
     /// Topics dropped or refused because of the cap.
     pub(super) evictions: u64,
 }
@@ -48,7 +43,7 @@ pub(super) struct InsideTopic {
     /// Messages lost in queues of subscriptions; `None` before any queue could be judged.
     lost_in_queues: Option<u64>,
     /// Times and totals of the last reports.
-    past: VecDeque<(Timestamp, u64)>,
+    past: Bounded<TopicTotals, VecDeque<(Timestamp, u64)>>,
     live: Live,
     choice: Choice,
     /// Its entry among the topics of the graph, if that is known.
@@ -80,36 +75,6 @@ pub(super) struct TopicAdded {
 }
 
 impl InsideTopics {
-    /// Returns the size and cap of each table.
-    pub(super) fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            topics,
-            evictions: _,
-        } = self;
-        let past = topics.values().map(|topic| {
-            let InsideTopic {
-                naming: _,
-                counts: _,
-                messages: _,
-                witness: _,
-                last: _,
-                latency: _,
-                waiting: _,
-                lost_in_queues: _,
-                past,
-                live: _,
-                choice: _,
-                id: _,
-                seen: _,
-            } = topic;
-            Size::new("inside.past", past.len(), PAST)
-        });
-        let mut sizes = largest(past);
-        sizes.push(Size::new("inside.topics", topics.len(), TOPICS));
-        sizes
-    }
-
     /// Returns all topics.
     pub(super) fn iter_mut(
         &mut self,
@@ -133,6 +98,7 @@ impl InsideTopics {
                 return;
             };
             if !self.has_room() {
+                self.topics.refuse();
                 self.evictions += 1;
                 return;
             }
@@ -145,7 +111,7 @@ impl InsideTopics {
                 latency: Arc::default(),
                 waiting: Arc::default(),
                 lost_in_queues: None,
-                past: VecDeque::new(),
+                past: Bounded::default(),
                 live: Live::default(),
                 choice: Choice::default(),
                 id: None,
@@ -166,11 +132,10 @@ impl InsideTopics {
             if live.contains_key(key) {
                 topic.seen = at;
             }
-            while topic.past.len() >= PAST
-                || topic
-                    .past
-                    .get(1)
-                    .is_some_and(|(time, _)| at - *time >= Duration::from_secs(SECONDS))
+            while topic
+                .past
+                .get(1)
+                .is_some_and(|(time, _)| at - *time >= Duration::from_secs(SECONDS))
             {
                 topic.past.pop_front();
             }
@@ -201,7 +166,7 @@ impl InsideTopics {
 
     /// Frees an entry if none is free: that of the topic whose last handle ended first.
     fn has_room(&mut self) -> bool {
-        if self.topics.len() < TOPICS {
+        if !self.topics.is_full() {
             return true;
         }
         let ended = self.topics.iter().filter(|(_, topic)| !topic.is_live());

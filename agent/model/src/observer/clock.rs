@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::time::Duration;
 
-use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::Verdict;
 use ros2probe_wire::time::{SECOND, nanoseconds};
+use ros2probe_wire::{Guid, Timestamp};
 
 use super::{JUMP, Observer, TICK, graph};
 use crate::delivery::Receiver;
@@ -16,6 +17,8 @@ use crate::expectation::WatchState;
 use crate::loss_share::LossShare;
 use crate::measurement::Measurement;
 use crate::rate::Slot;
+use crate::sampled::Sampled;
+use crate::transport::is_polled;
 
 impl Observer {
     /// Advances the time: expires leases, settles gaps, evaluates expectations.
@@ -220,11 +223,30 @@ impl Observer {
                 Some(inside) => &|seconds| inside.recent(seconds),
                 None => &recent,
             };
+            let seeming_silence = |slowest| {
+                let polled = writers.iter();
+                let longest = polled.map(|each| each.writer.seeming_silence(slowest));
+                let longest = longest.max().unwrap_or_default();
+                let is_unseen = |guid: &&Guid| {
+                    let known = self.profiler.get(**guid);
+                    known.is_none_or(|each| each.writer.is_unseen())
+                };
+                let mut unseen = topic.writers.iter().filter(is_unseen);
+                match unseen.any(|guid| is_polled(&self.discovery, *guid, &topic.readers)) {
+                    true => longest.max(Sampled::seeming_silence_of_unseen(slowest)),
+                    false => longest,
+                }
+            };
+            let seeming_silence: &dyn Fn(Duration) -> Duration = match &inside {
+                Some(_) => &|_| Duration::ZERO,
+                None => &seeming_silence,
+            };
             let evidence = Evidence {
                 now,
                 publishers: topic.writers.len().max(publishers),
                 subscriptions: topic.readers.len().max(subscriptions),
                 last_message: last_message.max(retired).max(seen_inside),
+                seeming_silence,
                 since: topic.published,
                 observed: topic.published.max(topic.subscribed).max(self.view_began),
                 recent,

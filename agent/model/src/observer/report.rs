@@ -80,7 +80,7 @@ fn participants(observer: &Observer) -> Vec<ParticipantFacts> {
 }
 
 fn node_facts(discovery: &Discovery) -> Vec<NodeFacts> {
-    let mut facts = Vec::with_capacity(discovery.node_count());
+    let mut facts = Vec::new();
     for (prefix, participant) in discovery.participants() {
         for node in &participant.nodes {
             facts.push(NodeFacts {
@@ -360,24 +360,20 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         profiler,
         ..
     } = observer;
-    let evictions = discovery.evictions();
+    let [participants, endpoints, nodes] = discovery.tables();
     let table = |table, size: usize, limit: usize, evictions| TableFacts {
         table,
         size: size as u64,
         limit: limit as u64,
+        bytes: None,
         evictions,
     };
-    let (writers, unknown, unknown_limit, unknown_evictions) = profiler.size();
+    let (writers, unknown_writers) = profiler.size();
     let (interest, interest_limit, interest_evictions) = observer.interest.size();
-    let (sockets, sockets_limit, sockets_evictions) = observer.receivers.sockets().size();
-    let (addresses, addresses_limit, addresses_evictions) = observer.receivers.addresses();
+    let [sockets, addresses] = observer.receivers.tables();
     let (diagnoses, diagnoses_limit, diagnoses_left_out) = observer.examiner.size();
-    let (spans, spans_limit, spans_evictions) = observer.tracer.size();
-    let (inside, inside_limit, inside_evictions) = observer.inside.size();
-    let (calls, calls_limit, calls_evictions) = observer.services.size();
     let (payloads, payloads_limit, payloads_evictions) = observer.payloads.size();
-    let (messages, messages_limit, messages_evictions) = observer.chains.size();
-    let (chains, chains_limit, chains_refused) = observer.chains.paths();
+    let [chains, messages] = observer.chains.tables();
     let quota = profiler.quota();
     let refused = profiler.iter().filter_map(|(_, measured)| {
         let subscribers = measured.subscribers.as_ref()?;
@@ -391,28 +387,13 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
         .iter()
         .map(|budget| budget.evictions + budget.rejected)
         .sum();
-    vec![
-        table(
-            "participants",
-            discovery.participants().len(),
-            settings.participants,
-            evictions.participants,
-        ),
-        table(
-            "endpoints",
-            discovery.endpoints().len(),
-            settings.endpoints,
-            evictions.endpoints,
-        ),
-        table(
-            "nodes",
-            discovery.node_count(),
-            settings.nodes,
-            evictions.nodes,
-        ),
+    let mut tables = vec![
+        participants,
+        endpoints,
+        nodes,
         table("topics", topics.len(), settings.endpoints, topics.evictions),
         table("writers", writers, settings.endpoints, 0),
-        table("unknown_writers", unknown, unknown_limit, unknown_evictions),
+        unknown_writers,
         table(
             "samples",
             samples,
@@ -426,19 +407,16 @@ fn tables(observer: &Observer) -> Vec<TableFacts> {
             quota.limit,
             quota.evictions + refused,
         ),
-        table("sockets", sockets, sockets_limit, sockets_evictions),
-        table("addresses", addresses, addresses_limit, addresses_evictions),
+        sockets,
+        addresses,
         table("diagnoses", diagnoses, diagnoses_limit, diagnoses_left_out),
-        table("spans", spans, spans_limit, spans_evictions),
-        table("calls", calls, calls_limit, calls_evictions),
-        table("inside", inside, inside_limit, inside_evictions),
-        table("chains", chains, chains_limit, chains_refused),
-        table(
-            "chain_messages",
-            messages,
-            messages_limit,
-            messages_evictions,
-        ),
+        observer.tracer.table(),
+        observer.services.table(),
+        observer.inside.table(),
+        chains,
+        messages,
         table("payloads", payloads, payloads_limit, payloads_evictions),
-    ]
+    ];
+    tables.extend(observer.zenoh.tables());
+    tables
 }

@@ -43,10 +43,8 @@ impl Profiler {
             return RecordOutcome::Unmeasured;
         }
         let now = Timestamp(record.time);
-        if self.unknown_writers.len() >= self.unknown_writer_limit
-            && !self.evict_unknown_writer(now, graph)
-        {
-            self.unknown_writer_evictions += 1;
+        if self.unknown_writers.is_full() && !self.evict_unknown_writer(now, graph) {
+            self.unknown_writers.refuse();
             return RecordOutcome::Unmeasured;
         }
         self.unknown_writers.insert(guid);
@@ -73,7 +71,7 @@ impl Profiler {
             self.search_after = now + SEARCH_INTERVAL;
             return false;
         };
-        self.unknown_writer_evictions += 1;
+        self.unknown_writers.refuse();
         self.stop(guid, now, &mut Journal::default(), graph);
         true
     }

@@ -7,21 +7,21 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use ros2probe_wire::GuidPrefix;
 
+use crate::bounded::{Bounded, Counted};
 use crate::route::Destination;
-use crate::size::Size;
+use crate::snapshot::TableFacts;
+use crate::tables::Addresses;
 
 /// All announced addresses.
 #[derive(Debug)]
 pub(super) struct AnnouncedAddresses {
-    announcers: HashMap<Destination, Announcer>,
+    announcers: Bounded<Counted<Addresses>, HashMap<Destination, Announcer>>,
     /// Addresses by the age of the announcement.
-    ages: BTreeMap<u64, Destination>,
+    ages: Bounded<Counted<Addresses>, BTreeMap<u64, Destination>>,
     /// The same ages, by participant.
-    own: BTreeSet<(GuidPrefix, u64)>,
+    own: Bounded<Counted<Addresses>, BTreeSet<(GuidPrefix, u64)>>,
     age: u64,
-    limit: usize,
     each: usize,
-    evictions: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -37,13 +37,11 @@ impl AnnouncedAddresses {
     /// Creates an empty table of at most `limit` addresses, `each` per participant.
     pub(super) fn new(limit: usize, each: usize) -> Self {
         Self {
-            announcers: HashMap::new(),
-            ages: BTreeMap::new(),
-            own: BTreeSet::new(),
+            announcers: Bounded::capped(limit),
+            ages: Bounded::capped(limit),
+            own: Bounded::capped(limit),
             age: 0,
-            limit,
             each,
-            evictions: 0,
         }
     }
 
@@ -63,6 +61,17 @@ impl AnnouncedAddresses {
             self.ages.remove(&before.age);
             self.own.remove(&(before.prefix, before.age));
         }
+        let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
+        let oldest = own().next().filter(|_| own().count() >= self.each);
+        if let Some((_, age)) = oldest.copied() {
+            self.give_up(age);
+        }
+        if before.is_none()
+            && self.announcers.is_full()
+            && let Some((age, _)) = self.ages.first_key_value()
+        {
+            self.give_up(*age);
+        }
         let age = self.age;
         let announcer = Announcer {
             prefix,
@@ -73,16 +82,6 @@ impl AnnouncedAddresses {
         self.announcers.insert(destination, announcer);
         self.ages.insert(age, destination);
         self.own.insert((prefix, age));
-        let own = || self.own.range((prefix, 0)..=(prefix, u64::MAX));
-        let oldest = own().next().filter(|_| own().count() > self.each);
-        if let Some((_, age)) = oldest.copied() {
-            self.give_up(age);
-        }
-        if self.ages.len() > self.limit
-            && let Some((age, _)) = self.ages.first_key_value()
-        {
-            self.give_up(*age);
-        }
         before.is_none_or(|before| before.prefix != prefix)
     }
 
@@ -102,32 +101,9 @@ impl AnnouncedAddresses {
         (!announcer.contested).then_some(announcer.prefix)
     }
 
-    /// Returns the size and cap of each table.
-    pub(super) fn sizes(&self) -> [Size; 4] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            announcers,
-            ages,
-            own,
-            age: _,
-            limit,
-            each,
-            evictions: _,
-        } = self;
-        let chunks: Vec<_> = own.iter().map(|(prefix, _)| prefix).collect();
-        let of_one = chunks.chunk_by(|before, after| before == after);
-        let of_one = of_one.map(<[_]>::len).max().unwrap_or(0);
-        [
-            Size::new("receivers.addresses", announcers.len(), *limit),
-            Size::new("receivers.addresses.ages", ages.len(), *limit),
-            Size::new("receivers.addresses.own", own.len(), *limit),
-            Size::new("receivers.addresses.participant", of_one, *each),
-        ]
-    }
-
-    /// Returns the number of addresses, their cap, and those dropped because of a cap.
-    pub(super) fn size(&self) -> (usize, usize, u64) {
-        (self.announcers.len(), self.limit, self.evictions)
+    /// Returns the row of the metrics.
+    pub(super) fn table(&self) -> TableFacts {
+        self.announcers.facts()
     }
 
     fn give_up(&mut self, age: u64) {
@@ -137,7 +113,7 @@ impl AnnouncedAddresses {
             .and_then(|destination| self.announcers.remove(&destination));
         if let Some(announcer) = announcer {
             self.own.remove(&(announcer.prefix, age));
-            self.evictions += 1;
+            self.announcers.refuse();
         }
     }
 }
@@ -148,6 +124,11 @@ mod tests {
 
     const ALICE: GuidPrefix = GuidPrefix([1; 12]);
     const BOB: GuidPrefix = GuidPrefix([2; 12]);
+
+    fn size(addresses: &AnnouncedAddresses) -> (u64, u64, u64) {
+        let facts = addresses.table();
+        (facts.size, facts.limit, facts.evictions)
+    }
 
     fn at(port: u16) -> Destination {
         Destination {
@@ -161,7 +142,7 @@ mod tests {
         let mut addresses = AnnouncedAddresses::new(100, 16);
         addresses.put(BOB, at(7411));
         (8000..9000).for_each(|port| assert!(addresses.put(ALICE, at(port))));
-        assert_eq!(addresses.size(), (17, 100, 1000 - 16));
+        assert_eq!(size(&addresses), (17, 100, 1000 - 16));
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         assert_eq!(addresses.owner(&at(8999)), Some(ALICE));
         assert_eq!(addresses.owner(&at(8000)), None);
@@ -176,10 +157,10 @@ mod tests {
             addresses.put(prefix, at(number.into()));
             addresses.put(BOB, at(7411));
         }
-        assert_eq!(addresses.size(), (4, 4, 97));
+        assert_eq!(size(&addresses), (4, 4, 97));
         assert_eq!(addresses.owner(&at(7411)), Some(BOB));
         addresses.retain(|prefix| *prefix == BOB);
-        assert_eq!(addresses.size().0, 1);
+        assert_eq!(size(&addresses).0, 1);
         assert_eq!((addresses.ages.len(), addresses.own.len()), (1, 1));
     }
 
@@ -192,6 +173,6 @@ mod tests {
         assert!(!addresses.put(BOB, at(1)));
         assert!(addresses.put(ALICE, at(1)));
         assert_eq!(addresses.owner(&at(1)), None);
-        assert_eq!(addresses.size(), (1, 4, 0));
+        assert_eq!(size(&addresses), (1, 4, 0));
     }
 }

@@ -101,7 +101,7 @@ impl Sequence {
     pub(super) fn confirm(&mut self) -> Run {
         let unconfirmed = self.unconfirmed.take();
         let run = unconfirmed.map_or_else(Run::default, |unconfirmed| unconfirmed.into_run());
-        let Some((first, _)) = run.numbers.first() else {
+        let Some((first, _)) = run.numbers.front() else {
             return run;
         };
         let jump = (*first >= self.next).then(|| *first - self.next);

@@ -3,16 +3,17 @@
 //! One datagram proves nothing. Two things confirm a run. Several datagrams continue it while the
 //! live run stands still, or a HEARTBEAT in a later datagram agrees with it.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use ros2probe_wire::{SequenceNumber, Timestamp};
 
 use super::FAR;
+use crate::bounded::Bounded;
+use crate::tables::UnconfirmedNumbers;
 
 /// Number of datagrams that confirm a run.
 pub(super) const CONFIRMATIONS: u8 = 5;
-/// Largest number of samples remembered per run; a datagram may contain several.
-const KEPT: usize = 32;
 /// Copies of one datagram arrive at several sockets within this time.
 const COPIES: Duration = Duration::from_millis(5);
 
@@ -33,45 +34,25 @@ pub(super) struct UnconfirmedRun {
 #[derive(Clone, Debug, Default)]
 pub struct Run {
     /// Numbers, and whether each sample is whole; sorted once confirmed.
-    pub numbers: Vec<(SequenceNumber, bool)>,
+    pub numbers: Bounded<UnconfirmedNumbers, VecDeque<(SequenceNumber, bool)>>,
     /// Numbers that a GAP skipped before the run.
     pub(super) gap: (SequenceNumber, SequenceNumber),
 }
 
 impl UnconfirmedRun {
-    /// Largest number of samples.
-    pub(super) const CAP: usize = KEPT;
-
-    /// Returns the number of samples.
-    pub(super) const fn len(&self) -> usize {
-        let Self {
-            run,
-            evidence: _,
-            since: _,
-            latest: _,
-            claim: _,
-        } = self;
-        let Run { numbers, gap: _ } = run;
-        numbers.len()
-    }
-
     /// Records the number of a sample. Returns whether it begins a run, and whether it is new.
     pub(super) fn note(&mut self, number: SequenceNumber, now: Timestamp) -> (bool, bool) {
         let numbers = &self.run.numbers;
         if numbers.iter().any(|(known, _)| *known == number) {
             return (false, false);
         }
-        let last = numbers.last().map(|(last, _)| *last);
+        let last = numbers.back().map(|(last, _)| *last);
         let opens = last.is_none_or(|last| last.distance(number) > FAR);
         if opens {
             self.run.numbers.clear();
             self.evidence = 0;
         }
-        let numbers = &mut self.run.numbers;
-        if numbers.len() >= KEPT {
-            numbers.remove(0);
-        }
-        numbers.push((number, false));
+        self.run.numbers.push_back((number, false));
         if self.evidence == 0 {
             self.since = now;
         }
@@ -93,7 +74,7 @@ impl UnconfirmedRun {
 
     /// Returns whether this number continues a run below `live`.
     pub(super) fn is_continued(&self, number: SequenceNumber, live: SequenceNumber) -> bool {
-        let last = self.run.numbers.last().filter(|_| self.evidence > 0);
+        let last = self.run.numbers.back().filter(|_| self.evidence > 0);
         last.is_some_and(|(last, _)| *last < live && last.distance(number) <= FAR)
     }
 
@@ -146,10 +127,10 @@ impl UnconfirmedRun {
     /// Returns the samples that arrived, in ascending order.
     pub(super) fn into_run(self) -> Run {
         let mut run = self.run;
-        run.numbers.sort_unstable();
+        run.numbers.make_contiguous().sort_unstable();
         if run
             .numbers
-            .first()
+            .front()
             .is_none_or(|(first, _)| run.gap.1 > *first)
         {
             // The GAP contradicts the samples that arrived.
@@ -179,7 +160,7 @@ mod tests {
                 (number == 1, true)
             );
         }
-        assert_eq!(unconfirmed.len(), UnconfirmedRun::CAP);
+        assert!(unconfirmed.run.numbers.is_full());
         // The evidence counts again.
         assert_eq!(
             unconfirmed.note(SequenceNumber(1), Timestamp(1)),

@@ -5,10 +5,8 @@ use std::collections::BTreeMap;
 use ros2probe_wire::Timestamp;
 
 use super::latency::Latencies;
-use crate::size::Size;
-
-/// Largest number of goals of one action that wait for their result.
-const MAX_GOALS: usize = 64;
+use crate::bounded::Bounded;
+use crate::tables::ActionGoals;
 
 /// `GoalStatus` of action_msgs: final states that a result reports.
 const SUCCEEDED: u8 = 4;
@@ -19,7 +17,7 @@ const ABORTED: u8 = 6;
 #[derive(Debug, Default)]
 pub struct Action {
     /// Accepted goals by id (`unique_identifier_msgs/UUID`), with the time of their request.
-    goals: BTreeMap<[u8; 16], Timestamp>,
+    goals: Bounded<ActionGoals, BTreeMap<[u8; 16], Timestamp>>,
     /// Number of goals in each state.
     pub counts: GoalCounts,
     /// Times from the request of a goal to its result.
@@ -51,7 +49,8 @@ impl Action {
             return;
         }
         self.counts.accepted += 1;
-        if self.goals.len() >= MAX_GOALS {
+        if self.goals.is_full() {
+            self.goals.refuse();
             let oldest = self.goals.iter().min_by_key(|(_, sent)| **sent);
             if let Some(oldest) = oldest.map(|(goal, _)| *goal) {
                 self.goals.remove(&oldest);
@@ -80,22 +79,6 @@ impl Action {
     #[must_use]
     pub fn open(&self) -> usize {
         self.goals.len()
-    }
-
-    /// Returns the size and cap of each table.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 2] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            goals,
-            counts: _,
-            durations,
-            evictions: _,
-        } = self;
-        [
-            Size::new("services.goals", goals.len(), MAX_GOALS),
-            durations.size(),
-        ]
     }
 }
 
@@ -129,10 +112,10 @@ mod tests {
     #[test]
     fn the_oldest_goal_is_dropped_at_the_cap() {
         let mut action = Action::default();
-        for number in 0..=u8::try_from(MAX_GOALS).unwrap() {
+        for number in 0..=u8::try_from(ActionGoals::CAP).unwrap() {
             action.replied([number; 16], Timestamp(number.into()), true);
         }
-        assert_eq!((action.open(), action.evictions), (MAX_GOALS, 1));
+        assert_eq!((action.open(), action.evictions), (ActionGoals::CAP, 1));
         action.result([0; 16], SUCCEEDED, Timestamp(1000));
         assert_eq!(action.counts.succeeded, 0);
     }

@@ -1,20 +1,18 @@
 //! Durations of calls or goals: all in a histogram, the latest ones exactly.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
+use crate::bounded::Bounded;
 use crate::histogram::Histogram;
-use crate::size::Size;
-
-/// Largest number of the latest durations from which quantiles are computed.
-const RECENT: usize = 1024;
+use crate::tables::RecentDurations;
 
 /// Durations of one service or action.
 #[derive(Debug, Default)]
 pub struct Latencies {
     all: Histogram,
-    /// The latest durations in nanoseconds; a ring once it has [`RECENT`] entries.
-    recent: Vec<u64>,
-    next: usize,
+    /// The latest durations in nanoseconds.
+    recent: Bounded<RecentDurations, VecDeque<u64>>,
 }
 
 /// Durations as a snapshot shows them.
@@ -33,35 +31,18 @@ impl Latencies {
     pub fn observe(&mut self, duration: Duration) {
         self.all.observe(duration.as_secs_f64());
         let nanoseconds = u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX);
-        if self.recent.len() < RECENT {
-            self.recent.push(nanoseconds);
-        } else if let Some(oldest) = self.recent.get_mut(self.next) {
-            *oldest = nanoseconds;
-            self.next = (self.next + 1) % RECENT;
-        }
+        self.recent.push_back(nanoseconds);
     }
 
     /// Returns the histogram and the quantiles.
     #[must_use]
     pub fn facts(&self) -> LatencyFacts {
-        let mut recent = self.recent.clone();
+        let mut recent: Vec<_> = self.recent.iter().copied().collect();
         LatencyFacts {
             histogram: self.all,
             p50: quantile(&mut recent, 50),
             p99: quantile(&mut recent, 99),
         }
-    }
-
-    /// Returns the size and cap of the list.
-    #[must_use]
-    pub fn size(&self) -> Size {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            all: _,
-            recent,
-            next: _,
-        } = self;
-        Size::new("services.recent", recent.len(), RECENT)
     }
 }
 
@@ -94,13 +75,17 @@ mod tests {
     #[test]
     fn only_the_latest_durations_are_kept_for_quantiles() {
         let mut latencies = Latencies::default();
-        for number in 0..10 * RECENT as u64 {
-            let milliseconds = if number < 9 * RECENT as u64 { 1 } else { 7 };
+        for number in 0..10 * RecentDurations::CAP as u64 {
+            let milliseconds = if number < 9 * RecentDurations::CAP as u64 {
+                1
+            } else {
+                7
+            };
             latencies.observe(Duration::from_millis(milliseconds));
         }
         let facts = latencies.facts();
         assert_eq!((facts.p50, facts.p99), (Some(0.007), Some(0.007)));
-        assert_eq!(facts.histogram.count(), 10 * RECENT as u64);
-        assert_eq!(latencies.size().entries, RECENT);
+        assert_eq!(facts.histogram.count(), 10 * RecentDurations::CAP as u64);
+        assert!(latencies.recent.is_full());
     }
 }

@@ -8,16 +8,13 @@ use ros2probe_wire::record::Sample;
 use ros2probe_wire::{Guid, GuidPrefix, SequenceNumber, Timestamp};
 
 use super::latency::Latencies;
-use crate::size::Size;
+use crate::bounded::Bounded;
+use crate::tables::{ReplyRuns, ServiceClients};
 
-/// Largest number of clients of one service whose request numbers are remembered.
-const MAX_CLIENTS: usize = 256;
 /// Request numbers below the highest one that are remembered per client, for late duplicates.
 const WINDOW: u64 = 64;
 /// A number further ahead does not move a client's highest number, since it may be forged.
 const FAR: u64 = 1 << 20;
-/// Largest number of separate runs of fragments of one reply.
-const MAX_RUNS: usize = 16;
 /// Time after which an unanswered call is no longer followed.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(600);
 
@@ -59,7 +56,7 @@ pub enum Position {
 /// A service.
 #[derive(Debug, Default)]
 pub struct Service {
-    clients: BTreeMap<[u8; 16], Client>,
+    clients: Bounded<ServiceClients, BTreeMap<[u8; 16], Client>>,
     calls: BTreeMap<CallId, Call>,
     /// Requests, each counted once.
     pub requests: u64,
@@ -109,7 +106,7 @@ struct Received {
     /// Writer and number of the reply.
     of: Option<(Guid, SequenceNumber)>,
     /// Sorted ranges of fragment numbers, the end exclusive.
-    runs: Vec<(u32, u32)>,
+    runs: Bounded<ReplyRuns, Vec<(u32, u32)>>,
 }
 
 /// Request numbers of a client that were seen.
@@ -250,54 +247,20 @@ impl Service {
         hanging.map(|call| call.writer)
     }
 
-    /// Returns the size and cap of each table; `calls` is the cap of all services together.
-    #[must_use]
-    pub fn sizes(&self, calls: usize) -> [Size; 4] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            clients,
-            calls: open,
-            requests: _,
-            answered: _,
-            unanswered: _,
-            latencies,
-            suspended: _,
-            last_request: _,
-            is_exact: _,
-        } = self;
-        let runs = |call: &Call| {
-            let Call {
-                writer: _,
-                sent: _,
-                is_local: _,
-                is_hanging: _,
-                goal: _,
-                dropped: _,
-                received,
-            } = call;
-            let Received { of: _, runs } = received;
-            runs.len()
-        };
-        let runs = open.values().map(runs).max().unwrap_or(0);
-        [
-            Size::new("services.clients", clients.len(), MAX_CLIENTS),
-            Size::new("services.calls", open.len(), calls),
-            Size::new("services.runs", runs, MAX_RUNS),
-            latencies.size(),
-        ]
-    }
-
     /// Returns whether the client has not sent this number before.
     fn is_new(&mut self, id: CallId, at: Timestamp) -> bool {
-        if !self.clients.contains_key(&id.client) && self.clients.len() >= MAX_CLIENTS {
+        if !self.clients.contains_key(&id.client) && self.clients.is_full() {
+            self.clients.refuse();
             let oldest = self.clients.iter().min_by_key(|(_, client)| client.last);
             if let Some(oldest) = oldest.map(|(client, _)| *client) {
                 self.clients.remove(&oldest);
             }
         }
-        let client = self.clients.entry(id.client).or_default();
-        client.last = at;
-        client.note(id.number.0)
+        let client = self.clients.get_or_insert_with(id.client, Client::default);
+        client.is_none_or(|client| {
+            client.last = at;
+            client.note(id.number.0)
+        })
     }
 }
 
@@ -339,7 +302,7 @@ impl Received {
         };
         let of = Some((writer, sample.sequence_number()));
         if self.of != of {
-            (self.of, self.runs) = (of, Vec::new());
+            (self.of, self.runs) = (of, Bounded::default());
         }
         let total = fragments.total();
         if total == 0 {
@@ -354,10 +317,8 @@ impl Received {
             }
             !touches
         });
-        if self.runs.len() < MAX_RUNS {
-            let place = self.runs.partition_point(|other| *other < run);
-            self.runs.insert(place, run);
-        }
+        let place = self.runs.partition_point(|other| *other < run);
+        self.runs.insert(place, run);
         matches!(self.runs.as_slice(), [(1, end)] if *end > total)
     }
 }

@@ -81,6 +81,10 @@ impl Writer {
             }
             Body::Complete | Body::Handover | Body::Undelivered | Body::Unknown => 0,
         };
+        sampled.pace(announced, since, now);
+        if announced > 0 {
+            self.last_message = self.last_message.max(Some(now));
+        }
         let announced = Sum {
             messages: announced,
             bytes: 0,
@@ -91,11 +95,14 @@ impl Writer {
 
     /// Counts the samples up to a seen one. Unseen ones are assumed to have its size.
     fn count_span(&mut self, sample: Sample<'_>, update: &SampledUpdate, since: Timestamp) {
+        let now = record_time(sample.record());
+        if let Some(sampled) = &mut self.sampled {
+            sampled.pace(update.samples, since, now);
+        }
         let disposals = u64::from(!sample.is_message() && update.samples > 0);
         let messages = update.samples - disposals;
         let size = u64::from(sample.size());
         let bytes = (update.alike - disposals).saturating_mul(size);
-        let now = record_time(sample.record());
         self.spread(Sum { messages, bytes }, since, now);
         if messages > 0 {
             self.last_message = self.last_message.max(Some(now));

@@ -94,6 +94,15 @@ fn data(number: u64) -> Record {
     }
 }
 
+fn heartbeat(first: u64, last: u32) -> Record {
+    Record {
+        kind: kind::HEARTBEAT,
+        sequence_number: first,
+        encapsulation: last,
+        ..Record::default()
+    }
+}
+
 /// Returns a record of a sample in ten fragments.
 fn fragment(number: u64, start: u32) -> Record {
     Record {
@@ -241,13 +250,7 @@ fn reliable_gaps_stay_open_for_retransmissions() {
 fn an_unannounced_writer_that_sends_heartbeats_is_reliable() {
     let mut bench = Bench::new(Traits::default());
     bench.data(1).data(3);
-    bench.put(Record {
-        kind: kind::HEARTBEAT,
-        sequence_number: 1,
-        encapsulation: 3,
-        ..Record::default()
-    });
-    bench.wait(5000);
+    bench.put(heartbeat(1, 3)).wait(5000);
     assert_eq!(bench.facts().lost, 0);
     bench.wait(7000);
     assert_eq!(bench.facts().lost, 1);
@@ -371,6 +374,44 @@ fn in_shared_memory_messages_are_the_span_of_their_numbers_and_no_gap_is_a_loss(
     assert_eq!((sampled.seen, sampled.span), (4, 9));
     // Only the interval between 1 and 2 counts.
     assert_eq!(facts.interarrival.count(), 1);
+}
+
+#[test]
+fn a_message_that_only_a_heartbeat_tells_of_is_the_last_message() {
+    let mut bench = Bench::new(RELIABLE);
+    bench.put(in_shared_memory(data(1))).wait(1000);
+    bench.put(in_shared_memory(heartbeat(1, 2)));
+    assert_eq!(bench.writer.last_message(), Some(Timestamp(bench.now)));
+    let told = bench.now;
+    bench.wait(1000);
+    bench.put(in_shared_memory(heartbeat(1, 2)));
+    assert_eq!(bench.writer.last_message(), Some(Timestamp(told)));
+}
+
+#[test]
+fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
+    let slowest = Duration::from_secs(2);
+    let silence_of = |seen: &dyn Fn(u64) -> bool| {
+        let mut bench = Bench::new(RELIABLE);
+        for number in (1..=100).filter(|number| seen(*number)) {
+            bench.now = START + number * SECOND;
+            bench.put(in_shared_memory(data(number)));
+        }
+        bench.writer.seeming_silence(slowest).as_secs_f64()
+    };
+    // Intervals of a second: 3 of 100 in a row, 10 of every fourth, 20 of every second.
+    let all = silence_of(&|_| true);
+    let most = silence_of(&|number| number % 4 > 0);
+    let half = silence_of(&|number| number % 2 == 0);
+    assert!((3.3..3.5).contains(&all), "{all}");
+    assert!((9.0..11.0).contains(&most), "{most}");
+    assert!((19.0..21.0).contains(&half), "{half}");
+    // After one message, nothing is known.
+    let one = silence_of(&|number| number == 1);
+    assert!((54.0..55.0).contains(&one), "{one}");
+    let mut bench = Bench::new(RELIABLE);
+    bench.data(1).wait(1000).data(2);
+    assert_eq!(bench.writer.seeming_silence(slowest), Duration::ZERO);
 }
 
 #[test]

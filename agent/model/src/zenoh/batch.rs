@@ -1,14 +1,23 @@
 //! Transport messages of a batch: INIT identifies the sender, OPEN has its lease, a FRAME contains
 //! network messages, and FRAGMENTs are parts of one.
 
-use ros2probe_wire::Reason;
+use std::time::Duration;
+
 use ros2probe_wire::zenoh::{
     Batch, Fragment, Init, Message, NetworkMessage, Sample, Side, VERSION, WhatAmI,
 };
+use ros2probe_wire::{Reason, Timestamp};
 
 use super::messages::attachment;
 use super::stream::{StreamId, Unseen};
-use super::{MAX_CHAIN_BYTES, Place, Shown, Zenoh};
+use super::{Place, Shown, Zenoh};
+
+/// Room for the messages in FRAGMENTs below which stale ones are given up: one large message.
+const ROOM: usize = 4 << 20;
+/// Time without a FRAGMENT after which a message is given up if room is needed.
+const STALE: Duration = Duration::from_secs(10);
+/// Least time between two searches for such messages.
+const GIVE_UP_INTERVAL: Duration = Duration::from_secs(1);
 
 impl Zenoh {
     pub(super) fn batch(
@@ -80,15 +89,30 @@ impl Zenoh {
         let Some(direction) = self.direction(stream) else {
             return;
         };
-        if direction.sender.is_some_and(|before| before != side) {
-            direction.aliases.clear();
+        let before = direction.sender.replace(side);
+        let (number, owner) = (direction.number, direction.owner(stream));
+        if before.is_some_and(|before| before != side) {
+            drop(self.aliases.remove_owner(number));
         }
-        direction.sender = Some(side);
-        if let Some(owner) = direction.owner(stream) {
+        if let Some(owner) = owner {
             show(Shown::Owner(stream.socket, owner.guid_prefix()));
             self.has_begun = true;
         }
         self.revision += 1;
+    }
+
+    /// Gives up messages of which no FRAGMENT arrives any more, at most once a second.
+    fn give_up_chains(&mut self, now: Timestamp) {
+        if now < self.gave_up + GIVE_UP_INTERVAL {
+            return;
+        }
+        self.gave_up = now;
+        let before = now - STALE;
+        for direction in self.directions.values_mut() {
+            let held = direction.held();
+            self.counters.incomplete += direction.give_up(before) as u64;
+            self.chain_bytes.sub(held - direction.held());
+        }
     }
 
     fn fragment(
@@ -98,6 +122,9 @@ impl Zenoh {
         wants_bytes: bool,
         show: &mut impl FnMut(Shown<'_>),
     ) {
+        if self.chain_bytes.room() < ROOM {
+            self.give_up_chains(place.time);
+        }
         let is_wanted = |beginning: &[u8]| match NetworkMessage::beginning(beginning) {
             Ok(NetworkMessage::Push(push)) => match push.sample {
                 Sample::Put(put) => attachment(&put).map(|_| wants_bytes),
@@ -111,12 +138,13 @@ impl Zenoh {
             return;
         };
         let before = direction.held();
-        let room = MAX_CHAIN_BYTES.saturating_sub(self.chain_bytes);
+        let room = self.chain_bytes.room();
         let waited = direction.chains.len();
         let chain = direction.fragment(fragment, place.time, is_wanted, room);
         let was_broken = chain.is_none() && direction.chains.len() < waited;
         self.counters.incomplete += u64::from(was_broken || fragment.is_dropped);
-        self.chain_bytes = (self.chain_bytes + direction.held()).saturating_sub(before);
+        self.chain_bytes.sub(before);
+        self.chain_bytes.add(direction.held());
         let Some(chain) = chain else {
             return;
         };

@@ -6,9 +6,9 @@ use std::time::Duration;
 use ros2probe_wire::zenoh::ZenohId;
 use ros2probe_wire::{GuidPrefix, Timestamp};
 
+use super::Zenoh;
 use super::stream::{Flow, StreamId, Unseen};
 use super::stream_state::StreamState;
-use super::{MAX_DIRECTIONS, MAX_UNSEEN, Zenoh};
 
 /// Lease that rmw_zenoh configures.
 const LEASE: Duration = Duration::from_secs(60);
@@ -50,15 +50,16 @@ impl Zenoh {
 
     pub(super) fn direction(&mut self, stream: &StreamId) -> Option<&mut StreamState> {
         if !self.directions.contains_key(stream) {
-            if self.directions.len() >= MAX_DIRECTIONS {
-                self.evictions += 1;
+            if self.directions.is_full() {
+                self.directions.refuse();
                 let oldest = self.directions.iter();
                 let oldest = oldest.min_by_key(|(id, direction)| (direction.last_seen, **id));
                 let oldest = oldest.map(|(id, _)| *id)?;
                 self.begin(&oldest);
             }
             let sender = self.remembered.take(stream.flow);
-            let direction = Box::new(StreamState::new(stream, sender));
+            self.numbered += 1;
+            let direction = Box::new(StreamState::new(self.numbered, stream, sender));
             self.directions.insert(*stream, direction);
             self.flows.insert(stream.flow, *stream);
         }
@@ -71,9 +72,7 @@ impl Zenoh {
         for flow in [stream.flow, stream.flow.reversed()] {
             self.remembered.take(flow);
         }
-        if let Some(known) = self.remove(stream) {
-            self.disconnect(stream, &known);
-        }
+        self.remove(stream);
         let connection = stream.flow.connection();
         self.unseen.retain(|(_, other)| *other != connection);
     }
@@ -113,11 +112,8 @@ impl Zenoh {
                 self.graph.end(session);
             }
         }
-        if let Some(direction) = self.directions.get_mut(stream) {
-            direction.token_ids.clear();
-            for token in std::mem::take(&mut direction.tokens) {
-                self.graph.undeclare(&token, stream, None);
-            }
+        if let Some(direction) = self.directions.get(stream) {
+            self.graph.leave(direction.number);
         }
     }
 
@@ -143,41 +139,34 @@ impl Zenoh {
         let Some(direction) = self.directions.get_mut(stream) else {
             return;
         };
-        self.chain_bytes -= direction.held();
+        self.chain_bytes.sub(direction.held());
         direction.interrupt();
         direction.has_ended = true;
         if self.opposite(stream).is_none_or(|other| other.has_ended) {
             let elsewhere = self.flows.get(&stream.flow.reversed()).copied();
             let ids = [Some(*stream), Some(stream.reversed()), elsewhere];
             for id in ids.into_iter().flatten() {
-                if let Some(direction) = self.remove(&id) {
-                    self.disconnect(&id, &direction);
-                }
+                self.remove(&id);
             }
         }
     }
 
     pub(super) fn note_unseen(&mut self, reason: Unseen, flow: Flow) {
-        if self.unseen.len() < MAX_UNSEEN {
-            self.unseen.insert((reason, flow.connection()));
-        }
+        self.unseen.insert((reason, flow.connection()));
     }
 
-    fn remove(&mut self, stream: &StreamId) -> Option<Box<StreamState>> {
-        let known = self.directions.remove(stream)?;
-        self.chain_bytes -= known.held();
+    /// Forgets a direction with what it declares. A token lives on until it is undeclared or its
+    /// session ends.
+    fn remove(&mut self, stream: &StreamId) {
+        let Some(known) = self.directions.remove(stream) else {
+            return;
+        };
+        self.chain_bytes.sub(known.held());
         if self.flows.get(&stream.flow) == Some(stream) {
             self.flows.remove(&stream.flow);
         }
-        Some(known)
-    }
-
-    /// Removes what a connection declares. A token lives on until it is undeclared or its session
-    /// ends.
-    fn disconnect(&mut self, stream: &StreamId, direction: &StreamState) {
-        for token in &direction.tokens {
-            self.graph.disconnect(token, stream);
-        }
+        drop(self.aliases.remove_owner(known.number));
+        self.graph.disconnect(known.number);
     }
 }
 

@@ -1,21 +1,18 @@
 //! Declarations: aliases of keys, and liveliness tokens.
 
-use std::sync::Arc;
-
 use ros2probe_wire::zenoh::{Declaration, WireExpr};
 
 use super::Zenoh;
 use super::connections::lease;
 use super::stream::StreamId;
-use super::stream_state::MAX_TOKENS;
 
 impl Zenoh {
     pub(super) fn declaration(&mut self, stream: &StreamId, declaration: Declaration<'_>) {
         match declaration {
             Declaration::KeyExpr { id, key } => self.declare_alias(stream, id, key),
             Declaration::UndeclareKeyExpr { id } => {
-                if let Some(direction) = self.directions.get_mut(stream) {
-                    direction.aliases.remove(&id);
+                if let Some(direction) = self.directions.get(stream) {
+                    self.aliases.remove(direction.number, &id);
                 }
             }
             Declaration::Token { id, key } => self.declare_token(stream, id, key),
@@ -30,11 +27,8 @@ impl Zenoh {
 
     fn declare_alias(&mut self, stream: &StreamId, id: u16, key: WireExpr<'_>) {
         let key = self.resolve(stream, key);
-        if let Some(direction) = self.directions.get_mut(stream)
-            && let Some(key) = key
-            && !direction.declare(id, key)
-        {
-            self.evictions += 1;
+        if let (Some(direction), Some(key)) = (self.directions.get(stream), key) {
+            self.aliases.insert(direction.number, id, key, 0);
         }
     }
 
@@ -42,37 +36,26 @@ impl Zenoh {
         let Some(key) = self.resolve(stream, key) else {
             return;
         };
+        let Some(direction) = self.directions.get(stream).map(|known| known.number) else {
+            return;
+        };
         let router = self.passing_router(stream);
         let directions = &self.directions;
         let lease = |session| lease(directions, session);
-        let token = self.graph.declare(&key.key, *stream, lease);
-        if let (Some(token), Some(router)) = (&token, router) {
-            self.revision += u64::from(self.graph.pass_on(token, router));
-        }
-        if let Some(token) = token
-            && let Some(direction) = self.directions.get_mut(stream)
-            && direction.tokens.len() < MAX_TOKENS
-        {
-            if id != 0 && direction.token_ids.len() < MAX_TOKENS {
-                direction.token_ids.insert(id, Arc::clone(&token));
-            }
-            direction.tokens.insert(token);
+        let is_known = self.graph.declare(&key.key, (direction, id), lease);
+        if let Some(router) = router.filter(|_| is_known) {
+            self.revision += u64::from(self.graph.pass_on(&key.key, router));
         }
     }
 
     fn undeclare_token(&mut self, stream: &StreamId, id: u32, key: Option<WireExpr<'_>>) {
-        let Some(direction) = self.directions.get_mut(stream) else {
+        let Some(direction) = self.directions.get(stream) else {
             return;
         };
-        let by = direction.session();
-        let declared = direction.token_ids.remove(&id);
+        let (by, direction) = (direction.session(), direction.number);
         let named = key.filter(|key| key.scope != 0 || !key.suffix.is_empty());
         let named = named.and_then(|key| self.resolve(stream, key));
-        if let Some(token) = declared.or(named.map(|alias| alias.key)) {
-            if let Some(direction) = self.directions.get_mut(stream) {
-                direction.tokens.remove(&token);
-            }
-            self.graph.undeclare(&token, stream, by);
-        }
+        let named = named.as_ref().map(|alias| &*alias.key);
+        self.graph.undeclare((direction, id), named, by);
     }
 }

@@ -13,8 +13,6 @@ pub struct ZenohFacts {
     pub counters: Counters,
     /// Connections of which nothing or no payload can be read, in the order of [`Unseen::ALL`].
     pub unseen: [u64; Unseen::ALL.len()],
-    /// Entries left out because a table was full.
-    pub evictions: u64,
 }
 
 impl ZenohFacts {

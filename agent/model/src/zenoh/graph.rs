@@ -14,16 +14,20 @@ use ros2probe_wire::names::{DdsTopic, Demangled};
 use ros2probe_wire::zenoh::{EndpointKind, EndpointToken, Gid, NodeToken, Token, ZenohId};
 use ros2probe_wire::{DomainId, EntityId, Guid, Timestamp};
 
+use super::declared::{Declared, TokenNumber};
 use super::endpoints::announcements;
 use super::session_state::{NodeState, SessionState};
-use super::stream::StreamId;
+use super::stream_state::DirectionNumber;
+use crate::bounded::{Bounded, ByOwner, HeapBytes};
 use crate::discovery::Endpoint;
-use crate::size::Size;
+use crate::snapshot::TableFacts;
+use crate::tables::{ZenohPassages, ZenohRestored, ZenohServers, ZenohTokens, ZenohWriters};
 
-/// Most tokens.
-pub(super) const MAX_TOKENS: usize = 32_768;
-/// Most connections that declare one token.
-pub(super) const MAX_DECLARERS: usize = 64;
+/// Bytes of a session besides its tokens: its state, and the first nodes of two trees.
+const SESSION: usize = 2048;
+/// Bytes that a token's parts take in its node, among the writers and among the servers, without
+/// names.
+const PARTS: usize = 640;
 /// Most routers that are remembered to pass on the tokens of sessions.
 pub(super) const MAX_PASSING_ROUTERS: usize = 256;
 /// Least time between two announcements of a session that discovery has forgotten.
@@ -59,9 +63,16 @@ enum Meaning {
 
 #[derive(Debug)]
 struct TokenState {
+    number: TokenNumber,
     session: ZenohId,
     meaning: Meaning,
-    declarers: BTreeSet<StreamId>,
+}
+
+impl HeapBytes for TokenState {
+    /// Returns nothing: what a token takes is estimated before it is entered.
+    fn heap_bytes(&self) -> usize {
+        0
+    }
 }
 
 /// A writer, by the gid of its publications, requests or replies.
@@ -75,18 +86,21 @@ struct WriterState {
 /// All tokens and what they stand for.
 #[derive(Debug, Default)]
 pub struct Graph {
-    tokens: HashMap<Arc<str>, TokenState>,
-    sessions: BTreeMap<ZenohId, SessionState>,
-    writers: HashMap<Gid, WriterState>,
+    tokens: ByOwner<ZenohTokens, (), Arc<str>, TokenState>,
+    /// The texts of the tokens.
+    texts: Bounded<ZenohTokens, HashMap<TokenNumber, Arc<str>>>,
+    /// Number of the newest token.
+    numbered: TokenNumber,
+    declared: Declared,
+    sessions: Bounded<ZenohTokens, BTreeMap<ZenohId, SessionState>>,
+    writers: Bounded<ZenohWriters, HashMap<Gid, WriterState>>,
     /// Sessions from saved state with their domains, until they end.
-    restored: BTreeMap<ZenohId, DomainId>,
+    restored: Bounded<ZenohRestored, BTreeMap<ZenohId, DomainId>>,
     /// Sessions behind other routers, by the router that passes on their tokens.
-    passages: BTreeMap<ZenohId, BTreeSet<ZenohId>>,
-    servers: BTreeMap<Arc<str>, BTreeMap<ZenohId, Guid>>,
+    passages: ByOwner<ZenohPassages, ZenohId, ZenohId, ()>,
+    servers: Bounded<ZenohServers, BTreeMap<Arc<str>, BTreeMap<ZenohId, Guid>>>,
     changed: BTreeSet<ZenohId>,
     changes: Vec<GraphChange>,
-    /// Tokens refused because there are too many.
-    pub refused: u64,
 }
 
 impl Graph {
@@ -128,19 +142,21 @@ impl Graph {
         if let Some(session) = session {
             self.restored.insert(session, endpoint.domain_id);
         }
-        if !guid.entity.is_writer() || self.writers.len() >= MAX_TOKENS {
+        if !guid.entity.is_writer() {
             return;
         }
-        let restored = WriterState { guid, session };
-        self.writers.entry(Gid(endpoint.gid)).or_insert(restored);
-        let Some(session) = session else {
+        let restored = || WriterState { guid, session };
+        let known = self.writers.get_or_insert_with(Gid(endpoint.gid), restored);
+        let (Some(_), Some(session)) = (known, session) else {
             return;
         };
         let topic = DdsTopic::parse(endpoint.topic.as_str());
         if let Ok(Demangled::ServiceReply(service)) = topic.map(|topic| topic.demangle()) {
             let key = service_key(endpoint.domain_id, service.as_str());
-            let servers = self.servers.entry(key.into()).or_default();
-            servers.insert(session, guid);
+            let servers = self
+                .servers
+                .get_or_insert_with(key.into(), BTreeMap::default);
+            servers.map(|servers| servers.insert(session, guid));
         }
     }
 
@@ -179,64 +195,94 @@ impl Graph {
         self.changed.insert(session);
     }
 
-    /// Records that `declarer` declares a token. Returns the token if it is of ROS.
+    /// Records that a direction declares a token with a number. Returns whether it is of ROS, and
+    /// known.
     pub fn declare(
         &mut self,
         text: &str,
-        declarer: StreamId,
+        (direction, id): (DirectionNumber, u32),
         lease: impl FnOnce(ZenohId) -> Option<Duration>,
-    ) -> Option<Arc<str>> {
-        if let Some((known, state)) = self.tokens.get_key_value(text) {
-            let known = Arc::clone(known);
-            if state.declarers.len() < MAX_DECLARERS
-                && let Some(state) = self.tokens.get_mut(text)
-            {
-                state.declarers.insert(declarer);
-            }
-            return Some(known);
+    ) -> bool {
+        if let Some(known) = self.tokens.get((), text) {
+            self.declared.insert(direction, id, known.number);
+            return true;
         }
-        let token = Token::parse(text).ok()?;
+        let Ok(token) = Token::parse(text) else {
+            return false;
+        };
         let node = match &token {
             Token::Node(node) => node,
             Token::Endpoint(endpoint) => &endpoint.node,
-            Token::Bridge(_) | Token::Other => return None,
+            Token::Bridge(_) | Token::Other => return false,
         };
-        if self.tokens.len() >= MAX_TOKENS {
-            self.refused += 1;
-            return None;
-        }
         let session = node.session;
         let text: Arc<str> = text.into();
-        self.enter(node, Arc::clone(&text), lease);
-        let meaning = match &token {
+        // Its names are parts of the text, and stand in the node, or in the key of a service.
+        let mut beside = PARTS + text.len();
+        if !self.sessions.contains_key(&session) {
+            beside += SESSION;
+        }
+        self.numbered += 1;
+        let state = TokenState {
+            number: self.numbered,
+            session,
+            meaning: match &token {
+                Token::Endpoint(endpoint) => Meaning::of(endpoint),
+                _ => Meaning::Node(node.node),
+            },
+        };
+        let number = state.number;
+        if !self.tokens.insert((), Arc::clone(&text), state, beside) {
+            return false;
+        }
+        self.texts.insert(number, Arc::clone(&text));
+        self.enter(node, text, lease);
+        match &token {
             Token::Endpoint(endpoint) => self.endpoint(endpoint),
             _ => self.node(node),
-        };
+        }
         self.changed.insert(session);
-        let state = TokenState {
-            session,
-            meaning,
-            declarers: BTreeSet::from([declarer]),
-        };
-        self.tokens.insert(Arc::clone(&text), state);
-        Some(text)
+        self.declared.insert(direction, id, number);
+        true
     }
 
-    /// Records that `declarer`, which is this session if known, no longer declares a token.
-    pub fn undeclare(&mut self, text: &str, declarer: &StreamId, by: Option<ZenohId>) {
-        let Some(state) = self.tokens.get_mut(text) else {
-            return;
-        };
-        state.declarers.remove(declarer);
-        if state.declarers.is_empty() || by == Some(state.session) {
-            self.remove(text);
+    /// Records that a direction, whose sender is this session if known, no longer declares the token
+    /// with this number or, without one, with this text.
+    pub fn undeclare(
+        &mut self,
+        (direction, id): (DirectionNumber, u32),
+        text: Option<&str>,
+        by: Option<ZenohId>,
+    ) {
+        let numbered = self.declared.take_id(direction, id);
+        let named = || Some(self.tokens.get((), text?)?.number);
+        if let Some(token) = numbered.or_else(named) {
+            self.declared.remove(direction, token);
+            self.remove_undeclared(token, by);
         }
     }
 
-    /// Records that a connection no longer declares a token, which may live on.
-    pub fn disconnect(&mut self, text: &str, declarer: &StreamId) {
-        if let Some(state) = self.tokens.get_mut(text) {
-            state.declarers.remove(declarer);
+    /// Records that a direction no longer declares anything: its sender has left.
+    pub fn leave(&mut self, direction: DirectionNumber) {
+        for token in self.declared.remove_direction(direction) {
+            self.remove_undeclared(token, None);
+        }
+    }
+
+    /// Forgets a direction, whose tokens may live on.
+    pub fn disconnect(&mut self, direction: DirectionNumber) {
+        self.declared.remove_direction(direction);
+    }
+
+    /// Removes a token that no direction declares, or that `by`, its own session, has undeclared.
+    fn remove_undeclared(&mut self, token: TokenNumber, by: Option<ZenohId>) {
+        let Some(text) = self.texts.get(&token).cloned() else {
+            return;
+        };
+        let state = self.tokens.get((), &*text);
+        let is_own = state.is_some_and(|state| by == Some(state.session));
+        if is_own || !self.declared.is_declared(token) {
+            self.remove(&text);
         }
     }
 
@@ -244,15 +290,15 @@ impl Graph {
     pub fn end(&mut self, session: ZenohId) {
         let state = self.sessions.remove(&session);
         let was_restored = self.restored.remove(&session).is_some();
-        for sessions in self.passages.values_mut() {
-            sessions.remove(&session);
+        let routers: Vec<_> = self.passages.owners().collect();
+        for router in routers {
+            self.passages.remove(router, &session);
         }
-        self.passages.retain(|_, sessions| !sessions.is_empty());
         if state.is_none() && !was_restored {
             return;
         }
         for text in state.into_iter().flat_map(|state| state.tokens) {
-            if let Some(token) = self.tokens.remove(&text) {
+            if let Some(token) = self.tokens.remove((), &*text) {
                 self.forget(&token);
             }
         }
@@ -267,56 +313,63 @@ impl Graph {
     /// Records that a router passes on this token of a session behind another router. Returns
     /// whether that is new.
     pub fn pass_on(&mut self, token: &str, router: ZenohId) -> bool {
-        let Some(session) = self.tokens.get(token).map(|token| token.session) else {
+        let Some(session) = self.tokens.get((), token).map(|token| token.session) else {
             return false;
         };
-        let has_room = self.passages.len() < MAX_PASSING_ROUTERS;
-        if !has_room && !self.passages.contains_key(&router) {
+        if self.passages.get(router, &session).is_some() {
             return false;
         }
-        self.passages.entry(router).or_default().insert(session)
+        let has_room = self.passes_on(router) || self.routers() < MAX_PASSING_ROUTERS;
+        has_room && self.passages.insert(router, session, (), 0)
     }
 
     /// Returns whether a router passes on tokens of sessions behind other routers.
     pub fn passes_on(&self, router: ZenohId) -> bool {
-        self.passages.contains_key(&router)
+        self.passages.of(router).next().is_some()
     }
 
     /// Returns the sessions of which a router passes on tokens.
     pub fn passed_on_by(&self, router: ZenohId) -> BTreeSet<ZenohId> {
-        self.passages.get(&router).cloned().unwrap_or_default()
+        let sessions = self.passages.of(router);
+        sessions.map(|(session, ())| *session).collect()
     }
 
     /// Removes a router that passes on tokens, and returns the sessions that no other one passes on.
     pub fn pass_no_longer(&mut self, router: ZenohId) -> BTreeSet<ZenohId> {
-        let mut sessions = self.passages.remove(&router).unwrap_or_default();
-        for others in self.passages.values() {
-            sessions.retain(|session| !others.contains(session));
+        let mut sessions: BTreeSet<_> = self.passages.remove_owner(router).collect();
+        for other in self.passages.owners() {
+            sessions.retain(|session| self.passages.get(other, session).is_none());
         }
         sessions
     }
 
     /// Returns the routers that pass on tokens, with the sessions.
-    pub const fn passages(&self) -> &BTreeMap<ZenohId, BTreeSet<ZenohId>> {
-        &self.passages
+    pub fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
+        let routers = self.passages.owners();
+        routers
+            .map(|router| (router, self.passed_on_by(router)))
+            .collect()
     }
 
     /// Restores saved routers with the restored sessions of which they pass on tokens.
     pub fn restore_passages(&mut self, passages: BTreeMap<ZenohId, BTreeSet<ZenohId>>) {
-        for (router, mut sessions) in passages.into_iter().take(MAX_PASSING_ROUTERS) {
-            sessions.retain(|session| self.restored.contains_key(session));
-            if !sessions.is_empty() {
-                self.passages.insert(router, sessions);
+        for (router, sessions) in passages.into_iter().take(MAX_PASSING_ROUTERS) {
+            for session in sessions {
+                if self.restored.contains_key(&session) {
+                    self.passages.insert(router, session, (), 0);
+                }
             }
         }
     }
 
-    /// Returns the connections that declare tokens of a session.
-    pub fn declarers(&self, session: ZenohId) -> impl Iterator<Item = &StreamId> {
+    /// Returns the directions that declare tokens of a session.
+    pub fn declarers(&self, session: ZenohId) -> BTreeSet<DirectionNumber> {
         let session = self.sessions.get(&session);
         let tokens = session.into_iter().flat_map(|session| &session.tokens);
-        let tokens = tokens.filter_map(|text| self.tokens.get(text));
-        tokens.flat_map(|token| &token.declarers)
+        let tokens = tokens.filter_map(|text| self.tokens.get((), &**text));
+        tokens
+            .flat_map(|token| self.declared.of(token.number))
+            .collect()
     }
 
     /// Removes what no connection declares of a session of this domain.
@@ -331,8 +384,8 @@ impl Graph {
             return;
         }
         let is_declared = |text: &&Arc<str>| {
-            let token = self.tokens.get(*text);
-            token.is_some_and(|token| !token.declarers.is_empty())
+            let token = self.tokens.get((), &***text);
+            token.is_some_and(|token| self.declared.is_declared(token.number))
         };
         let texts = state.tokens.iter();
         let gone: Vec<_> = texts.filter(|text| !is_declared(text)).cloned().collect();
@@ -341,53 +394,16 @@ impl Graph {
         }
     }
 
-    /// Returns the size and cap of each table.
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            tokens,
-            sessions,
-            writers,
-            restored,
-            passages,
-            servers,
-            changed,
-            changes,
-            refused: _,
-        } = self;
-        let passed_on = passages.values().map(BTreeSet::len).max();
-        let declarers = tokens.values().map(TokenState::declarers).max();
-        let of_sessions = || sessions.values().map(SessionState::lists);
-        let (mut nodes, mut ends, mut texts) = (0, 0, 0);
-        for (of_session, endpoints, tokens) in of_sessions() {
-            (nodes, ends, texts) = (nodes + of_session, ends + endpoints, texts + tokens);
-        }
-        let serving = servers.values().map(BTreeMap::len).sum();
-        vec![
-            Size::new("zenoh.tokens", tokens.len(), MAX_TOKENS),
-            Size::new(
-                "zenoh.tokens.declarers",
-                declarers.unwrap_or(0),
-                MAX_DECLARERS,
-            ),
-            Size::new("zenoh.sessions", sessions.len(), MAX_TOKENS),
-            Size::new("zenoh.sessions.nodes", nodes, MAX_TOKENS),
-            Size::new("zenoh.sessions.endpoints", ends, 2 * MAX_TOKENS),
-            Size::new("zenoh.sessions.tokens", texts, MAX_TOKENS),
-            Size::new("zenoh.writers", writers.len(), 2 * MAX_TOKENS),
-            Size::new("zenoh.restored", restored.len(), MAX_TOKENS),
-            Size::new("zenoh.passages", passages.len(), MAX_PASSING_ROUTERS),
-            Size::new(
-                "zenoh.passages.sessions",
-                passed_on.unwrap_or(0),
-                2 * MAX_TOKENS,
-            ),
-            Size::new("zenoh.servers", servers.len(), MAX_TOKENS),
-            Size::new("zenoh.servers.sessions", serving, MAX_TOKENS),
-            Size::new("zenoh.changed", changed.len(), MAX_TOKENS),
-            // The changes are taken after each batch.
-            Size::new("zenoh.changes", changes.len(), 3 * MAX_TOKENS),
-        ]
+    /// Returns the tables for the snapshot.
+    pub fn tables(&self) -> Vec<TableFacts> {
+        let mut tables = vec![self.tokens.facts(), self.passages.facts()];
+        tables.extend(self.declared.facts());
+        tables
+    }
+
+    /// Returns the number of routers that pass on tokens.
+    fn routers(&self) -> usize {
+        self.passages.owners().count()
     }
 
     /// Adds a token to its session, which may be new.
@@ -399,17 +415,17 @@ impl Graph {
     ) {
         let session = node.session;
         let is_new = !self.sessions.contains_key(&session);
-        let state = self
-            .sessions
-            .entry(session)
-            .or_insert_with(|| SessionState {
-                domain: node.domain,
-                enclave: node.enclave.clone(),
-                lease: lease(session),
-                nodes: BTreeMap::new(),
-                tokens: BTreeSet::new(),
-                repeated: Timestamp(0),
-            });
+        let new = || SessionState {
+            domain: node.domain,
+            enclave: node.enclave.clone(),
+            lease: lease(session),
+            nodes: BTreeMap::new(),
+            tokens: BTreeSet::new(),
+            repeated: Timestamp(0),
+        };
+        let Some(state) = self.sessions.get_or_insert_with(session, new) else {
+            return;
+        };
         state.tokens.insert(text);
         if is_new {
             let announcement = state.announcement(session);
@@ -418,14 +434,13 @@ impl Graph {
         }
     }
 
-    fn node(&mut self, token: &NodeToken) -> Meaning {
+    fn node(&mut self, token: &NodeToken) {
         if let Some(node) = self.node_state(token) {
             node.has_token = true;
         }
-        Meaning::Node(token.node)
     }
 
-    fn endpoint(&mut self, token: &EndpointToken) -> Meaning {
+    fn endpoint(&mut self, token: &EndpointToken) {
         let announcements = announcements(token);
         let guids: Vec<Guid> = announcements.iter().map(|each| each.guid).collect();
         for announcement in announcements {
@@ -446,20 +461,10 @@ impl Graph {
             self.changes
                 .push(GraphChange::Endpoint(Box::new(announcement)));
         }
-        let serves = (token.kind == EndpointKind::Server)
-            .then(|| service_key(token.node.domain, token.name.as_str()).into());
-        if let Some(key) = &serves {
-            let writer = guids.iter().find(|guid| guid.entity.is_writer());
-            if let Some(writer) = writer {
-                let servers = self.servers.entry(Arc::clone(key)).or_default();
-                servers.insert(token.node.session, *writer);
-            }
-        }
-        Meaning::Endpoint {
-            node: token.node.node,
-            guids,
-            gid: token.gid,
-            serves,
+        let writer = guids.iter().find(|guid| guid.entity.is_writer());
+        if let (Some(key), Some(writer)) = (served(token), writer) {
+            let servers = self.servers.get_or_insert_with(key, BTreeMap::default);
+            servers.map(|servers| servers.insert(token.node.session, *writer));
         }
     }
 
@@ -478,7 +483,7 @@ impl Graph {
     }
 
     fn remove(&mut self, text: &str) {
-        let Some(token) = self.tokens.remove(text) else {
+        let Some(token) = self.tokens.remove((), text) else {
             return;
         };
         self.forget(&token);
@@ -506,7 +511,7 @@ impl Graph {
             // The endpoints of a node end with it, also without an undeclaration.
             let tokens = &self.tokens;
             let is_of_node = |text: &&Arc<str>| {
-                let other = tokens.get(*text);
+                let other = tokens.get((), &***text);
                 other.is_some_and(|other| other.meaning.node() == node)
             };
             let orphans: Vec<_> = session.tokens.iter().filter(is_of_node).cloned().collect();
@@ -531,6 +536,8 @@ impl Graph {
     }
 
     fn forget(&mut self, token: &TokenState) {
+        self.texts.remove(&token.number);
+        self.declared.forget(token.number);
         let Meaning::Endpoint { gid, serves, .. } = &token.meaning else {
             return;
         };
@@ -546,26 +553,29 @@ impl Graph {
     }
 }
 
-impl TokenState {
-    /// Returns the number of connections that declare it.
-    fn declarers(&self) -> usize {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            session: _,
-            meaning: _,
-            declarers,
-        } = self;
-        declarers.len()
-    }
-}
-
 impl Meaning {
+    fn of(token: &EndpointToken) -> Self {
+        let announcements = announcements(token).into_iter();
+        Self::Endpoint {
+            node: token.node.node,
+            guids: announcements.map(|each| each.guid).collect(),
+            gid: token.gid,
+            serves: served(token),
+        }
+    }
+
     /// Returns the number of the node.
     const fn node(&self) -> u64 {
         match self {
             Self::Node(node) | Self::Endpoint { node, .. } => *node,
         }
     }
+}
+
+/// Returns the key of the service that an endpoint serves.
+fn served(token: &EndpointToken) -> Option<Arc<str>> {
+    (token.kind == EndpointKind::Server)
+        .then(|| service_key(token.node.domain, token.name.as_str()).into())
 }
 
 /// Returns the key of [`Graph::server`].

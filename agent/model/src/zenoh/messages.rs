@@ -48,7 +48,8 @@ impl Zenoh {
             Mapping::Sender => self.directions.get(stream).map(|known| &**known),
             Mapping::Receiver => self.opposite(stream),
         };
-        resolve(expression, table.map(|direction| &direction.aliases))
+        let number = table.map(|direction| direction.number);
+        resolve(expression, &self.aliases, number)
     }
 
     /// Notes that a session wants to know the graph.

@@ -11,6 +11,7 @@
 mod batch;
 mod connections;
 mod declarations;
+mod declared;
 mod endpoints;
 mod facts;
 mod graph;
@@ -28,26 +29,21 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use ros2probe_wire::zenoh::{Batch, Bytes, Gid, Side, WhatAmI, ZenohId};
 use ros2probe_wire::{Guid, GuidPrefix, Reason, SequenceNumber, Timestamp};
 
+use crate::bounded::{Bounded, Counted, Sum};
 use crate::discovery::Endpoint;
 use crate::route::Destination;
-use crate::size::{Size, largest};
+use crate::snapshot::TableFacts;
+use crate::tables::{ZenohChainBytes, ZenohCut, ZenohDirections, ZenohUnseen};
 pub use endpoints::unknown_guid;
 pub use facts::{Counters, ZenohFacts};
+use graph::Graph;
 pub use graph::GraphChange;
-use graph::{Graph, MAX_PASSING_ROUTERS};
 pub use processes::Holder;
+use remembered::Remembered;
 pub use remembered::ZenohMemory;
-use remembered::{MAX_REMEMBERED, Remembered};
 use replies::Replies;
 pub use stream::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
-use stream_state::StreamState;
-
-/// Most directions of connections with state.
-const MAX_DIRECTIONS: usize = 4096;
-/// Most bytes of messages in FRAGMENTs, of all connections.
-const MAX_CHAIN_BYTES: usize = 64 << 20;
-/// Most connections of which nothing can be read that are remembered.
-const MAX_UNSEEN: usize = 1024;
+use stream_state::{Aliases, DirectionNumber, StreamState};
 
 /// A message that rmw_zenoh sent: a sample of a topic, a request, or a reply.
 #[derive(Clone, Copy, Debug)]
@@ -95,25 +91,29 @@ pub enum Shown<'a> {
 /// All connections of Zenoh.
 #[derive(Debug, Default)]
 pub struct Zenoh {
-    directions: HashMap<StreamId, Box<StreamState>>,
+    directions: Bounded<Counted<ZenohDirections>, HashMap<StreamId, Box<StreamState>>>,
+    /// Number of the newest direction.
+    numbered: DirectionNumber,
+    aliases: Aliases,
     /// The direction that was last seen of each flow.
-    flows: HashMap<Flow, StreamId>,
+    flows: Bounded<ZenohDirections, HashMap<Flow, StreamId>>,
     /// The graph in the tokens.
     pub graph: Graph,
     replies: Replies,
     remembered: Remembered,
     /// Routers of which a connection that may lead to another router ended, with the time.
-    cut: BTreeMap<ZenohId, Timestamp>,
+    cut: Bounded<ZenohCut, BTreeMap<ZenohId, Timestamp>>,
     /// Time of the first report.
     began: Timestamp,
-    unseen: BTreeSet<(Unseen, Flow)>,
-    chain_bytes: usize,
+    unseen: Bounded<ZenohUnseen, BTreeSet<(Unseen, Flow)>>,
+    chain_bytes: Sum<ZenohChainBytes>,
+    /// When stale messages in FRAGMENTs were last searched for.
+    gave_up: Timestamp,
     counters: Counters,
     /// Whether a session of this host has sent an INIT since the last [`Self::link`].
     pub has_begun: bool,
     /// Increases with the senders that [`Self::memory`] contains.
     revision: u64,
-    evictions: u64,
 }
 
 /// The place of a message.
@@ -146,7 +146,7 @@ impl Zenoh {
                 self.counters.gaps += 1;
                 show(Shown::Missed(stream.flow.destination));
                 if let Some(direction) = self.directions.get_mut(stream) {
-                    self.chain_bytes -= direction.held();
+                    self.chain_bytes.sub(direction.held());
                     direction.interrupt();
                 }
             }
@@ -183,7 +183,6 @@ impl Zenoh {
             connections: connections.len() as u64,
             routers: routers.len() as u64,
             unseen,
-            evictions: self.evictions + self.graph.refused,
             counters: self.counters,
         }
     }
@@ -198,7 +197,8 @@ impl Zenoh {
     #[must_use]
     pub fn memory(&self) -> ZenohMemory {
         let (senders, relayed) = self.remembered.parts();
-        let (mut senders, mut relayed) = (senders.clone(), relayed.clone());
+        let mut senders = senders.clone();
+        let mut relayed: BTreeSet<_> = relayed.clone();
         for (stream, direction) in &self.directions {
             let linked = direction.linked.map(|zid| Side {
                 zid,
@@ -215,7 +215,7 @@ impl Zenoh {
             .chain(senders.values().map(|side| side.zid))
             .collect();
         relayed.extend(self.graph.sessions());
-        ZenohMemory::new(&senders, &(&relayed - &connected), self.graph.passages())
+        ZenohMemory::new(&senders, &(&relayed - &connected), &self.graph.passages())
     }
 
     /// Returns a number that increases with the connections of [`Self::memory`].
@@ -243,39 +243,11 @@ impl Zenoh {
         self.graph.restore_passages(memory.passages());
     }
 
-    /// Returns the size and cap of each table.
+    /// Returns the tables for the snapshot.
     #[must_use]
-    pub fn sizes(&self) -> Vec<Size> {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            directions,
-            flows,
-            graph,
-            replies,
-            remembered,
-            cut,
-            began: _,
-            unseen,
-            chain_bytes,
-            counters: _,
-            has_begun: _,
-            revision: _,
-            evictions: _,
-        } = self;
-        let (saved, relayed) = remembered.sizes();
-        let mut sizes = largest(directions.values().flat_map(|each| each.sizes()));
-        sizes.extend(graph.sizes());
-        sizes.extend([
-            Size::new("zenoh.directions", directions.len(), MAX_DIRECTIONS),
-            Size::new("zenoh.flows", flows.len(), MAX_DIRECTIONS),
-            Size::new("zenoh.chains.bytes", *chain_bytes, MAX_CHAIN_BYTES),
-            // Each of these routers passes on a session.
-            Size::new("zenoh.cut", cut.len(), MAX_PASSING_ROUTERS),
-            Size::new("zenoh.unseen", unseen.len(), MAX_UNSEEN),
-            Size::new("zenoh.remembered", saved, MAX_REMEMBERED),
-            Size::new("zenoh.relayed", relayed, MAX_REMEMBERED),
-            replies.size(),
-        ]);
-        sizes
+    pub fn tables(&self) -> Vec<TableFacts> {
+        let mut tables = vec![self.directions.facts(), self.aliases.facts()];
+        tables.extend(self.graph.tables());
+        tables
     }
 }

@@ -12,9 +12,9 @@ use ros2probe_wire::zenoh::{Side, WhatAmI, ZenohId};
 use serde::{Deserialize, Serialize};
 
 use super::stream::Flow;
+use crate::bounded::Bounded;
+use crate::tables::{RememberedDirections, RememberedSessions};
 
-/// Most saved connections, each with two directions.
-pub(super) const MAX_REMEMBERED: usize = 4096;
 /// Longer than the interval of KEEP_ALIVE that rmw_zenoh configures, 30 s: a connection that sends
 /// nothing for so long is gone.
 const SILENCE: Duration = Duration::from_secs(90);
@@ -59,8 +59,8 @@ enum RememberedRole {
 /// Restored connections that have not been seen since.
 #[derive(Debug, Default)]
 pub(super) struct Remembered {
-    senders: BTreeMap<Flow, Side>,
-    relayed: BTreeSet<ZenohId>,
+    senders: Bounded<RememberedDirections, BTreeMap<Flow, Side>>,
+    relayed: Bounded<RememberedSessions, BTreeSet<ZenohId>>,
     /// When those without a batch are forgotten.
     end: Timestamp,
 }
@@ -72,19 +72,18 @@ impl ZenohMemory {
         passages: &BTreeMap<ZenohId, BTreeSet<ZenohId>>,
     ) -> Self {
         let texts = |sessions: &BTreeSet<ZenohId>| {
-            let sessions = sessions.iter().take(MAX_REMEMBERED);
+            let sessions = sessions.iter().take(RememberedDirections::CAP);
             sessions.map(ZenohId::to_string).collect()
         };
-        let connections =
-            senders
-                .iter()
-                .take(MAX_REMEMBERED)
-                .map(|(flow, side)| RememberedConnection {
-                    source: flow.source.socket_address(),
-                    destination: flow.destination.socket_address(),
-                    session: side.zid.to_string(),
-                    role: side.whatami.into(),
-                });
+        let connections = senders
+            .iter()
+            .take(RememberedDirections::CAP)
+            .map(|(flow, side)| RememberedConnection {
+                source: flow.source.socket_address(),
+                destination: flow.destination.socket_address(),
+                session: side.zid.to_string(),
+                role: side.whatami.into(),
+            });
         Self {
             connections: connections.collect(),
             relayed: texts(relayed),
@@ -101,7 +100,7 @@ impl ZenohMemory {
     /// Returns the routers that pass on tokens. Invalid entries are skipped.
     pub(super) fn passages(&self) -> BTreeMap<ZenohId, BTreeSet<ZenohId>> {
         let read = |passage: &RememberedPassage| {
-            let sessions = passage.sessions.iter().take(MAX_REMEMBERED);
+            let sessions = passage.sessions.iter().take(RememberedDirections::CAP);
             let sessions = sessions.filter_map(|session| ZenohId::parse(session));
             Some((ZenohId::parse(&passage.router)?, sessions.collect()))
         };
@@ -112,7 +111,7 @@ impl ZenohMemory {
 impl Remembered {
     /// Restores saved connections. Invalid entries are skipped.
     pub(super) fn restore(&mut self, memory: &ZenohMemory, now: Timestamp) {
-        for saved in memory.connections.iter().take(MAX_REMEMBERED) {
+        for saved in &memory.connections {
             let flow = Flow {
                 source: saved.source.into(),
                 destination: saved.destination.into(),
@@ -122,9 +121,9 @@ impl Remembered {
                 self.senders.insert(flow, Side { zid, whatami });
             }
         }
-        let relayed = memory.relayed.iter().take(MAX_REMEMBERED);
-        self.relayed
-            .extend(relayed.filter_map(|session| ZenohId::parse(session)));
+        for session in &memory.relayed {
+            ZenohId::parse(session).map(|session| self.relayed.insert(session));
+        }
         self.end = now + SILENCE;
     }
 
@@ -135,7 +134,7 @@ impl Remembered {
     }
 
     /// Returns the connections and the relayed sessions.
-    pub(super) const fn parts(&self) -> (&BTreeMap<Flow, Side>, &BTreeSet<ZenohId>) {
+    pub(super) fn parts(&self) -> (&BTreeMap<Flow, Side>, &BTreeSet<ZenohId>) {
         (&self.senders, &self.relayed)
     }
 
@@ -156,7 +155,7 @@ impl Remembered {
 
     /// Removes and returns the relayed sessions: a router is seen.
     pub(super) fn take_relayed(&mut self) -> BTreeSet<ZenohId> {
-        std::mem::take(&mut self.relayed)
+        self.relayed.take()
     }
 
     /// Forgets what was not seen for too long.
@@ -165,17 +164,6 @@ impl Remembered {
             self.senders.clear();
             self.relayed.clear();
         }
-    }
-
-    /// Returns the number of connections and of relayed sessions.
-    pub(super) fn sizes(&self) -> (usize, usize) {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            senders,
-            relayed,
-            end: _,
-        } = self;
-        (senders.len(), relayed.len())
     }
 }
 
@@ -227,12 +215,12 @@ mod tests {
         let senders: BTreeMap<_, _> = (0..5000).map(sender).collect();
         let relayed: BTreeSet<_> = (5000..10_000).map(zid).collect();
         let mut memory = ZenohMemory::new(&senders, &relayed, &BTreeMap::new());
-        assert_eq!(memory.connections.len(), MAX_REMEMBERED);
-        assert_eq!(memory.relayed.len(), MAX_REMEMBERED);
+        assert_eq!(memory.connections.len(), RememberedDirections::CAP);
+        assert_eq!(memory.relayed.len(), RememberedDirections::CAP);
         memory.relayed.push(zid(1).to_string());
         memory.connections.extend(memory.connections.clone());
         let mut remembered = Remembered::default();
         remembered.restore(&memory, Timestamp(0));
-        assert_eq!(remembered.sizes(), (MAX_REMEMBERED, MAX_REMEMBERED));
+        assert!(remembered.senders.is_full() && remembered.relayed.is_full());
     }
 }

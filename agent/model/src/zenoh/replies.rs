@@ -3,23 +3,20 @@
 
 use std::collections::{HashMap, VecDeque};
 
+use crate::bounded::Bounded;
+use crate::tables::{ZenohReplies, ZenohReplyWriters};
 use ros2probe_wire::zenoh::Gid;
 use ros2probe_wire::{Guid, SequenceNumber};
-
-use crate::size::Size;
-
-/// Most replies whose further copies get the same number.
-const MAX_REPLIES: usize = 4096;
 
 type Reply = (Guid, Gid, SequenceNumber);
 
 /// The latest replies.
 #[derive(Debug, Default)]
 pub(super) struct Replies {
-    numbers: HashMap<Reply, SequenceNumber>,
-    order: VecDeque<Reply>,
+    numbers: Bounded<ZenohReplies, HashMap<Reply, SequenceNumber>>,
+    order: Bounded<ZenohReplies, VecDeque<Reply>>,
     /// Number of the next reply of each writer.
-    next: HashMap<Guid, SequenceNumber>,
+    next: Bounded<ZenohReplyWriters, HashMap<Guid, SequenceNumber>>,
 }
 
 impl Replies {
@@ -33,31 +30,21 @@ impl Replies {
         if let Some(number) = self.numbers.get(&reply) {
             return *number;
         }
-        if self.order.len() >= MAX_REPLIES
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.numbers.remove(&oldest);
-        }
-        if self.next.len() >= MAX_REPLIES && !self.next.contains_key(&writer) {
+        if self.next.is_full() && !self.next.contains_key(&writer) {
+            self.next.refuse();
             self.next.clear();
         }
-        let next = self.next.entry(writer).or_insert(SequenceNumber::FIRST);
+        let first = || SequenceNumber::FIRST;
+        let Some(next) = self.next.get_or_insert_with(writer, first) else {
+            return first();
+        };
         let number = *next;
         *next = number.next();
+        if let Some(oldest) = self.order.push_back(reply) {
+            self.numbers.remove(&oldest);
+        }
         self.numbers.insert(reply, number);
-        self.order.push_back(reply);
         number
-    }
-
-    pub(super) fn size(&self) -> Size {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            numbers,
-            order,
-            next,
-        } = self;
-        let longest = numbers.len().max(order.len()).max(next.len());
-        Size::new("zenoh.replies", longest, MAX_REPLIES)
     }
 }
 
@@ -74,10 +61,9 @@ mod tests {
         assert_eq!(replies.number(writer(1), call(9)), SequenceNumber(2));
         assert_eq!(replies.number(writer(2), call(9)), SequenceNumber(1));
         assert_eq!(replies.number(writer(1), call(5)), SequenceNumber(1));
-        for number in 0..2 * MAX_REPLIES as u64 {
+        for number in 0..2 * ZenohReplies::CAP as u64 {
             replies.number(writer(3), call(number));
         }
-        let size = replies.size();
-        assert_eq!((size.entries, size.cap), (MAX_REPLIES, MAX_REPLIES));
+        assert!(replies.order.is_full() && replies.numbers.is_full());
     }
 }

@@ -147,8 +147,9 @@ impl Zenoh {
         if now < self.began + ALL_SEEN || !self.cut.values().any(|at| is_due(*at)) {
             return;
         }
-        let due = self.cut.extract_if(.., |_, at| is_due(*at));
-        let due: Vec<_> = due.map(|(router, _)| router).collect();
+        let due = self.cut.iter().filter(|(_, at)| is_due(**at));
+        let due: Vec<_> = due.map(|(router, _)| *router).collect();
+        self.cut.retain(|_, at| !is_due(*at));
         for router in due {
             let mut streams = self.directions.keys();
             if streams.any(|stream| self.is_link_of(router, stream)) {
@@ -189,12 +190,13 @@ impl Zenoh {
         let has_own = directions.any(|(stream, direction)| {
             direction.session() == Some(session) && self.is_open(stream, direction)
         });
-        let mut declarers = self.graph.declarers(session);
+        let declarers = self.graph.declarers(session);
+        let mut others = self.directions.values();
         self.remembered.has(session)
             || has_own
-            || declarers.any(|stream| {
-                let declarer = self.directions.get(stream);
-                declarer.is_some_and(|each| each.sender.is_none_or(|side| side.zid != router))
+            || others.any(|each| {
+                declarers.contains(&each.number)
+                    && each.sender.is_none_or(|side| side.zid != router)
             })
     }
 

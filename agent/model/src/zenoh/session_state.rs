@@ -59,34 +59,4 @@ impl SessionState {
             nodes: nodes.collect(),
         }
     }
-
-    /// Returns the numbers of nodes, endpoints and tokens.
-    pub(super) fn lists(&self) -> (usize, usize, usize) {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            domain: _,
-            enclave: _,
-            lease: _,
-            nodes,
-            tokens,
-            repeated: _,
-        } = self;
-        let endpoints = nodes.values().map(NodeState::endpoints).sum();
-        (nodes.len(), endpoints, tokens.len())
-    }
-}
-
-impl NodeState {
-    /// Returns the number of endpoints.
-    fn endpoints(&self) -> usize {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            namespace: _,
-            name: _,
-            has_token: _,
-            writers,
-            readers,
-        } = self;
-        writers.len() + readers.len()
-    }
 }

@@ -1,7 +1,6 @@
 //! State of one direction of a connection: who sends, its aliases, its tokens, and the messages in
 //! FRAGMENTs.
 
-use std::collections::{BTreeSet, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,22 +10,22 @@ use ros2probe_wire::zenoh::{
 use ros2probe_wire::{DomainId, Timestamp};
 
 use super::stream::StreamId;
-use crate::size::Size;
+use crate::bounded::{Bounded, ByOwner, HeapBytes};
+use crate::tables::{ZenohAliases, ZenohChains};
 
-/// Most aliases of one direction.
-pub(super) const MAX_ALIASES: usize = 16_384;
-/// Most declared tokens of one direction.
-pub(super) const MAX_TOKENS: usize = 16_384;
-/// Longest key that is kept.
-pub(super) const MAX_KEY: usize = 4096;
+/// Longest key that is kept. A token of ROS with the longest names has 1.4 KiB.
+pub(super) const MAX_KEY: usize = 2048;
 /// Most bytes of one message in FRAGMENTs.
 const MAX_MESSAGE: usize = 32 << 20;
-/// Lanes: eight priorities, reliable and best effort.
-pub(super) const LANES: usize = 16;
 /// Bytes kept of a message whose payload is not requested: everything before the payload.
 const HEAD: usize = 8192;
 /// Publications of one source after which the sender is taken for that source.
 const PRESUMED: u32 = 3;
+
+/// Number of a direction, never used again.
+pub(super) type DirectionNumber = u64;
+/// Aliases by direction and number.
+pub(super) type Aliases = ByOwner<ZenohAliases, DirectionNumber, u16, Alias>;
 
 /// A key with its meaning.
 #[derive(Clone, Debug)]
@@ -44,6 +43,8 @@ pub(super) struct Chain {
     next: u32,
     /// Time of the first.
     pub(super) began: Timestamp,
+    /// Time of the last.
+    last: Timestamp,
     /// The beginning of the message, or all of it.
     pub(super) bytes: Vec<u8>,
     /// Bytes that have arrived.
@@ -54,6 +55,7 @@ pub(super) struct Chain {
 /// One direction of a connection.
 #[derive(Debug, Default)]
 pub(super) struct StreamState {
+    pub(super) number: DirectionNumber,
     /// The sender, from its INIT.
     pub(super) sender: Option<Side>,
     /// The session of the process that sends, if the INIT was missed.
@@ -72,12 +74,7 @@ pub(super) struct StreamState {
     /// The last INTEREST of the sender in the graph of a domain, with its number.
     pub(super) asked: Option<(u32, DomainId)>,
     pub(super) lease: Option<Duration>,
-    pub(super) aliases: HashMap<u16, Alias>,
-    /// Tokens that the sender declares.
-    pub(super) tokens: BTreeSet<Arc<str>>,
-    /// Their numbers; between routers all are 0.
-    pub(super) token_ids: HashMap<u32, Arc<str>>,
-    pub(super) chains: Vec<Chain>,
+    pub(super) chains: Bounded<ZenohChains, Vec<Chain>>,
     /// Whether the sender has sent CLOSE, or closed it.
     pub(super) has_left: bool,
     /// Whether the sender has closed it.
@@ -94,11 +91,32 @@ impl Chain {
             lane: _,
             next: _,
             began: _,
+            last: _,
             bytes,
             length: _,
             is_wanted: _,
         } = self;
-        bytes.len()
+        bytes.capacity()
+    }
+}
+
+impl Chain {
+    /// Adds bytes to the message, as far as `room` bytes of further memory suffice.
+    fn keep(&mut self, bytes: &[u8], room: usize) {
+        let (length, capacity) = (self.bytes.len(), self.bytes.capacity());
+        let bytes = bytes.get(..capacity - length + room).unwrap_or(bytes);
+        let needed = length + bytes.len();
+        if needed > capacity {
+            let larger = needed.max(2 * capacity).min(capacity + room);
+            self.bytes.reserve_exact(larger - length);
+        }
+        self.bytes.extend_from_slice(bytes);
+    }
+}
+
+impl HeapBytes for Alias {
+    fn heap_bytes(&self) -> usize {
+        self.key.heap_bytes()
     }
 }
 
@@ -117,9 +135,10 @@ impl Alias {
 
 impl StreamState {
     /// Creates the state of a direction of which nothing was seen; `sender` is from saved state.
-    pub(super) fn new(stream: &StreamId, sender: Option<Side>) -> Self {
+    pub(super) fn new(number: DirectionNumber, stream: &StreamId, sender: Option<Side>) -> Self {
         let (from, to) = (stream.flow.source.port, stream.flow.destination.port);
         Self {
+            number,
             sender,
             may_be_router: from == PORT || to == PORT && !stream.is_loopback(),
             ..Self::default()
@@ -179,16 +198,6 @@ impl StreamState {
         }
     }
 
-    /// Adds an alias; returns whether there was room.
-    pub(super) fn declare(&mut self, id: u16, alias: Alias) -> bool {
-        let is_full = self.aliases.len() >= MAX_ALIASES && !self.aliases.contains_key(&id);
-        if is_full {
-            return false;
-        }
-        self.aliases.insert(id, alias);
-        true
-    }
-
     /// Adds a FRAGMENT. Returns the message if it is complete; its bytes may be the beginning only.
     pub(super) fn fragment(
         &mut self,
@@ -215,6 +224,7 @@ impl StreamState {
                     lane: fragment.lane,
                     next: number,
                     began: time,
+                    last: time,
                     bytes: Vec::new(),
                     length: 0,
                     is_wanted,
@@ -225,20 +235,24 @@ impl StreamState {
         let is_whole_so_far = chain.bytes.len() == chain.length;
         chain.length += fragment.bytes.length;
         let most = if chain.is_wanted { MAX_MESSAGE } else { HEAD };
-        let kept = most.saturating_sub(chain.bytes.len()).min(room);
         if is_whole_so_far {
-            chain
-                .bytes
-                .extend_from_slice(captured.get(..kept).unwrap_or(captured));
+            let kept = most.saturating_sub(chain.bytes.len());
+            chain.keep(captured.get(..kept).unwrap_or(captured), room);
         }
+        chain.last = time;
         chain.next = Resolution::DEFAULT.next(number);
         if !fragment.has_more {
             return Some(chain);
         }
-        if self.chains.len() < LANES {
-            self.chains.push(chain);
-        }
+        self.chains.push(chain);
         None
+    }
+
+    /// Gives up messages without a FRAGMENT since `before`, and returns their number.
+    pub(super) fn give_up(&mut self, before: Timestamp) -> usize {
+        let all = self.chains.len();
+        self.chains.retain(|chain| chain.last >= before);
+        all - self.chains.len()
     }
 
     /// Forgets the unfinished messages: bytes are missing.
@@ -250,47 +264,18 @@ impl StreamState {
     pub(super) fn held(&self) -> usize {
         self.chains.iter().map(Chain::held).sum()
     }
-
-    /// Returns the size and cap of each list.
-    pub(super) fn sizes(&self) -> [Size; 3] {
-        // The destructuring makes a new list fail to compile until it is listed here.
-        let Self {
-            sender: _,
-            linked: _,
-            presumed: _,
-            is_ambiguous: _,
-            may_be_router: _,
-            is_router: _,
-            is_for_router: _,
-            receiver: _,
-            asked: _,
-            lease: _,
-            aliases,
-            tokens,
-            token_ids,
-            chains,
-            has_left: _,
-            has_ended: _,
-            last_seen: _,
-        } = self;
-        let declared = tokens.len().max(token_ids.len());
-        [
-            Size::new("zenoh.aliases", aliases.len(), MAX_ALIASES),
-            Size::new("zenoh.declared", declared, MAX_TOKENS),
-            Size::new("zenoh.chains", chains.len(), LANES),
-        ]
-    }
 }
 
 /// Returns the alias or the own key of an expression.
 pub(super) fn resolve(
     expression: WireExpr<'_>,
-    table: Option<&HashMap<u16, Alias>>,
+    aliases: &Aliases,
+    direction: Option<DirectionNumber>,
 ) -> Option<Alias> {
     if let Some(key) = expression.key() {
         return (key.len() <= MAX_KEY).then(|| Alias::new(key));
     }
-    let alias = table?.get(&expression.scope)?;
+    let alias = aliases.get(direction?, &expression.scope)?;
     if expression.suffix.is_empty() {
         return Some(alias.clone());
     }

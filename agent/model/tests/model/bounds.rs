@@ -5,21 +5,19 @@ mod chains;
 mod inside;
 mod zenoh;
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::net::{Ipv4Addr, SocketAddrV4};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use crate::allocator;
+use ros2probe_model::bounded::ledger;
 use ros2probe_model::history::History;
 use ros2probe_model::input::Input;
 use ros2probe_model::limits::Limits;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
-use ros2probe_model::size::Size;
 use ros2probe_model::snapshot::SocketFacts;
+use ros2probe_model::tables;
 use ros2probe_model::watch::{Watch, Watchlist};
 use ros2probe_testing::model::forge::{self, Message, SEDP_READERS, SEDP_WRITERS, SPDP};
 use ros2probe_wire::record::{flag, guid_words, kind};
@@ -202,15 +200,11 @@ fn somewhere(dice: &mut Dice, time: u64) -> Envelope {
     envelope
 }
 
-/// The largest size of each table, and its cap.
-type Largest = BTreeMap<&'static str, (usize, usize)>;
-
 /// One step, given the model, random numbers and the time.
 type Step<'a> = &'a mut dyn FnMut(&mut Observer, &mut Dice, u64);
 
-/// Runs the model with a step every `pause` nanoseconds. Returns the sizes of its tables, and the
-/// growth of the heap in the first half and in total.
-fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
+/// Runs the model with a step every `pause` nanoseconds. Returns the growth of the heap.
+fn drive(messages: u64, pause: u64, step: Step<'_>) -> usize {
     let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
     let before = allocator::held();
     let mut observer = observer();
@@ -218,16 +212,13 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
         Duration::from_secs(SECONDS as u64),
         Limits::default().topics,
     );
-    let mut largest = Largest::new();
     let (mut half, mut now) = (0, START);
     for turn in 0..messages {
         now += pause;
         step(&mut observer, &mut dice, now);
         if turn % 2_000 == 0 {
             observer.input(Input::Time(Timestamp(now)));
-            update(&observer.sizes(), &mut largest);
             history.take(Timestamp(now), observer.measured(Timestamp(now)));
-            update(&history.sizes(), &mut largest);
             observer.drain();
         }
         if turn == messages / 2 {
@@ -235,26 +226,16 @@ fn drive(messages: u64, pause: u64, step: Step<'_>) -> (Largest, usize, usize) {
         }
     }
     let whole = allocator::held().saturating_sub(before);
-    (largest, half, whole)
-}
-
-/// Asserts that no table exceeds its cap.
-fn update(sizes: &[Size], largest: &mut Largest) {
-    for size in sizes {
-        let seen = largest.entry(size.table).or_insert((0, size.cap));
-        *seen = (seen.0.max(size.entries), size.cap);
-        assert!(size.entries <= size.cap, "{size:?}");
-    }
+    println!("{half} bytes after half of it, {whole} at the end");
+    whole
 }
 
 /// Asserts that these tables were filled to at least nine tenths of their caps.
-fn assert_filled(largest: &Largest, tables: &[&str]) {
+fn assert_filled(tables: &[&str]) {
+    let ledger = ledger();
     for table in tables {
-        let (entries, cap) = largest[table];
-        assert!(
-            entries * 10 >= cap * 9,
-            "{table} was not filled: {entries} of {cap}"
-        );
+        let used = ledger[table];
+        assert!(used.largest * 10 >= used.cap * 9, "{table}: {used:?}");
     }
 }
 
@@ -435,136 +416,75 @@ fn newcomers_in_a_crowd(observer: &mut Observer, dice: &mut Dice, now: u64) {
     });
 }
 
-/// Collects the names of all tables in these sources.
-fn tables(directory: &Path, into: &mut BTreeSet<String>) {
-    for entry in fs::read_dir(directory).unwrap() {
-        let path = entry.unwrap().path();
-        if path.is_dir() {
-            tables(&path, into);
-            continue;
-        }
-        let text = fs::read_to_string(path).unwrap();
-        let named = text.split("Size::new(").skip(1);
-        into.extend(named.filter_map(|rest| Some(rest.split('"').nth(1)?.to_owned())));
-    }
-}
-
 #[test]
 fn no_table_grows_beyond_its_cap_whatever_is_forged() {
-    let (mut largest, half, whole) = drive(MESSAGES, 200_000, &mut any_datagram);
-    println!("{half} bytes after half of it, {whole} at the end\n{largest:#?}");
-    assert_filled(
-        &largest,
-        &[
-            "discovery.applicants",
-            "discovery.participants",
-            "discovery.pending_endpoints",
-            "discovery.pending_nodes",
-            "discovery_fragments.samples",
-            "profiler.unknown_writers",
-            "receivers.addresses",
-        ],
-    );
+    let whole = drive(MESSAGES, 200_000, &mut any_datagram);
+    assert_filled(&[
+        "discovery.applicants",
+        "participants",
+        "discovery.pending_endpoints",
+        "discovery.pending_nodes",
+        "discovery_fragments.samples",
+        "unknown_writers",
+        "addresses",
+    ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (of_one, half, whole) = drive(MESSAGES / 3, 1_000_000, &mut one_writer);
-    println!("{half} bytes after half of it, {whole} at the end\n{of_one:#?}");
-    assert_filled(
-        &of_one,
-        &[
-            "acknowledgements.readers",
-            "sequence.gaps",
-            "trace.finished",
-            "routes.routes",
-        ],
-    );
+    let whole = drive(MESSAGES / 3, 1_000_000, &mut one_writer);
+    assert_filled(&[
+        "acknowledgements.readers",
+        "sequence.gaps",
+        "trace.finished",
+        "routes.routes",
+    ]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (crowded, half, whole) = drive(MESSAGES * 2 / 5, 1_000_000, &mut newcomers_in_a_crowd);
-    println!("{half} bytes after half of it, {whole} at the end\n{crowded:#?}");
-    assert_filled(&crowded, &["discovery.endpoints", "discovery.nodes"]);
+    let whole = drive(MESSAGES * 2 / 5, 1_000_000, &mut newcomers_in_a_crowd);
+    assert_filled(&["endpoints", "nodes"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (called, half, whole) = drive(MESSAGES * 2 / 5, 1_000_000, &mut calls::calls);
-    println!("{half} bytes after half of it, {whole} at the end\n{called:#?}");
-    assert_filled(&called, &["services.identities", "services.clients"]);
+    let whole = drive(MESSAGES * 2 / 5, 1_000_000, &mut calls::calls);
+    assert_filled(&["services.identities", "services.clients"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (reported, half, whole) = drive(4_000, 300_000_000, &mut inside::reports);
-    println!("{half} bytes after half of it, {whole} at the end\n{reported:#?}");
-    assert_filled(&reported, &["inside.states"]);
+    let whole = drive(4_000, 300_000_000, &mut inside::reports);
+    assert_filled(&["inside.states"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (chained, half, whole) = drive(MESSAGES, 1_000_000, &mut chains::messages);
-    println!("{half} bytes after half of it, {whole} at the end\n{chained:#?}");
-    let filled = ["chains.paths", "chains.publications", "chains.spans"];
-    assert_filled(&chained, &filled);
+    let whole = drive(MESSAGES, 1_000_000, &mut chains::messages);
+    let filled = ["chains", "chains.publications", "chains.spans"];
+    assert_filled(&filled);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let (connected, half, whole) = drive(MESSAGES, 1_000_000, &mut zenoh::batches);
-    println!("{half} bytes after half of it, {whole} at the end\n{connected:#?}");
-    assert_filled(&connected, &["zenoh.directions"]);
+    let whole = drive(MESSAGES, 1_000_000, &mut zenoh::batches);
+    assert_filled(&["zenoh_directions"]);
     assert!(whole < 96 << 20, "{whole} bytes");
 
-    let queued: Vec<_> = inside::of_a_queue()
-        .into_iter()
-        .map(|size| (size.table, (size.entries, size.cap)))
-        .collect();
-    let is_bounded = |(_, (entries, cap)): &(&str, (usize, usize))| entries <= cap;
-    assert!(queued.iter().all(is_bounded), "{queued:#?}");
+    inside::of_a_queue();
 
-    let further = of_one.into_iter().chain(crowded);
-    let further = further.chain(called).chain(reported).chain(chained);
-    let further = further.chain(connected).chain(queued);
-    for (table, (entries, cap)) in further {
-        let seen = largest.entry(table).or_insert((0, cap));
-        seen.0 = seen.0.max(entries);
-    }
-    let mut listed = BTreeSet::new();
-    tables(
-        &Path::new(env!("CARGO_MANIFEST_DIR")).join("src"),
-        &mut listed,
-    );
-    // These two tables are outside the model.
-    listed.retain(|table| !table.starts_with("ahead.") && !table.starts_with("reassembly."));
-    let asked: BTreeSet<_> = largest.keys().map(|table| (*table).to_owned()).collect();
-    assert_eq!(asked, listed);
-    // These lists are taken after each datagram, or empty after a pause.
-    for drained in [
-        "zenoh.changed",
-        "zenoh.changes",
-        "chains.findings",
-        "chains.owners",
-        "discovery.changes",
-        "journal.missing",
-    ] {
-        largest.remove(drained);
-    }
+    let ledger = ledger();
+    println!("{ledger:#?}");
+    let mut empty: Vec<_> = tables::ALL.iter().map(|table| table.name).collect();
+    empty.retain(|table| ledger.get(table).is_none_or(|used| used.largest == 0));
     // Tests of their own fill these: `deliveries`, `event` and `zenoh::routers`.
-    for rare in [
+    let rare = [
         "delivery.withheld",
         "events.losers",
         "zenoh.cut",
-        "zenoh.passages",
-        "zenoh.passages.sessions",
-    ] {
-        largest.remove(rare);
-    }
+        "zenoh_passages",
+    ];
     // These are filled from saved state only.
-    for restored in ["zenoh.relayed", "zenoh.remembered", "zenoh.restored"] {
-        largest.remove(restored);
-    }
-    let empty = largest
-        .iter()
-        .filter(|(_, (entries, cap))| *entries == 0 && *cap > 0);
-    let empty: Vec<_> = empty.map(|(table, _)| *table).collect();
+    let restored = ["zenoh.relayed", "zenoh.remembered", "zenoh.restored"];
+    empty.retain(|table| !rare.contains(table) && !restored.contains(table));
     assert!(empty.is_empty(), "nothing came into {empty:?}");
+    let exceeded = ledger.iter().filter(|(_, used)| used.largest > used.cap);
+    assert_eq!(exceeded.count(), 0);
 }
 
 #[test]
 fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
     let prefix = GuidPrefix([9; 12]);
-    let (largest, _, whole) = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
+    let whole = drive(MESSAGES, 20_000, &mut |observer, dice, now| {
         let payload = forge::participant_at(prefix, 100, None, &dice.locators());
         let message = Message::from(prefix).data(SPDP, 1, &payload).bytes();
         observer.input(Input::Datagram {
@@ -573,6 +493,6 @@ fn one_forged_participant_with_fresh_addresses_keeps_the_last_ones_alone() {
             handover: None,
         });
     });
-    assert_eq!(largest["receivers.addresses"].0, 16);
+    assert_eq!(ledger()["addresses"].largest, 16);
     assert!(whole < 2 << 20, "{whole} bytes");
 }

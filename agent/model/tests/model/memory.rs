@@ -269,6 +269,6 @@ fn all_limits_reached_together_fit_into_the_unit_s_memory() {
         .find_map(|line| line.strip_prefix("MemoryMax="));
     let allowed = megabytes.unwrap().strip_suffix('M').unwrap();
     let allowed = allowed.parse::<usize>().unwrap() << 20;
-    let all = Limits::default().bytes() + Limits::BESIDE;
+    let all = Limits::default().bytes() + Limits::BESIDE + Limits::ZENOH;
     assert!(all <= allowed, "{} of {} KiB", all >> 10, allowed >> 10);
 }

@@ -257,6 +257,75 @@ fn a_restart_on_a_running_robot_reports_no_silence_of_the_time_before() {
     );
 }
 
+/// Returns after how many seconds a topic of Fast DDS without messages counts as silent. Its reader on
+/// the writer's host receives at locators of these kinds; another reader may be on another host.
+fn silent_after(reader_locators: &[u32], other_is_remote: bool) -> Option<u64> {
+    let talker = GuidPrefix(*b"\x01\x0fHHpid10000");
+    let listener = GuidPrefix(*b"\x01\x0fHHpid20000");
+    let remote = GuidPrefix(*b"\x01\x0fRRpid30000");
+    let mut observer = Observer::new(Settings::default());
+    let watch = Watch {
+        expectations: Expectations {
+            max_silence: Some(Duration::from_secs(2)),
+            ..Expectations::default()
+        },
+        ..Watch::named("/beat").unwrap()
+    };
+    let watchlist = Watchlist::new(vec![watch]).unwrap();
+    observer.input(Input::Watchlist(Arc::new(watchlist)));
+    let locator = |kind: &u32| [&kind.to_le_bytes()[..], &[1; 20]].concat();
+    let ends = [
+        (talker, WRITER, SEDP_WRITERS, vec![16, 1]),
+        (listener, READER, SEDP_READERS, reader_locators.to_vec()),
+        (remote, READER, SEDP_READERS, vec![16, 1]),
+    ];
+    let there = if other_is_remote { 3 } else { 2 };
+    for (prefix, entity, sedp, kinds) in ends.iter().take(there) {
+        let guid = Guid::new(*prefix, *entity);
+        let locators: Vec<_> = kinds.iter().map(locator).collect();
+        let locators = locators.iter().map(|value| (0x2f, &value[..]));
+        let reliable = [&2u32.to_le_bytes()[..], &[0; 8]].concat();
+        let list: Vec<_> = locators.chain([(0x1a, &reliable[..])]).collect();
+        let payload = forge::endpoint_with(guid, "rt/beat", "std_msgs::msg::dds_::Empty_", &list);
+        let message = Message::from_fast(*prefix).data(*sedp, 7, &payload);
+        put(&mut observer, START, message);
+    }
+    for second in 1..300 {
+        let now = Timestamp(START + second * SECOND);
+        for (prefix, ..) in ends.iter().take(there) {
+            let mut payload = forge::participant(*prefix, LEASE, None);
+            let vendor = payload
+                .windows(6)
+                .position(|six| six == [0x16, 0, 4, 0, 1, 0x10]);
+            payload[vendor.unwrap() + 5] = 0x0f;
+            let message = Message::from_fast(*prefix).data(SPDP, second, &payload);
+            put(&mut observer, now.0, message);
+        }
+        observer.input(Input::Time(now));
+        let events = observer.drain().events.events;
+        let is_silent = |kind: &EventKind| matches!(kind, EventKind::Expectation { to, .. } if to.label() == "silent");
+        if events.iter().any(|event| is_silent(&event.kind)) {
+            return Some(second);
+        }
+    }
+    None
+}
+
+#[test]
+fn a_writer_that_polling_has_not_seen_yet_is_not_silent_at_once() {
+    // 131 messages in a row, of which polling is assumed to see every tenth.
+    let polled = silent_after(&[16, 1], false);
+    assert!(
+        polled.is_some_and(|after| (262..266).contains(&after)),
+        "{polled:?}"
+    );
+    // The agent sees what the network carries at once.
+    for (locators, other_is_remote) in [(&[1][..], false), (&[16, 1], true)] {
+        let seen = silent_after(locators, other_is_remote);
+        assert!(seen.is_some_and(|after| after <= 5), "{seen:?}");
+    }
+}
+
 #[test]
 fn a_restart_gives_the_robot_time_to_announce_its_subscribers() {
     let three = Expectations {

@@ -5,10 +5,12 @@ mod routers;
 
 use std::ops::Range;
 
+use crate::allocator;
+use ros2probe_model::bounded::ledger;
 use ros2probe_model::discovery::Memory;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
-use ros2probe_model::snapshot::{Snapshot, TopicFacts};
+use ros2probe_model::snapshot::{Snapshot, TableFacts, TopicFacts};
 use ros2probe_model::watch::{Expectations, Retain, Watch, Watchlist};
 use ros2probe_model::zenoh::{StreamEvent, Unseen, ZenohFacts};
 use ros2probe_testing::zenoh::{
@@ -354,9 +356,18 @@ fn unseen(facts: &ZenohFacts, reason: Unseen) -> u64 {
 
 /// Every table stays within its cap.
 fn bounded(observer: &Observer) {
-    for size in observer.sizes() {
-        assert!(size.entries <= size.cap, "{size:?}");
-    }
+    let tables = observer.snapshot(Timestamp(START)).tables;
+    assert!(tables.iter().all(|table| table.size <= table.limit));
+    let ledger = ledger();
+    let chains = ledger.get("zenoh.chains.bytes");
+    assert!(chains.is_none_or(|used| used.largest <= used.cap));
+}
+
+/// Returns the size of a table in the snapshot.
+fn table(observer: &Observer, name: &str) -> TableFacts {
+    let tables = observer.snapshot(Timestamp(START)).tables;
+    let mut tables = tables.into_iter();
+    tables.find(|table| table.table == name).unwrap()
 }
 
 #[test]
@@ -373,8 +384,8 @@ fn connections_without_end_replace_the_longest_silent() {
         );
     }
     bounded(&observer);
-    let facts = observer.snapshot(Timestamp(START + SECOND)).zenoh.unwrap();
-    assert!(facts.evictions >= 1900, "{facts:?}");
+    let directions = table(&observer, "zenoh_directions");
+    assert!(directions.evictions >= 1900, "{directions:?}");
 }
 
 #[test]
@@ -382,13 +393,16 @@ fn aliases_tokens_and_keys_beyond_their_caps_are_left_out() {
     let mut observer = observer();
     connect(&mut observer, 1000, TALKER, (ROUTER, Role::Router));
     let [there, _] = connection(1000);
-    for id in 0..17_000_u16 {
-        send(
-            &mut observer,
-            &there,
-            START,
-            &frame(1, &[declare_key(id + 1, KEY)]),
-        );
+    for port in 2000..2003 {
+        let [there, _] = connection(port);
+        for id in 0..17_000_u16 {
+            send(
+                &mut observer,
+                &there,
+                START,
+                &frame(1, &[declare_key(id + 1, KEY)]),
+            );
+        }
     }
     let long = format!("0/{}/t/TypeHashNotSupported", "a".repeat(60_000));
     send(
@@ -407,12 +421,14 @@ fn aliases_tokens_and_keys_beyond_their_caps_are_left_out() {
         );
     }
     bounded(&observer);
-    let facts = observer.snapshot(Timestamp(START)).zenoh.unwrap();
-    assert!(facts.evictions > 7000, "{facts:?}");
+    let aliases = table(&observer, "zenoh_aliases");
+    assert!(aliases.evictions > 7000, "{aliases:?}");
+    let tokens = table(&observer, "zenoh_tokens");
+    assert!(tokens.evictions > 20_000, "{tokens:?}");
 }
 
 #[test]
-fn a_token_that_everybody_declares_remembers_so_many() {
+fn a_token_that_everybody_declares_is_one_session() {
     let mut observer = observer();
     let token = publisher(TALKER, 10, "/chatter");
     for port in 0..100 {
@@ -426,6 +442,102 @@ fn a_token_that_everybody_declares_remembers_so_many() {
     }
     bounded(&observer);
     assert_eq!(participants(&observer, START), 1);
+}
+
+/// Returns the bytes that the model holds after `attack` on each of 4096 connections. `attack` gets
+/// the model and the number of the connection.
+fn held_after(attack: impl Fn(&mut Observer, u16)) -> usize {
+    let before = allocator::held();
+    let mut observer = observer();
+    for port in 0..4096 {
+        attack(&mut observer, port);
+    }
+    bounded(&observer);
+    observer.input(Input::Time(Timestamp(START + SECOND)));
+    let held = allocator::held() - before;
+    let mut tables = observer.snapshot(Timestamp(START)).tables.into_iter();
+    assert!(tables.all(|table| table.bytes.is_none_or(|(bytes, cap)| bytes <= cap)));
+    held
+}
+
+#[test]
+fn long_aliases_on_all_connections_take_a_few_megabytes() {
+    let held = held_after(|observer, port| {
+        let [there, _] = connection(port);
+        for id in 1..100 {
+            let key = format!("0/{id}{}/t/TypeHashNotSupported", "a".repeat(2000));
+            send(observer, &there, START, &frame(1, &[declare_key(id, &key)]));
+        }
+    });
+    println!("{held} bytes");
+    assert!(held < 16 << 20, "{held} bytes");
+}
+
+#[test]
+fn long_tokens_of_forged_sessions_on_all_connections_take_a_few_megabytes() {
+    let held = held_after(|observer, port| {
+        let [there, _] = connection(port);
+        for id in 1..10 {
+            let mut session = TALKER;
+            session[..2].copy_from_slice(&port.to_le_bytes());
+            session[2] = u8::try_from(id).unwrap();
+            let topic = format!("/t{}", "a".repeat(200));
+            let token = publisher(session, id, &topic);
+            let token = token.replace("/talker/", &format!("/{}/", "n".repeat(1400)));
+            send(
+                observer,
+                &there,
+                START,
+                &frame(1, &[declare_token(id, &token)]),
+            );
+        }
+    });
+    println!("{held} bytes");
+    // Discovery and its changes hold the announcements, too.
+    assert!(held < 40 << 20, "{held} bytes");
+}
+
+#[test]
+fn stale_fragments_make_room_for_a_large_message() {
+    let (mut observer, gid) = talking();
+    let part = vec![7; 60_000];
+    for port in 100..140 {
+        let [there, _] = connection(port);
+        // Requests are kept whole.
+        let mut first = vec![0x1c, 1, 0, 0x03];
+        first.extend_from_slice(&part[..50_000]);
+        send(
+            &mut observer,
+            &there,
+            START,
+            &fragment(0, true, true, &first),
+        );
+        for number in 1..20 {
+            send(
+                &mut observer,
+                &there,
+                START,
+                &fragment(number, false, true, &part),
+            );
+        }
+    }
+    bounded(&observer);
+    let incomplete = |observer: &Observer| {
+        let facts = observer.snapshot(Timestamp(START)).zenoh;
+        facts.map_or(0, |facts| facts.counters.incomplete)
+    };
+    assert!(ledger()["zenoh.chains.bytes"].largest > 19 << 20);
+    let before = incomplete(&observer);
+    let [there, _] = connection(1000);
+    let message = push(3, gid, 1, &part);
+    send(
+        &mut observer,
+        &there,
+        START + 11 * SECOND,
+        &fragment(0, true, true, &message),
+    );
+    // The messages that wait are given up.
+    assert!(incomplete(&observer) > before);
 }
 
 #[test]
@@ -444,9 +556,7 @@ fn routers_that_pass_on_tokens_are_bounded() {
         }
         bounded(&observer);
     }
-    let sizes = observer.sizes();
-    let routers = sizes.iter().find(|size| size.table == "zenoh.passages");
-    assert_eq!(routers.map(|size| size.entries), Some(256));
+    assert_eq!(table(&observer, "zenoh_passages").size, 256);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! The kernel programs and user space write the same records for every capture.
 
 use super::*;
+use ros2probe_wire::Expansion;
 
 /// One IP packet of a capture.
 pub(super) struct IpPacket {
@@ -48,7 +49,7 @@ fn collect(folder: &Path, found: &mut Vec<PathBuf>) {
 }
 
 pub(super) fn ip_packets(path: &Path) -> Vec<IpPacket> {
-    let mut reader = PcapReader::open(path).unwrap();
+    let mut reader = PcapReader::open(path, Expansion::Limited).unwrap();
     let mut packets = Vec::new();
     while let Some(captured) = reader.next_packet().unwrap() {
         let header = match captured.link {

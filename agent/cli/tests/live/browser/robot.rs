@@ -15,8 +15,8 @@ use ros2probe_testing::harness::peer;
 use ros2probe_testing::harness::process::Process;
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// Streams of the page that an agent has room for.
-const STREAMS: usize = 16;
+/// Streams of clients without a token.
+const STREAMS: usize = 12;
 
 /// A host without a link to any other.
 pub(crate) struct Place {

@@ -1,5 +1,5 @@
-//! All loads of the other tests at once, within the unit's memory and CPU: forged announcements of
-//! every kind, full tables, recordings, and hostile clients.
+//! All loads of the other tests at once, within two thirds of the unit's memory, and its CPU: forged
+//! announcements of every kind, full tables, recordings, and hostile clients.
 
 use std::fs;
 use std::io::Write as _;
@@ -15,6 +15,7 @@ use serde_json::Value;
 use super::clients::{Asker, Clients, Doors, answer};
 use super::memory::{Breathing, NOBODY};
 use super::unit::{Allowance, Confined, mebibytes};
+use super::zenoh_storm::ZenohStorm;
 use super::{Scene, ask};
 use ros2probe_testing::forged::storm::{Storm, forgery};
 use ros2probe_testing::harness::agent::{ON_THE_WIRE, Scrape, at_the_sockets_of};
@@ -68,6 +69,8 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     let (before, throttled) = (Usage::of(scene.pid())?, group.throttled()?);
     let began = Instant::now();
     let storms = storms(&link)?;
+    let rest = Duration::from_millis(if long().is_some() { 2 } else { 10 });
+    let zenoh = ZenohStorm::start(&link, rest)?;
     let clients = Clients::start(&doors);
     let askers = askers(&doors);
     real.go()?;
@@ -75,6 +78,7 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
         mut peak,
         participants,
         endpoints,
+        zenoh_aliases,
     } = observe(span, &group, &doors, &mut real)?;
     let took = began.elapsed();
     let cpu = Usage::of(scene.pid())?.since(&before).cpu;
@@ -85,15 +89,17 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
     for storm in storms {
         sent += storm.end()?;
     }
+    let declared = zenoh.end()?;
     drop(silent);
     let page = real.settled(&scene)?;
     peak = peak.max(group.needed()?);
     ensure!(group.kills()? == 0, "killed at the end");
     ensure!(
-        peak < allowance.memory,
+        peak < allowance.memory / 3 * 2,
         "{peak} bytes with what sockets take"
     );
     ensure!(sent > 5_000, "{sent} datagrams are no storm");
+    ensure!(declared > 5_000, "{declared} declarations are no storm");
     what_was_refused_has_names(&page)?;
     let counted = real.check(&page)?;
     let mut recorded = 0;
@@ -108,11 +114,13 @@ fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
             allowance.cpu_percent
         ),
         &format!(
-            "{sent} forged datagrams in {took:.0?}, participants {:.0} % and endpoints {:.0} % full; {done}: {:.1} MiB \
+            "{sent} forged datagrams and {declared} declarations of Zenoh in {took:.0?}, participants {:.0} % and endpoints {:.0} % \
+             and aliases of Zenoh {:.0} % full; {done}: {:.1} MiB \
              at most ({:.1} MiB before), not killed; {:.1} s of CPU, {:.1} s waited for more; {}; {counted}; \
              {recorded} messages of real topics in 4 recordings, all others accounted for; ended in {ended:.1?}",
             participants * 100.0,
             endpoints * 100.0,
+            zenoh_aliases * 100.0,
             mebibytes(peak),
             mebibytes(idle),
             cpu.as_secs_f64(),
@@ -143,13 +151,14 @@ struct Highest {
     /// Used share of these tables, of 1.
     participants: f64,
     endpoints: f64,
+    zenoh_aliases: f64,
 }
 
 /// Reads the values until everything is sent, and once more.
 fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> Result<Highest> {
     let began = Instant::now();
     let mut peak = 0;
-    let (mut participants, mut endpoints) = (0.0_f64, 0.0_f64);
+    let (mut participants, mut endpoints, mut zenoh_aliases) = (0.0_f64, 0.0_f64, 0.0_f64);
     let mut is_sent = false;
     while !is_sent {
         is_sent = began.elapsed() >= span;
@@ -161,12 +170,14 @@ fn observe(span: Duration, group: &Confined, doors: &Doors, real: &mut Real) -> 
         let page = page(doors)?;
         participants = participants.max(filled(&page, "participants"));
         endpoints = endpoints.max(filled(&page, "endpoints"));
+        zenoh_aliases = zenoh_aliases.max(filled_bytes(&page, "zenoh_aliases"));
         std::thread::sleep(Duration::from_millis(200));
     }
     Ok(Highest {
         peak,
         participants,
         endpoints,
+        zenoh_aliases,
     })
 }
 
@@ -246,6 +257,12 @@ fn page(doors: &Doors) -> Result<Scrape> {
 fn filled(page: &Scrape, table: &str) -> f64 {
     let label = [("table", table)];
     page.sum("ros2probe_table_entries", &label) / page.sum("ros2probe_table_limit", &label)
+}
+
+/// As [`filled`], of its cap in bytes.
+fn filled_bytes(page: &Scrape, table: &str) -> f64 {
+    let label = [("table", table)];
+    page.sum("ros2probe_table_bytes", &label) / page.sum("ros2probe_table_bytes_limit", &label)
 }
 
 /// Ends a recording, and returns its number of messages of real topics. The report counts each other

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_model::loss::DeliveryLoss;
@@ -209,7 +209,9 @@ impl Experiment {
             ensure!(beyond.is_empty(), "never sent: {beyond:?}");
         }
         if !doubts.is_empty() {
-            cells.iter().for_each(|cell| println!("{cell}"));
+            for cell in &cells {
+                println!("{cell} {:?}", cell.faults());
+            }
             bail!("{}", doubts.join("; "));
         }
         Ok(cells)
@@ -300,9 +302,13 @@ impl Experiment {
         let before = overflows()?;
         let _loss = self.loss(trouble, link, peers)?;
         peers.publisher.go()?;
+        if trouble == Trouble::Stops {
+            // A busy publisher may send little while its subscriber stands for a short time.
+            self.stop(peers, || Ok(overflows()? > before))?;
+        }
         while (peers.publisher.log()?.sequences("pub").len() as u64) < due {
             match trouble {
-                Trouble::Stops => self.stop(peers)?,
+                Trouble::Stops => self.stop(peers, || Ok(true))?,
                 _ => std::thread::sleep(PAUSE),
             }
         }
@@ -313,11 +319,16 @@ impl Experiment {
         })
     }
 
-    fn stop(&self, peers: &Peers) -> Result<()> {
+    /// Stops the first subscriber for a while, and until `is_enough`.
+    fn stop(&self, peers: &Peers, is_enough: impl Fn() -> Result<bool>) -> Result<()> {
         let (stands, runs) = self.size.stop();
         let slow = &peers.subscribers.first().context("no subscriber")?.process;
         slow.signal("STOP")?;
         std::thread::sleep(stands);
+        let deadline = Instant::now() + PATIENCE;
+        while !is_enough()? && Instant::now() < deadline {
+            std::thread::sleep(PAUSE);
+        }
         slow.signal("CONT")?;
         std::thread::sleep(runs);
         Ok(())
@@ -371,19 +382,21 @@ fn sums_that_differ(
             .take_while(|number| truth.numbers.last() < Some(number))
             .count() as u64;
         let logged = (truth.numbers.len() as u64, missing.len() as u64);
-        let mut counted = None;
+        let (mut counted, mut rows) = (None, String::new());
         let agreed = witness.wait_for("the counts of the log", SETTLED, |seen| {
             let sums = sums(seen, &sent.guid, &truth.guid);
             // Peers that have left take their deliveries with them.
             if sums.messages > 0 {
                 counted = Some(sums);
+                let all = seen.topics.iter().flat_map(|topic| &topic.deliveries);
+                rows = all.map(|row| format!("\n{row:?}")).collect();
             }
             let is_lost = (logged.1 - open..=logged.1).contains(&sums.lost());
             (sums.messages == logged.0 && is_lost).then_some(())
         });
         if agreed.is_err() {
             doubts.push(format!(
-                "received and lost {logged:?} by the log, but {counted:?}"
+                "received and lost {logged:?} by the log, but {counted:?} in {rows}"
             ));
         }
     }

@@ -11,6 +11,7 @@ use anyhow::{Context as _, Result, bail, ensure};
 use ros2probe_capture::netns;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::{FlowKey, Limits, Reassembly};
+use ros2probe_wire::Expansion;
 use ros2probe_wire::frame::{self, PacketType, Payload};
 
 use ros2probe_testing::harness::cgroup::Cgroup;
@@ -139,7 +140,7 @@ fn send_multicasts_to_loopback(socket: &UdpSocket) -> Result<()> {
 
 /// All whole datagrams in the order in which they were complete.
 fn datagrams(capture: &Path) -> Result<Option<Vec<Datagram>>> {
-    let mut reader = PcapReader::open(capture)?;
+    let mut reader = PcapReader::open(capture, Expansion::Limited)?;
     let mut reassembly = Reassembly::new(Limits::default());
     let mut datagrams = Vec::new();
     let mut first = None;

@@ -12,6 +12,7 @@ use serde_json::Value;
 use super::metadata;
 use ros2probe_testing::bag_readers::read_by_others;
 use ros2probe_testing::truth::{self, Scenario};
+use ros2probe_wire::Expansion;
 
 fn convert(capture: &Path, bag: &Path, options: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_rp"))
@@ -146,7 +147,7 @@ fn in_the_bag(name: &str, bag: &Path) -> BTreeMap<String, u64> {
             *counts.entry(topic.clone()).or_default() += 1;
             sequences.entry(topic).or_default().push(message.sequence);
         };
-        read::scan(&bag.join(file), each).unwrap();
+        read::scan(&bag.join(file), Expansion::Limited, each).unwrap();
     }
     for (topic, sequences) in sequences {
         // One writer each, but for these; in its order, none twice.

@@ -1,9 +1,9 @@
 //! The test that exceeds each cap of docs/limits-*.md.
 
-/// A line for each fixed cap: constant, its file, the test's file, and the test.
+/// A line for each fixed cap: constant or table, its file, the test's file, and the test.
 const FIXED: &str = include_str!("driven.txt");
 
-/// Returns constant, its file, the test's file, and the test.
+/// Returns constant or table, its file, the test's file, and the test.
 pub fn fixed() -> Vec<[&'static str; 4]> {
     let words = |line: &'static str| line.split(' ').collect::<Vec<_>>().try_into();
     FIXED

@@ -235,10 +235,25 @@ fn kernel_maps_probes_and_memory_are_of_the_threads_that_need_them() {
             let probes = matches!(role, Role::Exact | Role::Inside);
             assert_eq!(open != Some(libc::EPERM), probes, "{role:?}");
             let memory = call(libc::SYS_process_vm_readv, [0; 6]);
-            let is_inside = role == Role::Inside;
-            assert_eq!(memory != Some(libc::EPERM), is_inside, "{role:?}");
+            assert_eq!(memory, Some(libc::EPERM), "{role:?}");
         });
     }
+}
+
+#[test]
+fn the_reader_of_memory_forks_and_opens_nothing() {
+    confined(Role::MemoryReader, || {
+        let memory = call(libc::SYS_process_vm_readv, [0; 6]);
+        assert_ne!(memory, Some(libc::EPERM));
+        let namespace = c_long::from(libc::CLONE_NEWUSER | libc::SIGCHLD);
+        let fork = call(libc::SYS_clone, [namespace, 0, 0, 0, 0, 0]);
+        assert_eq!(fork, Some(libc::EPERM));
+        assert!(std::fs::read("/proc/self/stat").is_err());
+        let socket = [libc::AF_UNIX.into(), libc::SOCK_STREAM.into(), 0, 0, 0, 0];
+        assert_eq!(call(libc::SYS_socket, socket), Some(libc::EPERM));
+        let probe = call(libc::SYS_perf_event_open, [0, 0, -1, -1, 0, 0]);
+        assert_eq!(probe, Some(libc::EPERM));
+    });
 }
 
 #[test]

@@ -16,7 +16,7 @@ use ros2probe_model::inside::report as inside;
 use ros2probe_model::topic_kind::TopicKind;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
-use ros2probe_wire::{DomainId, Guid, SequenceNumber, Timestamp};
+use ros2probe_wire::{DomainId, Expansion, Guid, SequenceNumber, Timestamp};
 use tempfile::TempDir;
 use tokio_util::sync::CancellationToken;
 
@@ -212,7 +212,7 @@ fn numbers(bag: &Path) -> Vec<u64> {
         .unwrap()
         .map(|file| file.unwrap().path());
     for file in files.filter(|file| file.extension().is_some_and(|it| it == "mcap")) {
-        ros2probe_bag::read::scan(&file, &mut |message, _| {
+        ros2probe_bag::read::scan(&file, Expansion::Limited, &mut |message, _| {
             numbers.push(u64::from(message.sequence));
         })
         .unwrap();

@@ -6,16 +6,16 @@
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
-use std::sync::Arc;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
-use axum::extract::State;
+use axum::extract::{Extension, State};
 use axum::http::HeaderMap;
 use axum::http::header::CACHE_CONTROL;
 use axum::response::sse::{Event, Sse};
 use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
-use tokio::sync::{Semaphore, SemaphorePermit};
+use tokio::sync::OwnedSemaphorePermit;
 use tokio::time::sleep;
 use tokio_util::sync::CancellationToken;
 use utoipa::IntoParams;
@@ -27,16 +27,18 @@ use super::body_stream::{Pieces, stream_of};
 use super::endpoint::texts;
 use super::parameters::Parameters;
 use super::problem::{Code, Problem, ProblemBody};
+use super::security::Granted;
 use crate::config::{Watch, Watchlist};
 use crate::events::EventLog;
 use crate::events::{EVENTS, Position, Reader, Record, Value};
+use crate::surface::places::Places;
 use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
 use ros2probe_wire::DomainId;
 
 /// Slots for streams of all listeners: fewer than connections, so that other requests still get
 /// one.
-static STREAMS: Semaphore = Semaphore::const_new(MAX_STREAMS);
+static STREAMS: LazyLock<Places> = LazyLock::new(|| Places::new(MAX_STREAMS));
 const MAX_STREAMS: usize = 16;
 /// Silence after which a stream sends a comment.
 const BEAT: Duration = Duration::from_secs(15);
@@ -86,7 +88,7 @@ struct Stream {
     /// Number of the last event that was processed.
     place: u64,
     waiting: VecDeque<Event>,
-    _permit: SemaphorePermit<'static>,
+    _permit: OwnedSemaphorePermit,
 }
 
 pub(super) fn routes() -> OpenApiRouter<Context> {
@@ -121,6 +123,7 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 )]
 async fn events(
     State(context): State<Context>,
+    Extension(granted): Extension<Granted>,
     headers: HeaderMap,
     Parameters(selection): Parameters<Selection>,
 ) -> Result<Response, Problem> {
@@ -140,7 +143,7 @@ async fn events(
             Position::Unknown => (0, true),
         },
     };
-    let permit = STREAMS.try_acquire().map_err(|_| {
+    let permit = STREAMS.take(granted.is_holder()).ok_or_else(|| {
         let detail = format!("{MAX_STREAMS} streams are open, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
@@ -366,7 +369,7 @@ mod tests {
             follow: true,
             place: 0,
             waiting: VecDeque::new(),
-            _permit: STREAMS.try_acquire().unwrap(),
+            _permit: STREAMS.take(true).unwrap(),
         }
     }
 

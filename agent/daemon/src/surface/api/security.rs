@@ -24,8 +24,8 @@ use crate::surface::authority;
 
 /// Largest size of a request body in bytes, above any valid request.
 pub(super) const MAX_BODY: usize = 16 << 10;
-/// Sustained number of requests per second and size of a burst. Authorized clients have one such
-/// limit per door, other clients another.
+/// Sustained number of requests per second and size of a burst. Each door has such a limit for
+/// clients with a token or on the unix socket, one for other clients, and one for refused requests.
 const RATE: f64 = 500.0;
 const BURST: f64 = 1_000.0;
 /// Valid length of a token: shorter ones can be guessed, and a longer file is no token.
@@ -66,6 +66,7 @@ pub(in crate::surface) struct Door {
     kind: Kind,
     granted: Granted,
     page: page::Shared,
+    holders: Mutex<Bucket>,
     clients: Mutex<Bucket>,
     outsiders: Mutex<Bucket>,
 }
@@ -74,6 +75,8 @@ pub(in crate::surface) struct Door {
 #[derive(Clone, Debug)]
 pub(in crate::surface) struct Granted {
     access: Access,
+    /// Whether the client showed a token, or is on the unix socket.
+    is_holder: bool,
     /// The agent's unix socket, which grants all rights.
     socket: Option<Arc<Path>>,
 }
@@ -146,6 +149,7 @@ impl Door {
             kind,
             granted,
             page: page::Shared::default(),
+            holders: bucket(),
             clients: bucket(),
             outsiders: bucket(),
         }
@@ -163,7 +167,7 @@ impl Door {
 
     /// Checks a request and returns its rights.
     fn let_in(&self, headers: &HeaderMap, now: Instant) -> Result<Granted, Problem> {
-        let granted = self.pass(self.admit(headers), now)?;
+        let granted = self.pass(self.admit(headers), Granted::is_holder, now)?;
         small(headers)?;
         Ok(granted)
     }
@@ -183,7 +187,8 @@ impl Door {
             true => Ok(()),
             false => own_pages(headers),
         });
-        self.pass(admitted, now)
+        // A browser requests files before it can have a token.
+        self.pass(admitted, |()| false, now)
     }
 
     /// Checks the handshake of a viewer and returns its rights. Viewers send a token in the URL. The
@@ -196,7 +201,8 @@ impl Door {
         origins: &[String],
         now: Instant,
     ) -> Result<Granted, Problem> {
-        self.pass(self.admit_viewer(headers, token, origins), now)
+        let admitted = self.admit_viewer(headers, token, origins);
+        self.pass(admitted, Granted::is_holder, now)
     }
 
     /// Returns the token that a request needs, if any; `None` on the unix socket, whose file mode
@@ -219,7 +225,7 @@ impl Door {
         origins: &[String],
     ) -> Result<Granted, Problem> {
         let Some(token) = self.token(headers)? else {
-            return Ok(self.granted.clone());
+            return Ok(self.granted.held());
         };
         if let Some(offered) = offered.or_else(|| bearer(headers)) {
             let is_right =
@@ -237,10 +243,15 @@ impl Door {
         Ok(self.granted.clone())
     }
 
-    /// Applies the rate limit. Authorized and other clients have separate limits, so the latter
-    /// cannot exhaust the former.
-    fn pass<T>(&self, admitted: Result<T, Problem>, now: Instant) -> Result<T, Problem> {
+    /// Applies the rate limit. Each class of clients has its own, so that no other can exhaust it.
+    fn pass<T>(
+        &self,
+        admitted: Result<T, Problem>,
+        is_holder: impl FnOnce(&T) -> bool,
+        now: Instant,
+    ) -> Result<T, Problem> {
         let bucket = match &admitted {
+            Ok(granted) if is_holder(granted) => &self.holders,
             Ok(_) => &self.clients,
             Err(_) => &self.outsiders,
         };
@@ -255,16 +266,17 @@ impl Door {
 
     fn admit(&self, headers: &HeaderMap) -> Result<Granted, Problem> {
         let Some(token) = self.token(headers)? else {
-            return Ok(self.granted.clone());
+            return Ok(self.granted.held());
         };
         own_pages(headers)?;
         if bearer(headers).is_some_and(|offered| self.page.tokens.know(offered)) {
             return Ok(self.granted.everything());
         }
-        if let Some(token) = token {
-            authorized(headers, token)?;
-        }
-        Ok(self.granted.clone())
+        let Some(token) = token else {
+            return Ok(self.granted.clone());
+        };
+        authorized(headers, token)?;
+        Ok(self.granted.held())
     }
 }
 
@@ -280,17 +292,35 @@ impl Kind {
 
 impl Granted {
     pub(in crate::surface) const fn new(access: Access, socket: Option<Arc<Path>>) -> Self {
-        Self { access, socket }
+        Self {
+            access,
+            is_holder: false,
+            socket,
+        }
+    }
+
+    /// Returns whether the client showed a token, or is on the unix socket. Some places are reserved
+    /// for such clients.
+    pub(in crate::surface) const fn is_holder(&self) -> bool {
+        self.is_holder
     }
 
     pub(in crate::surface) const fn access(&self) -> Access {
         self.access
     }
 
-    /// Returns all rights.
+    /// Returns all rights, for the holder of a token of the page.
     fn everything(&self) -> Self {
         Self {
             access: Access::All,
+            ..self.held()
+        }
+    }
+
+    /// Returns the same rights, for a client that showed a token.
+    fn held(&self) -> Self {
+        Self {
+            is_holder: true,
             ..self.clone()
         }
     }

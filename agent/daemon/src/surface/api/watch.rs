@@ -72,7 +72,11 @@ pub(super) fn routes() -> OpenApiRouter<Context> {
 async fn list(State(context): State<Context>) -> Json<WatchList> {
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let snapshot = state.snapshot.as_deref();
-    let watches = in_force.entries().iter().map(|entry| view(entry, snapshot));
+    let is_kept = context.watches.is_kept();
+    let watches = in_force
+        .entries()
+        .iter()
+        .map(|entry| view(entry, snapshot, is_kept));
     Json(WatchList {
         watches: watches.collect(),
     })
@@ -99,7 +103,8 @@ async fn show(
     let (state, in_force) = (context.state().await, context.watches.in_force());
     let entry = in_force.find(&topic, domain.domain_id);
     let entry = entry.ok_or_else(|| unknown(&topic, domain.domain_id))?;
-    Ok(Json(view(entry, state.snapshot.as_deref())))
+    let is_kept = context.watches.is_kept();
+    Ok(Json(view(entry, state.snapshot.as_deref(), is_kept)))
 }
 
 /// Watch a topic
@@ -278,7 +283,7 @@ fn answer(
         .snapshot
         .as_deref()
         .filter(|_| done == Done::Unchanged);
-    let body = Json(view(&entry, snapshot));
+    let body = Json(view(&entry, snapshot, context.watches.is_kept()));
     Ok(match done {
         Done::Added => {
             let location = location(watch);
@@ -327,7 +332,7 @@ fn unknown(topic: &str, domain_id: Option<u32>) -> Problem {
     Problem::new(Code::NoSuchWatch, detail)
 }
 
-fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
+fn view(entry: &Entry, snapshot: Option<&Snapshot>, is_kept: bool) -> answers::Watch {
     let watch = &entry.watch;
     let facts = snapshot.and_then(|snapshot| {
         let mut all = snapshot.watches.iter();
@@ -357,6 +362,7 @@ fn view(entry: &Entry, snapshot: Option<&Snapshot>) -> answers::Watch {
             watch::Retain::Last => Retain::Last,
         },
         expectations: expectations(&watch.expectations),
+        kept: is_kept || entry.origin != watches::Origin::Api,
         topics,
     }
 }

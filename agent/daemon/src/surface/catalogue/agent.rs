@@ -137,6 +137,16 @@ pub(in crate::surface) const TABLE_LIMIT: Metric = Metric::gauge(
     &["table"],
     "Cap of a bounded table.",
 );
+pub(in crate::surface) const TABLE_BYTES: Metric = Metric::gauge(
+    "ros2probe_table_bytes",
+    &["table"],
+    "Memory of a table with a cap in bytes, in bytes.",
+);
+pub(in crate::surface) const TABLE_BYTES_LIMIT: Metric = Metric::gauge(
+    "ros2probe_table_bytes_limit",
+    &["table"],
+    "Cap of a table in bytes.",
+);
 pub(in crate::surface) const TABLE_EVICTIONS: Metric = Metric::counter(
     "ros2probe_table_evictions_total",
     &["table"],
@@ -211,7 +221,7 @@ pub(in crate::surface) const RELOAD_TIMESTAMP: Metric = Metric::gauge(
 pub(in crate::surface) const STATE_WRITES: Metric = Metric::counter(
     "ros2probe_state_writes_total",
     &["outcome"],
-    "Writes of discovery state to the state directory, by result; absent if no state is kept.",
+    "Writes of discovery state and added watches, by result; absent if no state is kept.",
 );
 pub(in crate::surface) const RESTORED: Metric = Metric::gauge(
     "ros2probe_restored_participants",

@@ -35,11 +35,12 @@ use tokio_util::task::TaskTracker;
 
 use super::api;
 use super::api::page::Page;
-use super::api::problem::Problem;
+use super::api::problem::{Code, Problem};
 use super::api::security::{Door, Granted, Kind, Token, TokenError};
 use super::connection::{Connection, ConnectionState};
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
+use super::places::Places;
 use super::serving::{self, Plain};
 use crate::agent_facts::SourceKind;
 use crate::config::{Access, ApiSettings, FoxgloveSettings, Limit};
@@ -86,6 +87,7 @@ struct Gate {
     shared: Arc<Shared>,
     door: Arc<Door>,
     origins: Arc<[String]>,
+    places: Arc<Places>,
     tasks: TaskTracker,
 }
 
@@ -160,6 +162,9 @@ impl Server {
             shared: Arc::clone(&shared),
             door: Arc::new(door),
             origins: self.origins,
+            places: Arc::new(Places::new(
+                context.limits.caps().get(Limit::FoxgloveClients),
+            )),
             tasks: TaskTracker::new(),
         };
         let tasks = gate.tasks.clone();
@@ -260,9 +265,16 @@ async fn open(State(gate): State<Gate>, request: Request) -> Response {
         Ok(response) => response,
         Err(unfit) => return refused(unfit.into_response()),
     };
+    let Some(taken) = gate.places.take(granted.is_holder()) else {
+        let detail = "all places for viewers without a token are taken, a quarter of \
+                      limits.foxglove_clients is for others: add `?token=TOKEN` to the address, as \
+                      `rp foxglove` prints it";
+        return refused(turned_away(Problem::new(Code::TooManyClients, detail)));
+    };
     let upgrade = hyper::upgrade::on(&mut request);
     let Gate { shared, tasks, .. } = gate;
     tasks.spawn(async move {
+        let _taken = taken;
         let Ok(stream) = upgrade.await else {
             return;
         };

@@ -66,7 +66,7 @@ impl ConnectionState {
         }
     }
 
-    /// Records that a request arrived.
+    /// Records that a whole request arrived.
     pub(super) fn requested(&self) {
         self.is_working.store(true, Ordering::Relaxed);
     }

@@ -109,7 +109,6 @@ impl Requests {
         let service = service_fn(|request: Request<Incoming>| {
             let (requests, origin) = (Arc::clone(self), Rc::clone(&origin));
             async move {
-                origin.state.requested();
                 let response = requests.respond(request, &origin).await;
                 origin.state.answered();
                 Ok::<_, Infallible>(response)
@@ -135,6 +134,8 @@ impl Requests {
             self.figures.refuse(Refused::Size);
             return refusal(StatusCode::PAYLOAD_TOO_LARGE);
         };
+        // Until here, the connection makes room for others: its client may never finish.
+        origin.state.requested();
         let Some(turn) = ANSWERS.turn().await else {
             self.figures.refuse(Refused::Memory);
             return refusal(StatusCode::SERVICE_UNAVAILABLE);

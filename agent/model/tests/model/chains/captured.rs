@@ -13,6 +13,7 @@ use ros2probe_model::event::EventKind;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_model::watch::{Watch, Watchlist};
+use ros2probe_wire::Expansion;
 
 use super::*;
 
@@ -57,7 +58,7 @@ fn replay(trace: f64) -> Found {
     };
     let watchlist = Watchlist::new(vec![watch]).unwrap();
     observer.input(Input::Watchlist(Arc::new(watchlist)));
-    let mut reader = PcapReader::open(&data().join("capture.pcap.gz")).unwrap();
+    let mut reader = PcapReader::open(&data().join("capture.pcap.gz"), Expansion::Limited).unwrap();
     let mut feed = FrameDecoder::new(Limits::default());
     let (mut restamping, mut spans) = (Vec::new(), Vec::new());
     while let Some(captured) = reader.next_packet().unwrap() {

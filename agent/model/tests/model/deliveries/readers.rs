@@ -245,8 +245,7 @@ fn losses_at_a_socket_of_an_unknown_participant_stay_bounded() {
     }
     (0..15).for_each(|_| host.wait(1000));
     assert!(host.deliveries().is_empty());
-    let sizes = host.observer.sizes();
-    let withheld = sizes.iter().find(|size| size.table == "delivery.withheld");
-    let withheld = withheld.unwrap();
-    assert_eq!(withheld.entries, withheld.cap);
+    let withheld = ros2probe_model::bounded::ledger()["delivery.withheld"];
+    assert_eq!(withheld.largest, withheld.cap);
+    assert!(withheld.refused > 0);
 }

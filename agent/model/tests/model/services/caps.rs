@@ -1,12 +1,13 @@
 //! The caps of the tables of services.
 
 use super::*;
+use ros2probe_model::bounded::ledger;
+use ros2probe_model::tables::ServiceWriters;
 
-/// Size and cap of a table.
-fn size(robot: &Robot, table: &str) -> (usize, usize) {
-    let sizes = robot.domain.observer.sizes();
-    let size = sizes.iter().find(|size| size.table == table).unwrap();
-    (size.entries, size.cap)
+/// Largest size of a table so far, and its cap.
+fn size(table: &str) -> (usize, usize) {
+    let used = ledger()[table];
+    (used.largest, used.cap)
 }
 
 fn evictions(robot: &Robot) -> u64 {
@@ -38,7 +39,7 @@ fn clients(robot: &mut Robot, count: u64) -> Vec<Party> {
 fn writers_beyond_the_cap_are_not_captured() {
     let mut robot = Robot::new(Middleware::Fast);
     clients(&mut robot, 4_000);
-    let full = size(&robot, "services.writers").1 - 4_000;
+    let full = ServiceWriters::CAP - 4_000;
     for number in 0..=full {
         let writer = Guid::new(prefix(2), EntityId([1, number as u8, 1, 3]));
         robot.domain.participant(prefix(2), LEASE);
@@ -46,7 +47,7 @@ fn writers_beyond_the_cap_are_not_captured() {
             .domain
             .endpoint(writer, number as u64 + 1, "rr/otherReply");
     }
-    assert_eq!(size(&robot, "services.writers"), (4_096, 4_096));
+    assert_eq!(size("services.writers"), (4_096, 4_096));
     assert_eq!(evictions(&robot), 1);
     let interest = robot.domain.observer.drain().interest;
     let captured = interest
@@ -67,7 +68,7 @@ fn the_service_with_the_oldest_call_makes_room_for_a_new_one() {
         robot.request(*client, 1);
     }
     // The first one is idle; all others wait for a reply and stay.
-    assert_eq!(size(&robot, "services.services"), (512, 512));
+    assert_eq!(size("services.services"), (512, 512));
     assert_eq!((robot.service("/s0"), evictions(&robot)), (None, 2));
     assert!(robot.service("/s1").is_some() && robot.service("/s512").is_some());
     assert_eq!(robot.service("/s513"), None);
@@ -82,8 +83,8 @@ fn the_oldest_call_makes_room_for_a_new_one() {
         robot.request(client, number);
         robot.domain.now += MILLISECOND / 100;
     }
-    assert_eq!(size(&robot, "services.calls"), (4_096, 4_096));
-    assert_eq!(size(&robot, "services.identities"), (4_096, 4_096));
+    assert_eq!(size("calls"), (4_096, 4_096));
+    assert_eq!(size("services.identities"), (4_096, 4_096));
     assert_eq!(evictions(&robot), 4);
     robot.reply(server, 1, client, 1);
     assert_eq!(robot.counts(), (4_100, 0, 0, 0));
@@ -102,7 +103,7 @@ fn the_client_with_the_longest_silence_makes_room_for_a_new_one() {
         robot.domain.put(message);
         robot.wait(1);
     }
-    assert_eq!(size(&robot, "services.clients"), (256, 256));
+    assert_eq!(size("services.clients"), (256, 256));
     assert_eq!(robot.counts().0, 300);
 }
 
@@ -115,7 +116,7 @@ fn a_reply_in_too_many_parts_keeps_within_its_runs() {
     let mut fragment = |start| robot.part_of_a_reply(server, client, &[5; 10_000], start, 100);
     (0..50).for_each(|part| fragment(2 * part + 1));
     (0..50).for_each(|part| fragment(2 * part + 2));
-    assert_eq!(size(&robot, "services.runs"), (16, 16));
+    assert_eq!(size("services.runs"), (16, 16));
     // Runs were forgotten, so the reply is not known to be whole.
     assert_eq!(robot.counts(), (1, 0, 0, 0));
 }
@@ -145,22 +146,4 @@ fn a_service_beyond_its_bytes_is_not_captured_for_a_while() {
     robot.request(client, 100);
     assert_eq!(robot.counts(), (before + 1, 0, 0, 0));
     assert!(!robot.service(ADD).unwrap().suspended);
-}
-
-#[test]
-fn an_observer_without_calls_lists_the_same_tables() {
-    let tables = |observer: &Observer| -> Vec<_> {
-        let sizes = observer.sizes();
-        let names = sizes.into_iter().map(|size| size.table);
-        names
-            .filter(|table| table.starts_with("services."))
-            .collect()
-    };
-    let mut robot = Robot::new(Middleware::Cyclone);
-    let client = robot.client(1, ADD);
-    robot.request(client, 1);
-    assert_eq!(
-        tables(&robot.domain.observer),
-        tables(&Observer::new(Settings::default()))
-    );
 }

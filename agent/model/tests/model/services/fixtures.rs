@@ -5,6 +5,7 @@ use std::path::Path;
 use ros2probe_capture::frame_decoder::FrameDecoder;
 use ros2probe_capture::pcap::PcapReader;
 use ros2probe_capture::reassembly::Limits;
+use ros2probe_wire::Expansion;
 
 use super::*;
 
@@ -37,7 +38,7 @@ fn calls_and_goals_of_real_nodes_are_paired() {
             ..Settings::default()
         });
         let capture = data.join(label).join("lifecycle-2ns/capture.pcap.gz");
-        let mut reader = PcapReader::open(&capture).unwrap();
+        let mut reader = PcapReader::open(&capture, Expansion::Limited).unwrap();
         let mut feed = FrameDecoder::new(Limits::default());
         while let Some(captured) = reader.next_packet().unwrap() {
             feed.packet(&captured, &mut observer);

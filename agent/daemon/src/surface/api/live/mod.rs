@@ -10,7 +10,7 @@ mod shared_lines;
 mod structure;
 mod values;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use axum::body::Body;
@@ -18,7 +18,7 @@ use axum::extract::{Extension, State};
 use axum::http::header::{CACHE_CONTROL, CONTENT_TYPE};
 use axum::response::{IntoResponse, Response};
 use bytes::Bytes;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::OwnedSemaphorePermit;
 use tokio::time::{Instant, sleep_until};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -31,6 +31,7 @@ use super::problem::{Code, Problem, ProblemBody};
 use super::security::Granted;
 use crate::agent_facts::SourceKind;
 use crate::events::Reader;
+use crate::surface::places::Places;
 use ros2probe_api::live::{End, Events, Line, Open, Replay};
 use ros2probe_model::snapshot::Transport;
 use shared_lines::SharedLines;
@@ -50,7 +51,7 @@ const EVENTS: usize = 64;
 pub struct Live {
     /// Time for which measurements are kept.
     history: Duration,
-    places: Arc<Semaphore>,
+    places: Places,
     shared: Mutex<Option<SharedLines>>,
 }
 
@@ -73,7 +74,7 @@ impl Live {
     pub fn new(history: Duration) -> Self {
         Self {
             history,
-            places: Arc::new(Semaphore::new(MAX_TABS)),
+            places: Places::new(MAX_TABS),
             shared: Mutex::new(None),
         }
     }
@@ -108,8 +109,8 @@ async fn live(
     State(context): State<Context>,
     Extension(granted): Extension<Granted>,
 ) -> Result<Response, Problem> {
-    let permit = Arc::clone(&context.live.places).try_acquire_owned();
-    let permit = permit.map_err(|_| {
+    let permit = context.live.places.take(granted.is_holder());
+    let permit = permit.ok_or_else(|| {
         let detail = format!("{MAX_TABS} pages are open, which is the limit");
         Problem::new(Code::TooManyStreams, detail)
     })?;
@@ -226,7 +227,7 @@ impl Drop for Stream {
     fn drop(&mut self) {
         self.permit = None;
         let live = &self.context.live;
-        if live.places.available_permits() == MAX_TABS {
+        if live.places.is_unused() {
             *live.shared() = None;
         }
     }

@@ -21,7 +21,7 @@ impl Tokens {
     ///
     /// # Errors
     /// Fails if the kernel returns no random bytes.
-    pub(super) fn mint(&self) -> io::Result<String> {
+    pub(in super::super) fn mint(&self) -> io::Result<String> {
         let mut bytes = [0; BYTES];
         let flags = rustix::rand::GetRandomFlags::empty();
         // Up to 256 bytes are returned at once (getrandom(2)).

@@ -88,6 +88,25 @@ fn requests_without_the_token_take_nothing_from_those_with_it() {
 }
 
 #[test]
+fn clients_of_loopback_take_nothing_from_those_with_a_token_of_the_page() {
+    let now = Instant::now();
+    let page = page::Shared::default();
+    let token = page.tokens.mint().unwrap();
+    let granted = Granted::new(Access::Watch, None);
+    let door = Door::new(Kind::Loopback(None), granted).with(page);
+    let plain = headers(&[("host", "localhost")]);
+    let bearer = format!("Bearer {token}");
+    let holder = headers(&[("host", "localhost"), ("authorization", &bearer)]);
+    let answered = (0..5_000).filter(|_| door.let_in(&plain, now).is_ok());
+    assert_eq!(answered.count(), 1_000);
+    let answered = (0..370).filter(|_| {
+        let granted = door.let_in(&holder, now);
+        granted.is_ok_and(|granted| granted.is_holder() && granted.access() == Access::All)
+    });
+    assert_eq!(answered.count(), 370);
+}
+
+#[test]
 fn loopback_grants_what_is_configured_and_socket_and_token_everything() {
     for loopback in [Access::Read, Access::Watch, Access::All] {
         assert_eq!(Kind::Loopback(None).access(loopback), loopback);

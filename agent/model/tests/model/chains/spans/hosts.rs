@@ -170,7 +170,7 @@ fn play(granularity: u64, hosts: Hosts) -> [Vec<ChainSpan>; 2] {
         }
         agent.until(START + 15_000 * MILLISECOND);
     }
-    agents.map(|mut agent| agent.observer.drain().chain_spans.spans)
+    agents.map(|mut agent| agent.observer.drain().chain_spans.spans.to_vec())
 }
 
 /// Asserts that each span comes from one agent, and that one of them exports its parent.

@@ -1,6 +1,4 @@
-//! Current size and cap of the model's tables.
-
-use std::collections::BTreeMap;
+//! Current size and cap of the capture's tables.
 
 /// Size and cap of one table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -11,17 +9,6 @@ pub struct Size {
     pub entries: usize,
     /// Largest number of entries or bytes.
     pub cap: usize,
-}
-
-/// Returns the largest size of each table, among many instances.
-#[must_use]
-pub fn largest(sizes: impl IntoIterator<Item = Size>) -> Vec<Size> {
-    let mut largest: BTreeMap<&'static str, Size> = BTreeMap::new();
-    for size in sizes {
-        let known = largest.entry(size.table).or_insert(size);
-        known.entries = known.entries.max(size.entries);
-    }
-    largest.into_values().collect()
 }
 
 impl Size {

@@ -1,0 +1,71 @@
+//! Places for streams, of which some are reserved for clients with a token.
+//!
+//! A client without a token can hold a place for as long as it likes. It cannot hold those that are
+//! reserved, so the owner of the robot still finds one.
+
+use std::sync::Arc;
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+/// A fixed number of places.
+#[derive(Debug)]
+pub(super) struct Places {
+    all: usize,
+    open: Arc<Semaphore>,
+    reserved: Arc<Semaphore>,
+}
+
+impl Places {
+    /// Creates `all` places, a quarter of them reserved for clients with a token.
+    pub(super) fn new(all: usize) -> Self {
+        let reserved = all / 4;
+        Self {
+            all,
+            open: Arc::new(Semaphore::new(all - reserved)),
+            reserved: Arc::new(Semaphore::new(reserved)),
+        }
+    }
+
+    /// Returns whether no place is taken.
+    pub(super) fn is_unused(&self) -> bool {
+        self.open.available_permits() + self.reserved.available_permits() == self.all
+    }
+
+    /// Returns a place until it is dropped; `None` if all are taken.
+    pub(super) fn take(&self, is_holder: bool) -> Option<OwnedSemaphorePermit> {
+        let open = Arc::clone(&self.open).try_acquire_owned();
+        let reserved = || Arc::clone(&self.reserved).try_acquire_owned();
+        match open {
+            Err(_) if is_holder => reserved().ok(),
+            open => open.ok(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn clients_without_a_token_leave_a_quarter_of_the_places() {
+        let places = Places::new(16);
+        let strangers: Vec<_> = std::iter::from_fn(|| places.take(false)).collect();
+        assert_eq!(strangers.len(), 12);
+        let owners: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
+        assert_eq!(owners.len(), 4);
+        drop(strangers);
+        // Owners have the others, too.
+        let others: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
+        assert_eq!(others.len(), 12);
+    }
+
+    #[test]
+    fn a_place_is_free_after_its_stream() {
+        let places = Places::new(4);
+        let held: Vec<_> = std::iter::from_fn(|| places.take(true)).collect();
+        assert_eq!((held.len(), places.take(true).is_some()), (4, false));
+        assert!(!places.is_unused());
+        drop(held);
+        assert!(places.is_unused() && places.take(false).is_some());
+    }
+}

@@ -1,0 +1,51 @@
+//! Use of each table in debug builds: the largest length of a container, and what had no room.
+//!
+//! Tests read it to know that every declared table was driven to its cap. It belongs to the thread,
+//! as an observer does. Release builds keep no ledger.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+
+use super::Table;
+
+/// Use of one table.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Use {
+    /// Largest number of entries of one container.
+    pub largest: usize,
+    /// Its cap.
+    pub cap: usize,
+    /// Number of entries that a cap refused or removed.
+    pub refused: u64,
+}
+
+thread_local! {
+    static LEDGER: RefCell<BTreeMap<&'static str, Use>> = const { RefCell::new(BTreeMap::new()) };
+}
+
+/// Returns the use of each table by this thread so far, by the table's name.
+#[must_use]
+pub fn ledger() -> BTreeMap<&'static str, Use> {
+    LEDGER.with_borrow(Clone::clone)
+}
+
+/// Notes the length of a container after it grew.
+#[inline]
+pub(super) fn filled(table: &Table, entries: usize, cap: usize) {
+    if cfg!(debug_assertions) {
+        LEDGER.with_borrow_mut(|ledger| {
+            let used = ledger.entry(table.name).or_default();
+            if entries >= used.largest {
+                (used.largest, used.cap) = (entries, cap);
+            }
+        });
+    }
+}
+
+/// Notes entries without room.
+#[inline]
+pub(super) fn refused(table: &Table, entries: u64) {
+    if cfg!(debug_assertions) {
+        LEDGER.with_borrow_mut(|ledger| ledger.entry(table.name).or_default().refused += entries);
+    }
+}
