@@ -5,11 +5,14 @@
 //! from its first message.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, Read as _};
-use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
-use std::path::{Path, PathBuf};
+use std::os::unix::fs::MetadataExt as _;
+use std::path::{Component, Path, PathBuf};
 use std::time::{Duration, Instant};
+
+use rustix::fs::{CWD, Mode, OFlags, openat};
+use rustix::io::Errno;
 
 use super::library::LibraryError;
 use super::processes::{LibraryId, Mapped, Processes};
@@ -22,6 +25,8 @@ pub const RETRY: Duration = Duration::from_secs(5);
 /// Most libraries with a probe: images of containers on one host.
 pub const MAX_LIBRARIES: usize = 64;
 
+/// A file whose open blocks is not a library.
+const UNBLOCKED: OFlags = OFlags::NONBLOCK.union(OFlags::NOCTTY);
 /// Beginning of the names of file systems in user space.
 const USER_SPACE: &str = "fuse";
 /// Most bytes read of a process's mounts.
@@ -246,14 +251,41 @@ fn open_mapped(file: &Path, process: u32, mapped: &Mapped) -> Result<File, Refus
     }
 }
 
+/// Follows no link: the kernel has resolved the path, so a link was put there later. Behind
+/// `/proc/<pid>/root` an absolute link would lead to files of the host.
 fn open_by_path(refused: io::Error, process: u32, mapped: &Mapped) -> Result<File, Refusal> {
-    let Ok(relative) = mapped.path.strip_prefix("/") else {
+    let mut names = Vec::new();
+    for component in mapped.path.components() {
+        match component {
+            Component::RootDir => {}
+            Component::Normal(name) => names.push(name),
+            _ => return Err(Refusal::Open(refused)),
+        }
+    }
+    let Some((last, directories)) = names.split_last() else {
         return Err(Refusal::Open(refused));
     };
-    let file = open(&PathBuf::from(format!("/proc/{process}/root")).join(relative))?;
+    let directory = OFlags::PATH | OFlags::DIRECTORY | OFlags::CLOEXEC;
+    let root = format!("/proc/{process}/root");
+    let mut at = openat(CWD, &root, directory, Mode::empty()).map_err(not_opened)?;
+    for name in directories {
+        let plain = directory | OFlags::NOFOLLOW;
+        at = openat(&at, *name, plain, Mode::empty()).map_err(not_opened)?;
+    }
+    let library = OFlags::RDONLY | OFlags::CLOEXEC | OFlags::NOFOLLOW | UNBLOCKED;
+    let file = openat(&at, *last, library, Mode::empty()).map_err(not_opened)?;
+    let file = regular(File::from(file))?;
     match file.metadata().map_err(Refusal::Open)?.ino() == mapped.id.inode {
         true => Ok(file),
         false => Err(Refusal::Replaced),
+    }
+}
+
+/// A link, or a file in place of a directory, was put there after the library was mapped.
+fn not_opened(error: Errno) -> Refusal {
+    match error {
+        Errno::LOOP | Errno::NOTDIR | Errno::NOENT => Refusal::Replaced,
+        error => Refusal::Open(error.into()),
     }
 }
 
@@ -286,16 +318,18 @@ fn file_system<'a>(mounts: &'a str, device: &str) -> Option<&'a str> {
 }
 
 fn open(path: &Path) -> Result<File, Refusal> {
-    // A file whose open blocks is not a library.
-    let file = OpenOptions::new()
-        .read(true)
-        .custom_flags(libc::O_NONBLOCK | libc::O_NOCTTY)
-        .open(path)
-        .map_err(Refusal::Open)?;
-    if !file.metadata().map_err(Refusal::Open)?.is_file() {
-        return Err(Refusal::NoFile);
+    let flags = OFlags::RDONLY | OFlags::CLOEXEC | UNBLOCKED;
+    let file = openat(CWD, path, flags, Mode::empty());
+    regular(File::from(
+        file.map_err(|error| Refusal::Open(error.into()))?,
+    ))
+}
+
+fn regular(file: File) -> Result<File, Refusal> {
+    match file.metadata().map_err(Refusal::Open)?.is_file() {
+        true => Ok(file),
+        false => Err(Refusal::NoFile),
     }
-    Ok(file)
 }
 
 #[cfg(test)]
@@ -346,5 +380,34 @@ mod tests {
         let denied = io::Error::from(io::ErrorKind::PermissionDenied);
         let opened = open_by_path(denied, own, &mapped(inode + 1));
         assert!(matches!(opened, Err(Refusal::Replaced)));
+    }
+
+    #[test]
+    fn a_link_on_the_way_to_a_library_is_not_followed() {
+        let directory = tempfile::tempdir().unwrap();
+        let elsewhere = tempfile::tempdir().unwrap();
+        let name = "libtracetools.so";
+        fs::write(elsewhere.path().join(name), "of the host").unwrap();
+        let inode = fs::metadata(elsewhere.path().join(name)).unwrap().ino();
+        let (way, end) = (directory.path().join("lib"), directory.path().join("end"));
+        std::os::unix::fs::symlink(elsewhere.path(), &way).unwrap();
+        std::os::unix::fs::symlink(elsewhere.path().join(name), &end).unwrap();
+        for path in [
+            way.join(name),
+            end,
+            directory.path().join("gone").join(name),
+        ] {
+            let mapped = Mapped {
+                id: LibraryId {
+                    device: String::new(),
+                    inode,
+                },
+                path,
+                range: String::new(),
+            };
+            let denied = io::Error::from(io::ErrorKind::PermissionDenied);
+            let opened = open_by_path(denied, std::process::id(), &mapped);
+            assert!(matches!(opened, Err(Refusal::Replaced)), "{opened:?}");
+        }
     }
 }

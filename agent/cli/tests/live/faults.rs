@@ -9,6 +9,7 @@ mod clients;
 mod descriptors;
 mod disk;
 mod everything;
+mod identities;
 mod killed;
 mod log;
 mod memory;

@@ -203,7 +203,7 @@ fn shared_memory_that_never_answers_is_named_and_delays_neither_the_rest_nor_the
 
 /// Writes a program that starts `rp` as a user and group with these capabilities alone. The user may
 /// be unable to read the build directory, so the program starts a copy.
-fn start_as(user: u32, capabilities: &str, directory: &TempDir) -> Result<PathBuf> {
+pub fn start_as(user: u32, capabilities: &str, directory: &TempDir) -> Result<PathBuf> {
     let file = |name: &str| directory.path().join(name);
     std::fs::copy(env!("CARGO_BIN_EXE_rp"), file("rp"))?;
     let script = format!(
