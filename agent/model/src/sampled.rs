@@ -20,7 +20,8 @@ const ARRIVAL_TIMEOUT: Duration = Duration::from_millis(200);
 /// Probability that a silence is claimed while messages are sent.
 const FALSE_SILENCE: f64 = 1e-6;
 /// Messages that are presumed before the first one is seen, and the share of them that polling
-/// missed: it misses nine of ten large ones on a busy machine.
+/// missed: it misses nine of ten large ones on a busy machine. The same is presumed of messages
+/// after a missed one: what hides a message, such as a large one sent with it, hides the next ones.
 const PRESUMED: f64 = 2.0;
 const PRESUMED_MISSED: f64 = 0.9;
 /// Share of the newest interval in the mean one.
@@ -38,6 +39,8 @@ pub struct Sampled {
     span: u64,
     seen: u64,
     uncertain: u64,
+    /// Number of times that one or more unseen messages preceded a seen one.
+    holes: u64,
     /// Mean time between messages of late, in seconds.
     interval: Option<f64>,
     /// Messages known from HEARTBEATs and ACKNACKs whose size is not known yet.
@@ -99,6 +102,7 @@ impl Sampled {
             span: 0,
             seen: 0,
             uncertain: 0,
+            holes: 0,
             interval: None,
             unmeasured: 0,
             sighted: u128::MAX,
@@ -234,9 +238,13 @@ impl Sampled {
             return Duration::ZERO;
         }
         let interval = self.interval.unwrap_or(slowest.as_secs_f64());
-        let unseen = self.span.saturating_sub(self.seen) as f64;
-        let missed = (unseen + PRESUMED * PRESUMED_MISSED) / (self.span as f64 + PRESUMED);
-        let messages = FALSE_SILENCE.ln() / missed.ln();
+        let unseen = self.span.saturating_sub(self.seen);
+        let share = |missed: u64, of: u64| {
+            (missed as f64 + PRESUMED * PRESUMED_MISSED) / (of as f64 + PRESUMED)
+        };
+        let missed = share(unseen, self.span);
+        let missed_again = share(unseen.saturating_sub(self.holes), unseen);
+        let messages = 1.0 + (FALSE_SILENCE.ln() - missed.ln()) / missed_again.ln();
         Duration::try_from_secs_f64(messages * interval).unwrap_or(Duration::MAX)
     }
 
@@ -310,6 +318,7 @@ impl Sampled {
         let samples = self.advance(end, true, now, sequence);
         let samples = self.confirm(&run, samples);
         self.span += samples;
+        self.holes += u64::from(samples.saturating_add(self.unmeasured) > 1);
         let below = sequence.next().steps_since(number.next());
         let finished = self.sight(number, seen);
         let mut update = SampledUpdate {

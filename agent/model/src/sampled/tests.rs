@@ -328,3 +328,32 @@ fn runs(runs: &[(u64, u64)]) -> Vec<(SequenceNumber, SequenceNumber)> {
     let numbered = |(first, last): &(u64, u64)| (SequenceNumber(*first), SequenceNumber(*last));
     runs.iter().map(numbered).collect()
 }
+
+/// Messages in a row that polling may have missed after these numbers were seen.
+fn possibly_missed(seen: impl Iterator<Item = u64>) -> u64 {
+    let mut view = View::new();
+    seen.for_each(|number| drop(view.see(number)));
+    view.sampled
+        .seeming_silence(Duration::from_secs(1))
+        .as_secs()
+}
+
+#[test]
+fn messages_that_hide_one_after_the_other_explain_a_longer_silence() {
+    assert_eq!(possibly_missed(std::iter::empty()), 131);
+    assert!((80..100).contains(&possibly_missed(1..=100)));
+    // Every other one, which never misses two in a row, and half of them at random.
+    assert!((4..8).contains(&possibly_missed((1..=100).step_by(2))));
+    let at_random = (1..=400_u64).filter(|number| (number * number).count_ones() % 2 == 0);
+    assert!((15..30).contains(&possibly_missed(at_random)));
+    // As many are missed, all in one row.
+    assert!(possibly_missed((1..=50).chain(100..=101)) > 400);
+    let mut view = View::new();
+    view.see(1);
+    view.sampled.end();
+    assert!(
+        view.sampled
+            .seeming_silence(Duration::from_secs(1))
+            .is_zero()
+    );
+}
