@@ -29,8 +29,6 @@ use crate::watch::Expectations;
 const BAD: u8 = 2;
 /// Good evaluations in a row until it recovers.
 const GOOD: u8 = 3;
-/// Longest time in which polling sees no message of a topic on a busy machine. Real Fast DDS: 0.4 s.
-const POLLING_HOLE: Duration = Duration::from_secs(1);
 /// Seconds from a topic's first publisher until the numbers of its endpoints are evaluated.
 pub const GRACE: u64 = 10;
 const NAMES: [&str; 7] = [
@@ -114,7 +112,7 @@ impl Evidence<'_> {
         let interval = Duration::try_from_secs_f64(1.0 / rate).unwrap_or(Duration::MAX);
         let seeming = (self.seeming_silence)(interval);
         let last = self.last_message.unwrap_or_default().max(self.observed);
-        if seeming.is_zero() || self.now - last > seeming.max(POLLING_HOLE) {
+        if seeming.is_zero() || self.now - last > seeming {
             return 0.0;
         }
         let end = Timestamp(self.now.whole_seconds().saturating_mul(SECOND));
@@ -479,7 +477,7 @@ mod tests {
             min_rate_hz: Some(40.0),
             ..Expectations::default()
         });
-        bench.seeming_silence = Duration::from_millis(200);
+        bench.seeming_silence = Duration::from_secs(1);
         bench.unseen = Duration::from_millis(400);
         // 50 Hz, the last 0.4 s of each second unseen.
         let states = [(); 4].map(|()| bench.second(rate(30)));

@@ -122,6 +122,14 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     );
     println!("{}", recorder.errors());
 
+    let has_network = !matches!(
+        middleware,
+        Middleware::FastSampled | Middleware::FastExact(_)
+    );
+    if has_network {
+        delivers_what_was_received(&agent, &published)?;
+    }
+
     let is_looked_at = middleware == Middleware::FastSampled;
     let unknown_of = bag_holds_or_names_each_message(&bag, &published, &page, is_looked_at)?;
     for (topic, echo) in &echoes {
@@ -136,6 +144,21 @@ fn holds_what_was_published(middleware: Middleware) -> Result<()> {
     let received = robot.rate("subscribe", "/imu")?;
     let expected = received.min(250.0) - 5.0..255.0;
     ensure!(expected.contains(last), "{rates:?}, received {received}");
+    Ok(())
+}
+
+/// Compares the deliveries at sockets with the log of the only subscriber, which has all messages.
+/// The last ones count when the agent has read their records.
+fn delivers_what_was_received(agent: &Agent<'_>, received: &Numbers) -> Result<()> {
+    let agrees = |page: &Scrape| {
+        received.iter().all(|(topic, numbers)| {
+            let sum = |name| page.sum(name, &[("topic", topic)]);
+            sum("ros2_topic_delivered_messages_total") == numbers.len() as f64
+                && sum("ros2_topic_delivery_lost_messages_total") == 0.0
+                && sum("ros2_topic_delivery_pending_messages") == 0.0
+        })
+    };
+    agent.scrape_until("deliveries as the subscriber logs", agrees)?;
     Ok(())
 }
 

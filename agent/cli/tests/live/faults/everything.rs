@@ -24,6 +24,8 @@ use ros2probe_testing::harness::peer::{Peer, Role, Stack, Stream};
 use ros2probe_testing::harness::soak::{dropped, long, outcome};
 use ros2probe_testing::harness::usage::Usage;
 
+/// Variable with another length of the attack, in seconds.
+const SECONDS: &str = "ROS2PROBE_ATTACK_SECONDS";
 const TOKEN: &str = "0123456789abcdef0123456789abcdef";
 /// A scraper waits for 10 s unless configured otherwise; an unoptimized agent takes several times the
 /// CPU of the shipped one.
@@ -47,7 +49,10 @@ fn everything_at_once_at_the_sockets_stays_within_the_unit() -> Result<()> {
 }
 
 fn everything(place: &str, capture: impl Fn(&Link) -> String) -> Result<()> {
-    let span = Duration::from_secs(if long().is_some() { 120 } else { 10 });
+    let seconds = std::env::var(SECONDS).ok();
+    let seconds = seconds.map(|text| text.parse()).transpose()?;
+    let usual = if long().is_some() { 120 } else { 10 };
+    let span = Duration::from_secs(seconds.unwrap_or(usual));
     let allowance = Allowance::of_the_unit()?;
     let group = Confined::to(&allowance)?;
     let link = Link::new()?;
