@@ -173,6 +173,7 @@ fn the_book_s_tables_are_those_of_the_sources() {
         tables("limits-model.md", false),
         tables("limits-tables.md", true),
         declared("limits-capture.md", ros2probe_capture::tables::ALL),
+        declared("limits-agent.md", ros2probe_daemon::tables::ALL),
     ] {
         let path = docs.join(page);
         let text = std::fs::read_to_string(&path).unwrap();

@@ -2,6 +2,7 @@
 
 use super::*;
 use ros2probe_capture::tables as capture;
+use ros2probe_daemon::tables as daemon;
 use ros2probe_model::bounded::Table;
 use ros2probe_model::tables as model;
 
@@ -92,7 +93,8 @@ fn every_cap_names_the_test_that_drives_it_over() {
         |all: &'static [Table], path: &'static str| all.iter().map(move |table| (table.name, path));
     let rows = rows
         .chain(declared(model::ALL, "agent/model/src/tables.rs"))
-        .chain(declared(capture::ALL, "agent/capture/src/tables.rs"));
+        .chain(declared(capture::ALL, "agent/capture/src/tables.rs"))
+        .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"));
     let rows: BTreeSet<_> = rows.collect();
     let fixed = driven::fixed();
     let named: Vec<_> = fixed
