@@ -6,18 +6,13 @@
 
 use std::collections::{HashMap, VecDeque};
 
+use ros2probe_model::bounded::{Bounded, Sum};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::record::{Body, Record, flag};
 
 use super::reassembly::Reassembled;
-use crate::size::Size;
+use crate::tables::{AheadBytes, AheadDatagrams, AheadRecords};
 
-/// Most waiting datagrams; the oldest makes room for another.
-const DATAGRAMS: usize = 1024;
-/// Most records held per datagram. A UDP payload has room for at most 2,047 empty submessages.
-const RECORDS_PER_DATAGRAM: usize = 2048;
-/// Most bytes of all datagrams together, records and rests.
-const BYTES: usize = 4 << 20;
 /// Linux gives up a fragmented datagram after 30 seconds (`ipfrag_time`).
 const LIFETIME_NANOSECONDS: i64 = 30_000_000_000;
 
@@ -34,8 +29,8 @@ pub enum Ready {
 #[derive(Debug, Default)]
 pub struct Ahead {
     waiting: HashMap<Token, Waiting>,
-    oldest: VecDeque<(Timestamp, Token)>,
-    bytes: usize,
+    oldest: Bounded<AheadDatagrams, VecDeque<(Timestamp, Token)>>,
+    bytes: Sum<AheadBytes>,
     given_up: u64,
 }
 
@@ -44,7 +39,7 @@ type Token = (u32, u32);
 
 #[derive(Debug, Default)]
 struct Waiting {
-    records: Vec<Record>,
+    records: Bounded<AheadRecords, Vec<Record>>,
     handed_over: bool,
     rest: Option<Reassembled>,
     /// Time of the frame that completed it.
@@ -52,24 +47,6 @@ struct Waiting {
 }
 
 impl Ahead {
-    /// Returns entries, or bytes, and cap of every table.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 3] {
-        // A new table does not compile until it is listed here.
-        let Self {
-            waiting,
-            oldest,
-            bytes: _,
-            given_up: _,
-        } = self;
-        let bytes = waiting.values().map(Waiting::bytes).sum();
-        [
-            Size::new("ahead.waiting", waiting.len(), DATAGRAMS),
-            Size::new("ahead.oldest", oldest.len(), DATAGRAMS),
-            Size::new("ahead.bytes", bytes, BYTES),
-        ]
-    }
-
     /// Accepts a record of source `namespace`. The caller passes handovers to the reassembly; here
     /// they only announce a rest.
     pub fn record(&mut self, namespace: u32, record: Record, ready: impl FnMut(Ready)) {
@@ -89,8 +66,9 @@ impl Ahead {
             match record.body() {
                 Body::Handover => waiting.handed_over = true,
                 Body::Complete => {}
-                _ if waiting.records.len() < RECORDS_PER_DATAGRAM => waiting.records.push(record),
-                _ => {}
+                _ => {
+                    waiting.records.push(record);
+                }
             }
             if record.flags & flag::AHEAD == 0 {
                 waiting.complete = Some(record.time);
@@ -114,11 +92,10 @@ impl Ahead {
 
     /// Discards datagrams that can no longer become complete.
     pub fn advance(&mut self, now: Timestamp) {
-        while let Some((born, token)) = self.oldest.front().copied()
-            && now.nanoseconds_since(born) > LIFETIME_NANOSECONDS
-        {
-            self.oldest.pop_front();
-            self.given_up += u64::from(self.remove(token).is_some());
+        let is_late =
+            |(born, _): &mut (Timestamp, _)| now.nanoseconds_since(*born) > LIFETIME_NANOSECONDS;
+        while let Some(oldest) = self.oldest.pop_front_if(is_late) {
+            self.give_up(Some(oldest));
         }
     }
 
@@ -131,29 +108,29 @@ impl Ahead {
     /// Changes the waiting datagram, making room for it if needed.
     fn change(&mut self, token: Token, at: Timestamp, change: impl FnOnce(&mut Waiting)) {
         if !self.waiting.contains_key(&token) {
-            if self.oldest.len() >= DATAGRAMS {
-                self.give_up_oldest();
-            }
-            self.oldest.push_back((at, token));
+            let oldest = self.oldest.push_back((at, token));
+            self.give_up(oldest);
         }
         let waiting = self.waiting.entry(token).or_default();
         let before = waiting.bytes();
         change(waiting);
-        self.bytes = self.bytes + waiting.bytes() - before;
-        while self.bytes > BYTES && !self.oldest.is_empty() {
-            self.give_up_oldest();
+        self.bytes.sub(before);
+        self.bytes.add(waiting.bytes());
+        while self.bytes.is_exceeded() && !self.oldest.is_empty() {
+            let oldest = self.oldest.pop_front();
+            self.give_up(oldest);
         }
     }
 
-    fn give_up_oldest(&mut self) {
-        if let Some((_, oldest)) = self.oldest.pop_front() {
+    fn give_up(&mut self, oldest: Option<(Timestamp, Token)>) {
+        if let Some((_, oldest)) = oldest {
             self.given_up += u64::from(self.remove(oldest).is_some());
         }
     }
 
     fn remove(&mut self, token: Token) -> Option<Waiting> {
         let waiting = self.waiting.remove(&token)?;
-        self.bytes -= waiting.bytes();
+        self.bytes.sub(waiting.bytes());
         Some(waiting)
     }
 
@@ -201,6 +178,7 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     fn record(datagram: u32, kind: u8, flags: u16, time: u64) -> Record {
         Record {
@@ -261,7 +239,8 @@ mod tests {
         for token in 1..10_000 {
             taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, 1));
         }
-        assert!(ahead.waiting.len() <= DATAGRAMS && ahead.oldest.len() <= DATAGRAMS);
+        assert_eq!(ahead.waiting.len(), AheadDatagrams::CAP);
+        assert_driven::<AheadDatagrams>();
     }
 
     #[test]
@@ -272,9 +251,20 @@ mod tests {
                 taken(&mut ahead, record(token, kind::DATA, flag::AHEAD, time));
             }
         }
-        let [waiting, _, bytes] = ahead.sizes();
-        assert!(bytes.entries <= bytes.cap, "{bytes:?}");
-        assert!(bytes.entries * 10 >= bytes.cap * 9, "{bytes:?}");
-        assert_eq!(ahead.given_up(), 999 - waiting.entries as u64);
+        let held: usize = ahead.waiting.values().map(Waiting::bytes).sum();
+        assert_eq!(ahead.bytes.used(), held);
+        assert_driven::<AheadBytes>();
+        assert_eq!(ahead.given_up(), 999 - ahead.waiting.len() as u64);
+    }
+
+    #[test]
+    fn a_datagram_of_too_many_records_keeps_the_first_ones() {
+        let mut ahead = Ahead::default();
+        for time in 0..3000 {
+            taken(&mut ahead, record(1, kind::DATA, flag::AHEAD, time));
+        }
+        assert_driven::<AheadRecords>();
+        let all = taken(&mut ahead, record(1, kind::COMPLETE, 0, 9));
+        assert_eq!(all.len(), AheadRecords::CAP);
     }
 }

@@ -17,6 +17,8 @@ use super::piece_assembler::PieceAssembler;
 use super::reorder_buffer::{Next, ReorderBuffer, Segment};
 use super::system::Clocks;
 use super::zenoh::{Chunk, Streams};
+use crate::tables::FreshDatagrams;
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 
@@ -26,17 +28,11 @@ pub const SETTLE_NANOSECONDS: u64 = 50_000_000;
 const STALLED_NANOSECONDS: u64 = 30_000_000;
 /// Datagrams younger than this wait for older records that may still be in the ring.
 const FRESH_NANOSECONDS: u64 = 2_000_000;
-/// Most waiting datagrams: 4 MB.
-const MAX_FRESH: usize = 64;
-/// Most records read per round: several rings of the default size.
-const RECORDS_PER_ROUND: usize = 32_768;
 /// Most pieces read per round.
 const PIECES_PER_ROUND: usize = 32_768;
 /// The ring is emptied again after this many records passed to the model: a burst fills it while
 /// earlier records are counted.
 const RECORDS_BETWEEN: usize = 1024;
-/// Most waiting records, 18 MB; further ones stay in the ring, and are lost if it is full.
-pub const MAX_WAITING: usize = 131_072;
 
 /// The maps of one filter and their waiting contents.
 pub struct FilterReader {
@@ -44,12 +40,10 @@ pub struct FilterReader {
     order: ReorderBuffer,
     pieces: PieceAssembler,
     /// Captured datagrams that wait for older records.
-    fresh: VecDeque<(Piece, Vec<u8>)>,
+    fresh: Bounded<FreshDatagrams, VecDeque<(Piece, Vec<u8>)>>,
     streams: Streams,
     datagrams: u64,
     copied_bytes: u64,
-    /// Time of the latest record, in the kernel's clock.
-    recorded: u64,
 }
 
 impl FilterReader {
@@ -60,11 +54,10 @@ impl FilterReader {
             filter,
             order: ReorderBuffer::default(),
             pieces: PieceAssembler::default(),
-            fresh: VecDeque::new(),
+            fresh: Bounded::default(),
             streams: Streams::new(zenoh_ports.to_vec()),
             datagrams: 0,
             copied_bytes: 0,
-            recorded: 0,
         }
     }
 
@@ -158,21 +151,10 @@ impl FilterReader {
         fresh + self.pieces.bytes()
     }
 
-    /// Reads records, at most one round: a flood may refill the ring as fast as it is emptied.
-    /// Returns the time up to which all records were read, `u64::MAX` if none is left.
+    /// Reads one round of records; returns the time up to which all were read.
     fn take_records(&mut self) -> u64 {
-        for _ in 0..RECORDS_PER_ROUND {
-            if self.order.waiting() >= MAX_WAITING {
-                return self.recorded;
-            }
-            let Some(record) = self.filter.next_record() else {
-                return u64::MAX;
-            };
-            self.copied_bytes += size_of::<Record>() as u64;
-            self.recorded = record.time;
-            self.order.kernel(record);
-        }
-        self.recorded
+        self.order
+            .take_records(&mut self.filter, &mut self.copied_bytes)
     }
 
     /// Takes runs of fragments that have not grown since `before` in the kernel's clock.
@@ -194,7 +176,7 @@ impl FilterReader {
         let mut newest = 0;
         for _ in 0..PIECES_PER_ROUND {
             // Every remaining datagram is younger.
-            if self.fresh.len() >= MAX_FRESH {
+            if self.fresh.is_full() {
                 return u64::MAX;
             }
             let Some(captured) = self.filter.next_piece() else {
@@ -218,7 +200,8 @@ impl FilterReader {
                     });
                     continue;
                 }
-                if let Some(oldest) = self.order.segment(piece.time, &chunk) {
+                self.order.segment(piece.time, &chunk);
+                while let Some(oldest) = self.order.excess_segment() {
                     read_segment(&mut self.streams, &oldest, observer);
                 }
                 continue;

@@ -9,7 +9,9 @@ use std::io::{self, Read, Write};
 use std::mem::size_of_val;
 use std::os::fd::{AsFd, BorrowedFd, FromRawFd, OwnedFd};
 
+use crate::tables::KnownInterfaces;
 use globset::{Glob, GlobSet, GlobSetBuilder};
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::{Cursor, Endianness, WireError};
 
 /// Longest message of the kernel for one interface.
@@ -59,11 +61,13 @@ pub enum InterfacesError {
     Restless,
 }
 
+type Known = Bounded<KnownInterfaces, BTreeMap<u32, Interface>>;
+
 /// The interfaces of the namespace in which the socket was opened.
 #[derive(Debug)]
 pub struct Interfaces {
     socket: File,
-    known: BTreeMap<u32, Interface>,
+    known: Known,
     sequence: u32,
     buffer: Vec<u8>,
 }
@@ -86,7 +90,7 @@ impl Interfaces {
         let socket = File::from(listen()?);
         let mut interfaces = Self {
             socket,
-            known: BTreeMap::new(),
+            known: Known::default(),
             sequence: 0,
             buffer: vec![0; BUFFER],
         };
@@ -183,10 +187,13 @@ impl Interfaces {
                     None => {}
                     Some(0) if interrupted => continue 'attempt,
                     Some(0) => {
-                        let gone = self
-                            .known
-                            .extract_if(.., |index, _| !listed.contains(index));
-                        changes.extend(gone.map(|(_, interface)| Change::Gone(interface)));
+                        self.known.retain(|index, interface| {
+                            let is_listed = listed.contains(index);
+                            if !is_listed {
+                                changes.push(Change::Gone(interface.clone()));
+                            }
+                            is_listed
+                        });
                         return Ok(changes);
                     }
                     Some(error) => {
@@ -286,11 +293,14 @@ const NLM_F_REQUEST: u16 = 1;
 const NLM_F_DUMP: u16 = 0x300;
 const _: () = assert!(libc::NLM_F_REQUEST == 1 && libc::NLM_F_DUMP == 0x300);
 
-fn apply(known: &mut BTreeMap<u32, Interface>, message: Message) -> Option<Change> {
+fn apply(known: &mut Known, message: Message) -> Option<Change> {
     match message.body {
         Body::Present(interface) => {
-            let before = known.insert(interface.index, interface.clone());
-            (before.as_ref() != Some(&interface)).then_some(Change::Present(interface))
+            let is_known = known.get(&interface.index) == Some(&interface);
+            if !is_known {
+                known.insert(interface.index, interface.clone());
+            }
+            (!is_known).then_some(Change::Present(interface))
         }
         Body::Gone(index) => known.remove(&index).map(Change::Gone),
         Body::End(_) | Body::Other => None,
@@ -396,6 +406,7 @@ fn listen() -> Result<OwnedFd, InterfacesError> {
 mod tests {
     use super::*;
     use crate::netns::tests::{in_new_namespace, ip};
+    use crate::tables::tests::assert_driven;
 
     fn globs(list: &[&str]) -> Vec<String> {
         list.iter().map(|glob| (*glob).to_owned()).collect()
@@ -480,6 +491,26 @@ mod tests {
             );
             assert!(interfaces.iter().any(|interface| interface.name == "port"));
         });
+    }
+
+    #[test]
+    fn interfaces_beyond_the_cap_are_reported_and_not_kept() {
+        let mut known = Known::default();
+        for index in 1..=5_000 {
+            let interface = Interface {
+                index,
+                name: index.to_string(),
+                hardware: 1,
+                up: true,
+            };
+            let message = Message {
+                flags: 0,
+                sequence: 0,
+                body: Body::Present(interface.clone()),
+            };
+            assert_eq!(apply(&mut known, message), Some(Change::Present(interface)));
+        }
+        assert_driven::<KnownInterfaces>();
     }
 
     #[test]

@@ -7,18 +7,19 @@
 use std::borrow::Cow;
 use std::collections::VecDeque;
 
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::host::{PIECE_BYTES, Piece};
 
-/// Most incomplete datagrams, 4 MB. Only datagrams of programs that run at the same time are
-/// incomplete, and those whose rest is lost.
-const MAX_OPEN: usize = 64;
+use crate::tables::OpenPieces;
+
 /// A program writes all pieces within microseconds, unless it loses its CPU.
 const LIFETIME_NANOSECONDS: u64 = 1_000_000_000;
 
-/// Incomplete datagrams, the oldest first.
+/// Incomplete datagrams, the oldest first: those of programs that run at the same time, and those
+/// whose rest is lost.
 #[derive(Debug, Default)]
 pub struct PieceAssembler {
-    open: VecDeque<Open>,
+    open: Bounded<OpenPieces, VecDeque<Open>>,
     given_up: u64,
 }
 
@@ -52,13 +53,11 @@ impl PieceAssembler {
             if piece.len == piece.datagram_len {
                 return Some((*piece, Cow::Borrowed(bytes)));
             }
-            if self.open.len() >= MAX_OPEN {
-                self.give_up(Some(0));
-            }
-            self.open.push_back(Open {
+            let oldest = self.open.push_back(Open {
                 first: *piece,
                 bytes: bytes.to_vec(),
             });
+            self.given_up += u64::from(oldest.is_some());
             return None;
         }
         // The first piece was discarded or never arrived.
@@ -118,6 +117,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     fn piece(datagram: u32, offset: u32, len: u32, datagram_len: u32) -> Piece {
         Piece {
@@ -210,8 +210,8 @@ mod tests {
             let all = pieces(token, 65_507);
             assert!(wholes.piece(&all[0].0, &all[0].1).is_none());
         }
-        assert_eq!(wholes.open.len(), MAX_OPEN);
-        assert_eq!(wholes.given_up(), 1000 - MAX_OPEN as u64);
+        assert_driven::<OpenPieces>();
+        assert_eq!(wholes.given_up(), 1000 - wholes.open.len() as u64);
     }
 
     proptest! {
@@ -240,8 +240,7 @@ mod tests {
                     prop_assert_eq!(whole.len(), first.datagram_len as usize);
                     prop_assert_eq!(&*whole, &*content(first.datagram, 0, first.datagram_len));
                 }
-                prop_assert!(wholes.open.len() <= MAX_OPEN);
-                prop_assert!(wholes.bytes() <= MAX_OPEN * 65_535);
+                prop_assert!(wholes.bytes() <= OpenPieces::CAP * 65_535);
             }
         }
     }

@@ -11,15 +11,16 @@
 
 mod flow;
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 
+use ros2probe_model::bounded::{Bounded, Counted, Sum};
 use ros2probe_wire::frame::{Fragment, Packet};
 use ros2probe_wire::record::{Record, flag};
 use ros2probe_wire::{Cursor, Endianness, Timestamp};
 
 use flow::{Flow, Placed};
 
-use crate::size::Size;
+use crate::tables::{FinishedFlows, FlowBytes, Flows};
 
 const UDP_HEADER: u32 = 8;
 
@@ -43,9 +44,9 @@ impl Default for Limits {
     fn default() -> Self {
         Self {
             bytes: 4 << 20,
-            flows: 256,
+            flows: Flows::CAP,
             timeout: 30_000_000_000,
-            remembered: 1024,
+            remembered: FinishedFlows::CAP,
             remember: 1_000_000_000,
         }
     }
@@ -141,13 +142,13 @@ pub struct Counters {
 #[derive(Debug)]
 pub struct Reassembly {
     limits: Limits,
-    flows: HashMap<FlowKey, Flow>,
+    flows: Bounded<Counted<Flows>, HashMap<FlowKey, Flow>>,
     /// Flows by order of creation.
     order: BTreeMap<u64, FlowKey>,
     opened: u64,
-    bytes: usize,
-    finished: HashMap<FlowKey, Timestamp>,
-    finished_order: VecDeque<FlowKey>,
+    bytes: Sum<Counted<FlowBytes>>,
+    finished: HashSet<FlowKey>,
+    finished_order: Bounded<Counted<FinishedFlows>, VecDeque<(Timestamp, FlowKey)>>,
     counters: Counters,
 }
 
@@ -196,43 +197,14 @@ impl Reassembly {
     pub fn new(limits: Limits) -> Self {
         Self {
             limits,
-            flows: HashMap::new(),
+            flows: Bounded::capped(limits.flows),
             order: BTreeMap::new(),
             opened: 0,
-            bytes: 0,
-            finished: HashMap::new(),
-            finished_order: VecDeque::new(),
+            bytes: Sum::capped(limits.bytes),
+            finished: HashSet::new(),
+            finished_order: Bounded::capped(limits.remembered),
             counters: Counters::default(),
         }
-    }
-
-    /// Returns entries, or bytes, and cap of every table.
-    #[must_use]
-    pub fn sizes(&self) -> [Size; 5] {
-        // A new table does not compile until it is listed here.
-        let Self {
-            limits,
-            flows,
-            order,
-            opened: _,
-            bytes: _,
-            finished,
-            finished_order,
-            counters: _,
-        } = self;
-        let bytes = flows.values().map(Flow::held).sum();
-        let remembered = limits.remembered;
-        [
-            Size::new("reassembly.flows", flows.len(), limits.flows),
-            Size::new("reassembly.order", order.len(), limits.flows),
-            Size::new("reassembly.bytes", bytes, limits.bytes),
-            Size::new("reassembly.finished", finished.len(), remembered),
-            Size::new(
-                "reassembly.finished_order",
-                finished_order.len(),
-                remembered,
-            ),
-        ]
     }
 
     /// Accepts a fragment; returns the datagram if this fragment completes it.
@@ -243,7 +215,7 @@ impl Reassembly {
         fragment: &Fragment<'_>,
     ) -> Option<Reassembled> {
         self.advance(at);
-        if self.finished.contains_key(&key) {
+        if self.finished.contains(&key) {
             self.counters.duplicate += 1;
             return None;
         }
@@ -252,7 +224,8 @@ impl Reassembly {
         let placed = flow.place(at, fragment);
         let after = flow.memory();
         let handed_over = flow.handover.is_some();
-        self.bytes = (self.bytes + after).saturating_sub(before);
+        self.bytes.sub(before);
+        self.bytes.add(after);
         match placed {
             Placed::New => {}
             Placed::Nothing => self.counters.duplicate += 1,
@@ -266,7 +239,8 @@ impl Reassembly {
                     let before = flow.memory();
                     flow.place(at, fragment);
                     let after = flow.memory();
-                    self.bytes = (self.bytes + after).saturating_sub(before);
+                    self.bytes.sub(before);
+                    self.bytes.add(after);
                 }
             }
         }
@@ -282,7 +256,7 @@ impl Reassembly {
         record: &Record,
     ) -> Option<Reassembled> {
         self.advance(at);
-        if self.finished.contains_key(&key) {
+        if self.finished.contains(&key) {
             self.counters.duplicate += 1;
             return None;
         }
@@ -307,16 +281,10 @@ impl Reassembly {
             self.close(&key);
             self.counters.timed_out += 1;
         }
-        while let Some(key) = self.finished_order.front() {
-            let fresh = self
-                .finished
-                .get(key)
-                .is_some_and(|at| now.0.saturating_sub(at.0) <= self.limits.remember);
-            if fresh && self.finished_order.len() <= self.limits.remembered {
-                break;
-            }
-            self.finished.remove(key);
-            self.finished_order.pop_front();
+        let remember = self.limits.remember;
+        let is_old = |(at, _): &mut (Timestamp, _)| now.0.saturating_sub(at.0) > remember;
+        while let Some((_, key)) = self.finished_order.pop_front_if(is_old) {
+            self.finished.remove(&key);
         }
     }
 
@@ -329,7 +297,7 @@ impl Reassembly {
     /// Returns the bytes currently held.
     #[must_use]
     pub const fn bytes(&self) -> usize {
-        self.bytes
+        self.bytes.used()
     }
 
     /// Returns the number of unfinished datagrams.
@@ -345,14 +313,14 @@ impl Reassembly {
     /// Returns the flow of this key; creates it if needed, evicting the oldest one.
     fn open(&mut self, at: Timestamp, key: FlowKey) -> Option<&mut Flow> {
         if !self.flows.contains_key(&key) {
-            if self.flows.len() >= self.limits.flows
+            if self.flows.is_full()
                 && let Some(oldest) = self.oldest()
             {
                 self.close(&oldest);
                 self.counters.evicted += 1;
             }
             let flow = Flow::new(self.opened, at);
-            self.bytes += flow.memory();
+            self.bytes.add(flow.memory());
             self.order.insert(self.opened, key);
             self.opened += 1;
             self.flows.insert(key, flow);
@@ -363,7 +331,7 @@ impl Reassembly {
     fn close(&mut self, key: &FlowKey) -> Option<Flow> {
         let flow = self.flows.remove(key)?;
         self.order.remove(&flow.order);
-        self.bytes = self.bytes.saturating_sub(flow.memory());
+        self.bytes.sub(flow.memory());
         Some(flow)
     }
 
@@ -371,7 +339,7 @@ impl Reassembly {
     fn finish(&mut self, key: FlowKey) -> Option<Reassembled> {
         let complete = self.flows.get(&key)?.complete();
         if complete.is_none() {
-            while self.bytes > self.limits.bytes
+            while self.bytes.is_exceeded()
                 && let Some(oldest) = self.oldest()
             {
                 self.close(&oldest);
@@ -380,8 +348,10 @@ impl Reassembly {
         }
         let (from, to) = complete?;
         let mut flow = self.close(&key)?;
-        self.finished.insert(key, flow.last_seen);
-        self.finished_order.push_back(key);
+        self.finished.insert(key);
+        if let Some((_, oldest)) = self.finished_order.push_back((flow.last_seen, key)) {
+            self.finished.remove(&oldest);
+        }
         let transport = flow.take(from, to);
         let reassembled = match flow.handover {
             Some(record) => Some(handed_over(&flow, transport, &record)),

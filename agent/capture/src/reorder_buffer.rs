@@ -17,24 +17,24 @@
 
 use std::collections::{HashSet, VecDeque};
 
+use ros2probe_model::bounded::{self, Bounded, Sum};
 use ros2probe_model::input::Input;
 use ros2probe_model::observer::Observer;
 use ros2probe_wire::Record;
 use ros2probe_wire::record::{Body, flag};
 use ros2probe_wire::walk::Envelope;
 
+use super::filter::Filter;
 use super::system::Clocks;
 use super::zenoh::Chunk;
+use crate::tables::{
+    PolledRecords, SegmentBytes, UndeliveredDatagrams, WaitingRecords, WalkedRecords,
+};
 
-/// Most waiting records of captured datagrams: some 2.5 MB. A malicious datagram has two thousand
-/// records.
-const MAX_WALKED: usize = 16_384;
-/// Most waiting records of polled messages: some 2 MB, as many as the polling thread keeps.
-const MAX_POLLED: usize = 16_384;
-/// Most bytes of waiting segments of Zenoh.
-const MAX_SEGMENT_BYTES: usize = 8 << 20;
 /// Capacity for records that is kept while none wait; memory beyond it is freed after a burst.
 const KEPT: usize = 512;
+/// Most records read per round: several rings of the default size.
+const RECORDS_PER_ROUND: usize = 32_768;
 /// How much later than the report of its drop a captured datagram may be read.
 const LATE_NANOSECONDS: u64 = 1_000_000_000;
 
@@ -45,16 +45,18 @@ pub struct ReorderBuffer {
     kernel: VecDeque<Record>,
     /// Records with [`flag::SOCKET_FULL`], sorted by time in the kernel's clock.
     socket_full: VecDeque<Record>,
-    walked: VecDeque<Walked>,
+    walked: Bounded<WalkedRecords, VecDeque<Walked>>,
     /// Records of polled messages, with the time in the kernel's clock.
-    polled: VecDeque<(u64, Record)>,
+    polled: Bounded<PolledRecords, VecDeque<(u64, Record)>>,
     segments: VecDeque<Segment>,
-    segment_bytes: usize,
+    segment_bytes: Sum<SegmentBytes>,
     /// Tokens of captured datagrams that were not delivered, with the time in the kernel's clock.
-    undelivered: VecDeque<(u64, u32)>,
+    undelivered: Bounded<UndeliveredDatagrams, VecDeque<(u64, u32)>>,
     undelivered_tokens: HashSet<u32>,
     /// Records of the datagram being walked, otherwise empty.
     found: Vec<Record>,
+    /// Time of the latest record of the kernel's ring, in the kernel's clock.
+    recorded: u64,
 }
 
 /// A record of a captured datagram.
@@ -106,12 +108,35 @@ impl Segment {
 }
 
 impl ReorderBuffer {
+    /// Takes records from the kernel's ring, at most one round: a flood may refill the ring as fast
+    /// as it is emptied. Records without room stay in the ring. Returns the time up to which all
+    /// records were read, `u64::MAX` if none is left. Adds the bytes read to `copied_bytes`.
+    pub fn take_records(&mut self, filter: &mut Filter, copied_bytes: &mut u64) -> u64 {
+        for _ in 0..RECORDS_PER_ROUND {
+            if self.is_full() {
+                return self.recorded;
+            }
+            let Some(record) = filter.next_record() else {
+                return u64::MAX;
+            };
+            *copied_bytes += size_of::<Record>() as u64;
+            self.recorded = record.time;
+            self.kernel(record);
+        }
+        self.recorded
+    }
+
     /// Accepts a record of the kernel's ring, with its time in the kernel's clock.
     pub fn kernel(&mut self, record: Record) {
         if matches!(record.body(), Body::Undelivered) {
-            self.undelivered.push_back((record.time, record.datagram));
             self.undelivered_tokens.insert(record.datagram);
-        } else if record.flags & flag::SOCKET_FULL != 0 {
+            let report = (record.time, record.datagram);
+            if let Some((_, oldest)) = self.undelivered.push_back(report) {
+                self.undelivered_tokens.remove(&oldest);
+            }
+            return;
+        }
+        if record.flags & flag::SOCKET_FULL != 0 {
             // Records of several CPUs may be out of order by microseconds.
             let place = self
                 .socket_full
@@ -120,54 +145,50 @@ impl ReorderBuffer {
         } else {
             self.kernel.push_back(record);
         }
+        bounded::note::<WaitingRecords>(self.waiting());
     }
 
     /// Accepts a record of a captured datagram, with its time in the wall clock and the same time
     /// in the kernel's clock as `at`; returns it if too many wait.
     #[must_use]
     pub fn walked(&mut self, at: u64, record: Record) -> Option<Record> {
-        if self.walked.len() >= MAX_WALKED {
-            return Some(record);
-        }
-        self.walked.push_back(Walked {
+        let left = self.walked.push_back(Walked {
             at,
             record,
             no_room_said: false,
         });
-        None
+        left.map(|walked| walked.record)
     }
 
     /// Accepts a record of a polled message, with its time in the wall clock and the same time in
     /// the kernel's clock as `at`; returns it if too many wait.
     #[must_use]
     pub fn polled(&mut self, at: u64, record: Record) -> Option<Record> {
-        if self.polled.len() >= MAX_POLLED {
-            return Some(record);
-        }
-        self.polled.push_back((at, record));
-        None
+        let left = self.polled.push_back((at, record));
+        left.map(|(_, record)| record)
     }
 
     /// Accepts a segment of Zenoh, with its time in the wall clock and the same time in the kernel's
-    /// clock as `at`; returns the oldest one if too many bytes wait.
-    #[must_use]
-    pub fn segment(&mut self, at: u64, chunk: &Chunk<'_>) -> Option<Segment> {
+    /// clock as `at`. The caller then reads the segments of [`Self::excess_segment`].
+    pub fn segment(&mut self, at: u64, chunk: &Chunk<'_>) {
         let segment = Segment {
             at,
             chunk: chunk.without_bytes(),
             bytes: chunk.bytes.into(),
         };
-        self.segment_bytes += segment.size();
+        self.segment_bytes.add(segment.size());
         self.segments.push_back(segment);
-        if self.segment_bytes > MAX_SEGMENT_BYTES {
-            return self.take_segment();
-        }
-        None
+    }
+
+    /// Removes and returns the oldest segment if too many bytes wait.
+    pub fn excess_segment(&mut self) -> Option<Segment> {
+        let is_exceeded = self.segment_bytes.is_exceeded();
+        is_exceeded.then(|| self.take_segment()).flatten()
     }
 
     fn take_segment(&mut self) -> Option<Segment> {
         let segment = self.segments.pop_front()?;
-        self.segment_bytes = self.segment_bytes.saturating_sub(segment.size());
+        self.segment_bytes.sub(segment.size());
         Some(segment)
     }
 
@@ -228,9 +249,13 @@ impl ReorderBuffer {
     }
 
     /// Returns the number of waiting records of the kernel's ring.
-    #[must_use]
-    pub fn waiting(&self) -> usize {
+    fn waiting(&self) -> usize {
         self.kernel.len() + self.socket_full.len()
+    }
+
+    /// Returns whether there is no room for further records of the kernel's ring.
+    fn is_full(&self) -> bool {
+        self.waiting() >= WaitingRecords::CAP
     }
 
     /// Removes and returns the oldest record or segment, if it is not younger than `until` in the kernel's
@@ -299,10 +324,10 @@ impl ReorderBuffer {
             }
         }
         if self.walked.is_empty() && self.walked.capacity() > KEPT {
-            self.walked = VecDeque::new();
+            self.walked.take();
         }
         if self.polled.is_empty() && self.polled.capacity() > KEPT {
-            self.polled = VecDeque::new();
+            self.polled.take();
         }
         if self.segments.is_empty() && self.segments.capacity() > KEPT {
             self.segments = VecDeque::new();
@@ -325,6 +350,7 @@ mod tests {
     use ros2probe_wire::record::kind;
 
     use super::*;
+    use crate::tables::tests::assert_driven;
     use crate::zenoh::Before;
     use ros2probe_wire::time::MILLISECOND;
 
@@ -527,7 +553,8 @@ mod tests {
         let mut order = ReorderBuffer::default();
         for (number, milliseconds) in [(1, 10), (2, 30), (3, 110)] {
             let (at, chunk) = segment(number, milliseconds, b"four");
-            assert!(order.segment(at, &chunk).is_none());
+            order.segment(at, &chunk);
+            assert!(order.excess_segment().is_none());
         }
         order.kernel(of_the_kernel(9, 20));
         walked(&mut order, captured(10, 40));
@@ -557,10 +584,13 @@ mod tests {
         let mut early = Vec::new();
         for number in 0..1000 {
             let (at, chunk) = segment(number, 1, &bytes);
-            let passed = order.segment(at, &chunk);
-            early.extend(passed.map(|passed| passed.chunk().sequence_number));
-            assert!(order.segment_bytes <= MAX_SEGMENT_BYTES);
+            order.segment(at, &chunk);
+            while let Some(passed) = order.excess_segment() {
+                early.push(passed.chunk().sequence_number);
+            }
+            assert!(order.segment_bytes.used() <= SegmentBytes::CAP);
         }
+        assert_driven::<SegmentBytes>();
         let count = u32::try_from(early.len()).unwrap();
         assert!(
             count > 100 && early == Vec::from_iter(0..count),
@@ -568,7 +598,23 @@ mod tests {
         );
         let clocks = clocks(900);
         while order.next(&clocks, clocks.monotonic).is_some() {}
-        assert_eq!((order.segment_bytes, order.segments.capacity()), (0, 0));
+        assert_eq!(
+            (order.segment_bytes.used(), order.segments.capacity()),
+            (0, 0)
+        );
+    }
+
+    #[test]
+    fn large_segments_behind_small_ones_stay_within_the_bytes() {
+        let mut order = ReorderBuffer::default();
+        let large = vec![0; 60_000];
+        for number in 0..100_000 {
+            let bytes = if number < 50_000 { b"four" } else { &large[..] };
+            let (at, chunk) = segment(number, 1, bytes);
+            order.segment(at, &chunk);
+            while order.excess_segment().is_some() {}
+            assert!(order.segment_bytes.used() <= SegmentBytes::CAP);
+        }
     }
 
     #[test]
@@ -578,11 +624,39 @@ mod tests {
             let (at, record) = captured(*number, 1);
             order.walked(at, record).is_some()
         });
-        assert_eq!(refused.count(), 20_000 - MAX_WALKED);
+        assert_eq!(refused.count(), 20_000 - WalkedRecords::CAP);
+        assert_driven::<WalkedRecords>();
         let refused = (0..20_000).filter(|number| {
             let (at, record) = captured(*number, 1);
             order.polled(at, record).is_some()
         });
-        assert_eq!(refused.count(), 20_000 - MAX_POLLED);
+        assert_eq!(refused.count(), 20_000 - PolledRecords::CAP);
+        assert_driven::<PolledRecords>();
+    }
+
+    #[test]
+    fn the_oldest_reports_of_a_full_socket_buffer_make_room() {
+        let mut order = ReorderBuffer::default();
+        for datagram in 0..100_000 {
+            order.kernel(undelivered(datagram, 1));
+        }
+        assert_driven::<UndeliveredDatagrams>();
+        assert_eq!(order.undelivered_tokens.len(), UndeliveredDatagrams::CAP);
+        assert!(order.undelivered_tokens.contains(&99_999));
+    }
+
+    #[test]
+    fn no_more_records_of_the_kernel_are_taken_than_there_is_room_for() {
+        let mut order = ReorderBuffer::default();
+        let mut number = 0;
+        while !order.is_full() {
+            let record = match number % 2 {
+                0 => of_the_kernel(number, number),
+                _ => socket_full(number, number),
+            };
+            order.kernel(record);
+            number += 1;
+        }
+        assert_driven::<WaitingRecords>();
     }
 }

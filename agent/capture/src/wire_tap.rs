@@ -32,8 +32,6 @@ use ros2probe_model::zenoh::StreamId;
 pub const SETTLE_NANOSECONDS: u64 = 120_000_000;
 /// Fragments of one sample follow each other within microseconds; a longer pause ends the run.
 const STALLED_NANOSECONDS: u64 = 60_000_000;
-/// Most records read per round: several rings of the default size.
-const RECORDS_PER_ROUND: usize = 32_768;
 
 /// Why the interfaces of a namespace cannot be observed.
 #[derive(Debug, thiserror::Error)]
@@ -204,10 +202,11 @@ impl WireTap {
     ) -> Result<(), WireTapError> {
         self.follow_interfaces();
         self.take_frames(clocks, at_sockets, observer)?;
-        self.frames.take_records(&mut self.filter);
+        let recorded = self.frames.take_records(&mut self.filter);
         let stalled = clocks.monotonic.saturating_sub(STALLED_NANOSECONDS);
         self.frames.take_stalled(&mut self.filter, stalled);
         let settled = clocks.monotonic.saturating_sub(SETTLE_NANOSECONDS);
+        let settled = settled.min(recorded);
         self.frames.deliver(clocks, settled, at_sockets, observer);
         self.frames.advance(clocks, observer);
         Ok(())
@@ -392,16 +391,10 @@ struct FrameAssembly {
 }
 
 impl FrameAssembly {
-    /// Reads the kernel's record ring, at most one round: a flood may refill it as fast as it is
-    /// emptied. [`Self::deliver`] decides what is passed to the model.
-    fn take_records(&mut self, filter: &mut Filter) {
-        for _ in 0..RECORDS_PER_ROUND {
-            let Some(record) = filter.next_record() else {
-                return;
-            };
-            self.copied_bytes += size_of::<Record>() as u64;
-            self.order.kernel(record);
-        }
+    /// Reads one round of records; returns the time up to which all were read. [`Self::deliver`]
+    /// decides what is passed to the model.
+    fn take_records(&mut self, filter: &mut Filter) -> u64 {
+        self.order.take_records(filter, &mut self.copied_bytes)
     }
 
     /// Takes runs of fragments that have not grown since `before` in the filter's clock.
@@ -545,7 +538,8 @@ impl FrameAssembly {
                     return Ok(());
                 }
                 let chunk = Chunk::of_segment(segment, time, stream);
-                if let Some(oldest) = self.order.segment(at, &chunk) {
+                self.order.segment(at, &chunk);
+                while let Some(oldest) = self.order.excess_segment() {
                     self.read_segment(&oldest, at_sockets, observer);
                 }
             }

@@ -26,15 +26,15 @@ use ros2probe_wire::Timestamp;
 use ros2probe_wire::time::SECOND;
 use tokio::sync::Notify;
 
+use crate::tables::KeptEvents;
 use record::Occurrence;
 pub use record::{AgentEvent, Record, Value};
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::event::{Class, Taken};
 pub use self_monitor::{DropMonitor, SourceMonitor};
 pub use table::{Definition, EVENTS, Severity, markdown};
 pub use trigger::Trigger;
 
-/// Most events kept.
-const KEPT: usize = 4096;
 /// Most events of one name per second.
 const MOST: u32 = 200;
 
@@ -83,7 +83,7 @@ pub struct Batch {
 
 #[derive(Debug, Default)]
 struct Log {
-    kept: VecDeque<Arc<Entry>>,
+    kept: Bounded<KeptEvents, VecDeque<Arc<Entry>>>,
     /// Number of the latest event.
     last: u64,
     recorded: BTreeMap<&'static str, u64>,
@@ -335,9 +335,6 @@ impl Log {
             .recorded
             .entry(occurrence.definition().name)
             .or_default() += 1;
-        if self.kept.len() >= KEPT {
-            self.kept.pop_front();
-        }
         self.kept.push_back(Arc::new(Entry {
             number: self.last,
             at,

@@ -47,4 +47,5 @@ pub mod state;
 pub mod subscriptions;
 mod supervise;
 pub mod surface;
+pub mod tables;
 pub mod watches;

@@ -336,7 +336,8 @@ where
 }
 
 /// Notes a sum in the ledger that the caller computes and keeps within the cap.
-pub(crate) fn note<D: Declared>(sum: usize) {
+#[inline]
+pub fn note<D: Declared>(sum: usize) {
     ledger::filled(&D::TABLE, sum, D::TABLE.entries);
 }
 

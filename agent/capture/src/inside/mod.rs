@@ -18,6 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::inside::Counter;
 
 use self::process::ReadMemory;
@@ -30,6 +31,7 @@ use crate::memory_reader::MemoryReader;
 use crate::settings::InsideChoice;
 use crate::shm::directories::Scope;
 use crate::system::{Clocks, wait};
+use crate::tables::WaitingRounds;
 use crate::threads::{Progress, Spawn, Task};
 use crate::uprobe::attachments::{Attachments, LibraryFacts, Refusal, installed};
 use crate::uprobe::processes::{Processes, is_version_of};
@@ -39,8 +41,6 @@ use crate::uprobe::{self, UprobeError};
 const EVERY: Duration = Duration::from_secs(1);
 /// How long to collect announcements before they are read.
 const GATHER: Duration = Duration::from_millis(250);
-/// Most reports that wait for the model.
-const MAX_WAITING: usize = 4;
 /// Calls per second of all processes above which the programs are detached.
 pub const MAX_HITS: u64 = 200_000;
 /// Time for which they then stay detached.
@@ -71,7 +71,7 @@ pub struct Facts {
 }
 
 struct Shared {
-    rounds: Mutex<Vec<Round>>,
+    rounds: Mutex<Bounded<WaitingRounds, Vec<Round>>>,
     facts: Mutex<Facts>,
     progress: Arc<Progress>,
     stop: AtomicBool,
@@ -151,7 +151,8 @@ impl Inside {
     #[must_use]
     pub fn take(&self) -> Vec<Round> {
         let rounds = self.shared.rounds.lock();
-        std::mem::take(&mut *rounds.unwrap_or_else(PoisonError::into_inner))
+        let mut rounds = rounds.unwrap_or_else(PoisonError::into_inner);
+        rounds.take()
     }
 
     /// Returns the state of the source.
@@ -180,12 +181,13 @@ impl Shared {
     /// that is left out loses nothing.
     fn is_late(&self) -> bool {
         let rounds = self.rounds.lock();
-        rounds.unwrap_or_else(PoisonError::into_inner).len() >= MAX_WAITING
+        rounds.unwrap_or_else(PoisonError::into_inner).is_full()
     }
 
     fn put(&self, round: Round) {
         let rounds = self.rounds.lock();
-        rounds.unwrap_or_else(PoisonError::into_inner).push(round);
+        let mut rounds = rounds.unwrap_or_else(PoisonError::into_inner);
+        rounds.push(round);
     }
 
     fn facts(&self) -> MutexGuard<'_, Facts> {
@@ -368,4 +370,30 @@ fn counters(tables: &Tables) -> Vec<(&'static str, u64)> {
 /// Returns whether a file of this name is the library.
 fn is_library(name: &str) -> bool {
     is_version_of(LIBRARY, name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tables::tests::assert_driven;
+    use ros2probe_model::inside::report::Report;
+
+    #[test]
+    fn reports_beyond_those_that_may_wait_are_left_out() {
+        let shared = Shared {
+            rounds: Mutex::default(),
+            facts: Mutex::default(),
+            progress: Arc::default(),
+            stop: AtomicBool::new(false),
+        };
+        for _ in 0..10 {
+            shared.put(Round {
+                report: Report::default(),
+                publications: Vec::new(),
+                hits: 0,
+            });
+        }
+        assert!(shared.is_late());
+        assert_driven::<WaitingRounds>();
+    }
 }

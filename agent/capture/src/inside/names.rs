@@ -4,21 +4,20 @@ use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::inside::report::Trigger;
 use ros2probe_model::names::{NodeName, TopicName};
 use ros2probe_wire::inside::{Announcement, Figures, Handle, announced, kind};
 
-/// Most names and relations of one process.
-pub const MAX_NAMES: usize = 16_384;
+use crate::tables::InsideNames;
+
 /// Longest chain of relations.
 const DEPTH: usize = 8;
 
 /// Names that a process has announced.
 #[derive(Debug, Default)]
 pub struct Names {
-    known: HashMap<(Of, u64), Named>,
-    /// Names beyond the cap.
-    pub refused: u64,
+    known: Bounded<InsideNames, HashMap<(Of, u64), Named>>,
 }
 
 /// Kinds of objects: addresses of different kinds may be equal, because one contains the other.
@@ -85,14 +84,15 @@ impl Names {
         let (of, named) = match said.kind {
             announced::NODE => {
                 let name = NodeName::from(joined(&text(&said.second), &text(&said.text)));
-                self.insert(Of::Node, address, Named::Node(name.clone()));
+                self.known
+                    .insert((Of::Node, address), Named::Node(name.clone()));
                 return Some(name);
             }
             announced::PUBLISHER => (Of::Publisher, endpoint()),
             announced::SUBSCRIPTION => {
                 if said.value != 0 {
                     let is = Named::Is(Of::Subscription, address);
-                    self.insert(Of::SubscriptionHandle, said.value, is);
+                    self.known.insert((Of::SubscriptionHandle, said.value), is);
                 }
                 (Of::Subscription, endpoint())
             }
@@ -114,7 +114,8 @@ impl Names {
                 (Of::Buffer, Named::Capacity(capacity))
             }
             announced::BUFFER_OWNER => {
-                self.insert(Of::Owner, parent, Named::Is(Of::Owned, address));
+                self.known
+                    .insert((Of::Owner, parent), Named::Is(Of::Owned, address));
                 return None;
             }
             announced::BUFFER_SUBSCRIPTION => {
@@ -122,16 +123,8 @@ impl Names {
             }
             _ => return None,
         };
-        self.insert(of, address, named);
-        None
-    }
-
-    fn insert(&mut self, of: Of, address: u64, named: Named) {
-        if self.known.len() >= MAX_NAMES && !self.known.contains_key(&(of, address)) {
-            self.refused += 1;
-            return;
-        }
         self.known.insert((of, address), named);
+        None
     }
 
     /// Follows relations to an object that is no relation.
@@ -290,6 +283,7 @@ mod tests {
     use zerocopy::FromZeros as _;
 
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     fn said(kind: u32, address: u64, parent: u64, value: u64, text: &str) -> Announcement {
         let mut said = Announcement::new_zeroed();
@@ -324,21 +318,22 @@ mod tests {
     fn relations_in_a_circle_end() {
         let mut names = Names::default();
         names.announce(&said(announced::SUBSCRIPTION_OBJECT, 1, 2, 0, ""));
-        names.insert(
-            Of::SubscriptionHandle,
-            2,
+        names.known.insert(
+            (Of::SubscriptionHandle, 2),
             Named::Is(Of::SubscriptionObject, 1),
         );
         assert!(names.endpoint(Of::SubscriptionObject, 1).is_none());
     }
 
     #[test]
-    fn names_beyond_the_cap_are_counted() {
+    fn names_beyond_the_cap_are_left_out() {
         let mut names = Names::default();
-        for address in 0..=MAX_NAMES as u64 {
+        for address in 0..=InsideNames::CAP as u64 {
             names.announce(&said(announced::PUBLISHER, address, 0, 0, "/topic"));
         }
-        assert_eq!((names.known.len(), names.refused), (MAX_NAMES, 1));
+        assert_driven::<InsideNames>();
+        assert!(names.publisher(0).is_some());
+        assert!(names.publisher(InsideNames::CAP as u64).is_none());
     }
 
     #[test]

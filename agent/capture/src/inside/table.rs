@@ -4,6 +4,7 @@ use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::chain::causality::CausalPublication;
 use ros2probe_model::inside::report::{
     BufferReport, CallbackReport, Durations, ProcessReport, PublisherReport, Report,
@@ -20,6 +21,7 @@ use super::names::{Endpoint, Names, text};
 use super::process::{ReadMemory, Stat};
 use super::programs::Tables;
 use crate::system::Clocks;
+use crate::tables::{CausalHops, InsideBuffers, NewNodes, ReportedHandles, Transitions};
 
 /// Calls per second of one process above which its calls are no longer counted.
 pub const MAX_PROCESS_HITS: u64 = 50_000;
@@ -27,17 +29,14 @@ pub const MAX_PROCESS_HITS: u64 = 50_000;
 const JUDGED_OVER: Duration = Duration::from_millis(500);
 /// Rounds after which a process outside of the control group is inspected again.
 const RECHECK: u32 = 5;
-/// Most causal publications and transitions of one report.
-const MAX_HOPS: usize = 16_384;
-const MAX_TRANSITIONS: usize = 1_024;
 
 /// The observed processes.
 pub struct ProcessTable {
     read: ReadMemory,
     known: HashMap<u32, Observed>,
     has_callbacks: bool,
-    hops: Vec<inside::Hop>,
-    transitions: Vec<Transition>,
+    hops: Bounded<CausalHops, Vec<inside::Hop>>,
+    transitions: Bounded<Transitions, Vec<Transition>>,
     rounds: u32,
     /// Time since calls per second were last judged.
     unjudged: Duration,
@@ -60,14 +59,14 @@ struct Observed {
     stat: Option<Stat>,
     domain: DomainId,
     names: Names,
-    new_nodes: Vec<NodeName>,
+    new_nodes: Bounded<NewNodes, Vec<NodeName>>,
     /// Calls when they were last judged.
     hits: u64,
     is_suspended: bool,
     /// What was last reported of each handle.
-    reported: HashMap<Handle, Mark>,
+    reported: Bounded<ReportedHandles, HashMap<Handle, Mark>>,
     /// Publisher of each ring buffer.
-    buffers: HashMap<u64, Handle>,
+    buffers: Bounded<InsideBuffers, HashMap<u64, Handle>>,
 }
 
 /// Distinguishes two states of figures.
@@ -77,6 +76,26 @@ impl Observed {
     fn buffer(&self, address: u64) -> Option<Endpoint> {
         let publisher = self.buffers.get(&address).copied();
         self.names.buffer(address, publisher.unwrap_or_default())
+    }
+
+    /// Remembers the publisher of a ring buffer. A process may create and destroy buffers without
+    /// end.
+    fn note_buffer(&mut self, address: u64, publisher: Handle) {
+        if self.buffers.insert(address, publisher).is_some() {
+            self.forget_reported();
+        }
+    }
+
+    fn note_reported(&mut self, handle: Handle, mark: Mark) {
+        if self.reported.insert(handle, mark).is_some() {
+            self.forget_reported();
+        }
+    }
+
+    /// Lets the next round report all handles again.
+    fn forget_reported(&mut self) {
+        self.reported.clear();
+        self.buffers.clear();
     }
 }
 
@@ -88,8 +107,8 @@ impl ProcessTable {
             read,
             known: HashMap::new(),
             has_callbacks,
-            hops: Vec::new(),
-            transitions: Vec::new(),
+            hops: Bounded::default(),
+            transitions: Bounded::default(),
             rounds: 0,
             unjudged: Duration::ZERO,
         }
@@ -110,11 +129,17 @@ impl ProcessTable {
     /// Reads the announcements that wait.
     pub fn drain(&mut self, tables: &mut Tables, clocks: &Clocks) {
         while let Some(item) = tables.next_announcement(Item::read) {
-            match item {
-                Some(Item::Hop(hop)) if self.hops.len() < MAX_HOPS => self.hops.push(hop),
-                Some(Item::Announcement(said)) => self.announced(&said, clocks),
-                Some(Item::Hop(_)) | None => {}
+            self.note(item, clocks);
+        }
+    }
+
+    fn note(&mut self, item: Option<Item>, clocks: &Clocks) {
+        match item {
+            Some(Item::Hop(hop)) => {
+                self.hops.push(hop);
             }
+            Some(Item::Announcement(said)) => self.announced(&said, clocks),
+            None => {}
         }
     }
 
@@ -128,9 +153,7 @@ impl ProcessTable {
                 goal: text(&said.second).into(),
                 at: clocks.calendar(said.time),
             };
-            if self.transitions.len() < MAX_TRANSITIONS {
-                self.transitions.push(transition);
-            }
+            self.transitions.push(transition);
             return;
         }
         if let Some(node) = observed.names.announce(said) {
@@ -196,7 +219,7 @@ impl ProcessTable {
                 self.handle(report, *handle, figures, clocks);
             }
         }
-        let hops = std::mem::take(&mut self.hops);
+        let hops = self.hops.take();
         let hops = hops.iter().filter_map(|hop| self.hop(hop, clocks));
         let mut publications: Vec<_> = hops.collect();
         publications.sort_by_key(|publication| publication.published);
@@ -219,7 +242,7 @@ impl ProcessTable {
             at: clocks.now,
             has_callbacks: self.has_callbacks,
             processes: reports.into_values().collect(),
-            transitions: std::mem::take(&mut self.transitions),
+            transitions: self.transitions.take(),
         };
         Round {
             report,
@@ -248,7 +271,7 @@ impl ProcessTable {
             refused: process.refused,
             is_suspended: observed.is_suspended,
             has_ended,
-            nodes: std::mem::take(&mut observed.new_nodes),
+            nodes: observed.new_nodes.take(),
             ..ProcessReport::default()
         }
     }
@@ -305,6 +328,9 @@ impl ProcessTable {
         if observed.reported.get(&handle) == Some(&mark) {
             return;
         }
+        if handle.kind == kind::BUFFER {
+            observed.note_buffer(handle.address, figures.trigger);
+        }
         let names = &observed.names;
         let last = match figures.last {
             0 => Timestamp(0),
@@ -337,7 +363,6 @@ impl ProcessTable {
                 });
             }),
             kind::BUFFER => {
-                observed.buffers.insert(handle.address, figures.trigger);
                 let endpoint = names.buffer(handle.address, figures.trigger);
                 let topic = endpoint.as_ref().map(|of| TopicName::from(&*of.name));
                 report.buffers.push(BufferReport {
@@ -376,7 +401,7 @@ impl ProcessTable {
         };
         // The name of a handle may follow.
         if is_known.is_some() {
-            observed.reported.insert(handle, mark);
+            observed.note_reported(handle, mark);
         }
     }
 
@@ -431,4 +456,63 @@ fn durations(figures: &Figures, of: usize) -> Durations {
     let of = |values: &[u64; 2]| values.get(of).copied().unwrap_or_default();
     let minimum = of(&figures.minima).saturating_sub(1);
     Durations::new(counts, of(&figures.sums), minimum, of(&figures.maxima))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tables::tests::assert_driven;
+    use zerocopy::FromZeros as _;
+
+    fn table() -> ProcessTable {
+        ProcessTable::new(false, Box::new(|_, _, _| None))
+    }
+
+    fn announced(table: &mut ProcessTable, kind: u32, address: u64) {
+        let mut said = Announcement::new_zeroed();
+        (said.process, said.kind, said.address) = (u32::MAX, kind, address);
+        table.announced(&said, &Clocks::read());
+    }
+
+    #[test]
+    fn new_nodes_and_transitions_of_a_report_are_bounded() {
+        let mut table = table();
+        for address in 0..2000 {
+            announced(&mut table, announced::NODE, address);
+            announced(&mut table, announced::TRANSITION, address);
+        }
+        assert_driven::<NewNodes>();
+        assert_driven::<Transitions>();
+        assert_eq!(table.transitions.len(), Transitions::CAP);
+    }
+
+    #[test]
+    fn causal_publications_of_a_report_are_bounded() {
+        let (mut table, clocks) = (table(), Clocks::read());
+        for _ in 0..20_000 {
+            let hop = inside::Hop::new_zeroed();
+            table.note(Some(Item::Hop(hop)), &clocks);
+        }
+        assert_driven::<CausalHops>();
+    }
+
+    #[test]
+    fn handles_that_come_and_go_without_end_are_reported_again() {
+        let mut observed = Observed::default();
+        let handle = |address| Handle {
+            address,
+            ..Handle::new_zeroed()
+        };
+        for address in 0..10_000 {
+            observed.note_buffer(address, handle(1));
+            observed.note_reported(handle(address), [0; 5]);
+            assert!(observed.reported.len() <= ReportedHandles::CAP);
+        }
+        assert_driven::<InsideBuffers>();
+        observed.buffers.clear();
+        for address in 0..5_000 {
+            observed.note_reported(handle(address), [0; 5]);
+        }
+        assert_driven::<ReportedHandles>();
+    }
 }

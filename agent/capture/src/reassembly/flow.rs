@@ -71,26 +71,6 @@ impl Flow {
         ENTRIES + self.held + self.pieces.capacity() * size_of::<Piece>()
     }
 
-    /// Returns the same, computed from its pieces.
-    pub(super) fn held(&self) -> usize {
-        // A new list does not compile until it is listed here.
-        let Self {
-            order: _,
-            first_seen: _,
-            last_seen: _,
-            handover: _,
-            pieces,
-            total: _,
-            first_unknown: _,
-            held,
-        } = self;
-        let bytes = |piece: &Piece| {
-            let Piece { start: _, bytes } = piece;
-            bytes.capacity()
-        };
-        self.memory() - held + pieces.iter().map(bytes).sum::<usize>()
-    }
-
     /// Adds a fragment. Of overlapping bytes, the first ones are kept.
     pub(super) fn place(&mut self, at: Timestamp, fragment: &Fragment<'_>) -> Placed {
         let (start, end) = (fragment.offset, fragment.end());

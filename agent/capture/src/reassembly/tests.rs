@@ -2,6 +2,7 @@ use proptest::prelude::*;
 use ros2probe_wire::record::kind;
 
 use super::*;
+use crate::tables::tests::assert_driven;
 
 use ros2probe_wire::time::SECOND;
 const PART: usize = 1480;
@@ -193,6 +194,7 @@ fn the_oldest_goes_first_when_there_are_too_many() {
         assert_eq!(feed(&mut reassembly, id, &fragments(&bytes)[..1]), []);
     }
     assert_eq!((reassembly.flows(), reassembly.counters().evicted), (3, 2));
+    assert_driven::<Flows>();
     assert_eq!(feed(&mut reassembly, 4, &fragments(&bytes)[1..]).len(), 1);
     assert_eq!(feed(&mut reassembly, 1, &fragments(&bytes)[1..]), []);
 }
@@ -213,6 +215,11 @@ fn memory_follows_what_came_and_not_what_was_announced() {
         assert!(small.bytes() <= 100_000);
     }
     assert_eq!((small.flows(), small.counters().evicted), (1, 9));
+    for id in 100..300 {
+        assert_eq!(feed(&mut small, id, &fragments(&bytes)[..1]), []);
+        assert!(small.bytes() <= 100_000);
+    }
+    assert_driven::<FlowBytes>();
 }
 
 #[test]
@@ -230,6 +237,7 @@ fn finished_datagrams_are_remembered_within_a_cap() {
         (reassembly.finished.len(), reassembly.finished_order.len()),
         (10, 10)
     );
+    assert_driven::<FinishedFlows>();
     reassembly.advance(Timestamp(9 * SECOND));
     assert!(reassembly.finished.is_empty() && reassembly.finished_order.is_empty());
 }

@@ -6,11 +6,14 @@
 
 use std::collections::HashMap;
 
-use ros2probe_wire::filter::{UNKNOWN_CAPACITY, UNKNOWN_CAPTURE_BYTES};
+use ros2probe_model::bounded::Bounded;
+use ros2probe_wire::filter::UNKNOWN_CAPTURE_BYTES;
 use ros2probe_wire::record::{Record, Verdict, guid_words};
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::walk::{self, Bytes, Fate, MAGIC, Step, Walk};
 use ros2probe_wire::{EntityId, Guid};
+
+use crate::tables::UnknownShmWriters;
 
 /// Submessages read per message; a message with more is captured.
 const SUBMESSAGES: usize = 64;
@@ -36,7 +39,7 @@ pub enum MessageVerdict {
 pub struct MessageClassifier {
     interest: HashMap<[u32; 4], Verdict>,
     /// Bytes captured of unclassified writers.
-    unknown: HashMap<[u32; 4], u32>,
+    unknown: Bounded<UnknownShmWriters, HashMap<[u32; 4], u32>>,
     capture_left: i64,
     records_left: i64,
     refilled: u64,
@@ -55,7 +58,7 @@ impl Default for MessageClassifier {
     fn default() -> Self {
         Self {
             interest: HashMap::new(),
-            unknown: HashMap::new(),
+            unknown: Bounded::default(),
             capture_left: CAPTURE_PER_SECOND,
             records_left: RECORDS_PER_SECOND,
             refilled: 0,
@@ -158,16 +161,15 @@ impl MessageClassifier {
 
     /// Captures within the writer's budget, then meters within the common one.
     fn unknown(&mut self, writer: [u32; 4], length: u32) -> Verdict {
-        let has_room = self.unknown.len() < UNKNOWN_CAPACITY as usize;
         let is_datagram = length <= u16::MAX.into();
-        let has_place = has_room || self.unknown.contains_key(&writer);
-        if is_datagram && has_place && self.capture_left > 0 {
-            let used = self.unknown.entry(writer).or_default();
-            if *used < UNKNOWN_CAPTURE_BYTES {
-                *used = used.saturating_add(length);
-                self.capture_left -= i64::from(length);
-                return Verdict::Capture;
-            }
+        if is_datagram
+            && self.capture_left > 0
+            && let Some(used) = self.unknown.get_or_insert_with(writer, || 0)
+            && *used < UNKNOWN_CAPTURE_BYTES
+        {
+            *used = used.saturating_add(length);
+            self.capture_left -= i64::from(length);
+            return Verdict::Capture;
         }
         if self.records_left > 0 {
             self.records_left -= 1;
@@ -182,6 +184,7 @@ mod tests {
     use ros2probe_wire::record::{flag, kind};
 
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     const WRITER: [u8; 4] = [0, 0, 1, 3];
 
@@ -309,6 +312,6 @@ mod tests {
             captured <= CAPTURE_PER_SECOND as usize + 65_536,
             "{captured}"
         );
-        assert!(rules.unknown.len() <= UNKNOWN_CAPACITY as usize);
+        assert_driven::<UnknownShmWriters>();
     }
 }

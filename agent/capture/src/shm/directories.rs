@@ -11,15 +11,13 @@ use std::time::{Duration, SystemTime};
 
 use super::cell::SegmentId;
 use super::owner::{LOCKED, Locks};
+use crate::tables::{Directories, DirectoryFiles, ScopeProcesses};
+use ros2probe_model::bounded::Bounded;
 
 /// Directory of shared memory.
 const SHARED_MEMORY: &str = "/dev/shm";
 /// Prefixes of file names: Fast DDS 2.x, 3.x.
 const PREFIXES: [&str; 2] = ["fastrtps_", "fastdds_"];
-/// Most mount namespaces with their own `/dev/shm`.
-const MAX_DIRECTORIES: usize = 64;
-/// Most files kept per directory.
-const MAX_FILES: usize = 2048;
 /// Most entries read per directory.
 const MAX_LISTED: usize = 65_536;
 /// Granularity of directory timestamps: a directory that changed more recently may change again
@@ -31,7 +29,6 @@ const MOUNTING_ROUNDS: u32 = 5;
 const ROUNDS: u32 = 32;
 /// Levels of cgroups and processes of a scope that are visited.
 const DEPTH: usize = 8;
-const MAX_PROCESSES: usize = 8192;
 /// Rounds after a new process in which it may still move to a cgroup in scope.
 const MOVING_ROUNDS: u32 = 3;
 /// Most rounds without a new process that use the same list of processes.
@@ -63,7 +60,7 @@ pub struct ShmDirectory {
     /// A path that currently reaches it.
     pub path: PathBuf,
     /// Files by name, with their inodes.
-    pub files: HashMap<Name, u64>,
+    pub files: Bounded<DirectoryFiles, HashMap<Name, u64>>,
     changed: Option<SystemTime>,
     seen: bool,
 }
@@ -88,9 +85,9 @@ pub struct ShmDirectories {
     /// Inodes of the network namespaces, if they are the scope.
     networks: Vec<u64>,
     /// Directories by identity.
-    pub directories: HashMap<ShmDirectoryId, ShmDirectory>,
+    pub directories: Bounded<Directories, HashMap<ShmDirectoryId, ShmDirectory>>,
     /// The processes in scope when they were last listed.
-    listed: Vec<u32>,
+    listed: Bounded<ScopeProcesses, Vec<u32>>,
     newest: NewestProcess,
     /// Visited processes with their directory and the number of visits.
     processes: HashMap<u32, (Option<ShmDirectoryId>, u32)>,
@@ -103,15 +100,15 @@ pub struct ShmDirectories {
 impl Scope {
     /// Returns its processes. Unknown for a list of directories.
     #[must_use]
-    pub fn processes(&self) -> Vec<u32> {
+    pub fn processes(&self) -> Bounded<ScopeProcesses, Vec<u32>> {
         match self {
             Self::AllProcesses | Self::Networks(_) => all_processes(),
             Self::Cgroup(cgroup) => {
-                let mut processes = Vec::new();
+                let mut processes = Bounded::default();
                 processes_of(cgroup, DEPTH, &mut processes);
                 processes
             }
-            Self::Directories(_) => Vec::new(),
+            Self::Directories(_) => Bounded::default(),
         }
     }
 }
@@ -171,8 +168,8 @@ impl ShmDirectories {
         Self {
             scope,
             networks,
-            directories: HashMap::new(),
-            listed: Vec::new(),
+            directories: Bounded::default(),
+            listed: Bounded::default(),
             newest: NewestProcess::default(),
             processes: HashMap::new(),
             is_mounting: false,
@@ -294,20 +291,15 @@ impl ShmDirectories {
             directory.seen = true;
             return Some(id);
         }
-        if self.directories.len() >= MAX_DIRECTORIES {
-            self.left_out += 1;
-            return None;
-        }
-        self.directories.insert(
-            id,
-            ShmDirectory {
-                path: path.to_path_buf(),
-                files: HashMap::new(),
-                changed: None,
-                seen: true,
-            },
-        );
-        Some(id)
+        let directory = ShmDirectory {
+            path: path.to_path_buf(),
+            files: Bounded::default(),
+            changed: None,
+            seen: true,
+        };
+        let is_left_out = self.directories.insert(id, directory).is_some();
+        self.left_out += u64::from(is_left_out);
+        (!is_left_out).then_some(id)
     }
 }
 
@@ -320,7 +312,7 @@ impl ShmDirectory {
             return false;
         }
         self.changed = changed.filter(|_| settled);
-        let known = std::mem::take(&mut self.files);
+        let known = self.files.take();
         let Ok(entries) = fs::read_dir(&self.path) else {
             return true;
         };
@@ -342,11 +334,11 @@ impl ShmDirectory {
             *left_out += 1;
             files = self.keep(files, known);
         }
-        *left_out += files.len().saturating_sub(MAX_FILES) as u64;
-        if files.len() > MAX_FILES {
+        *left_out += files.len().saturating_sub(DirectoryFiles::CAP) as u64;
+        if files.len() > DirectoryFiles::CAP {
             files = self.choose(files, &locks);
         }
-        self.files.extend(files);
+        self.files = files.into_iter().collect();
         true
     }
 
@@ -375,10 +367,10 @@ impl ShmDirectory {
         let (mut chosen, others) = files
             .into_iter()
             .partition::<Vec<_>, _>(|(name, _)| alive.contains(name));
-        if chosen.len() > MAX_FILES {
-            return self.share(chosen, MAX_FILES);
+        if chosen.len() > DirectoryFiles::CAP {
+            return self.share(chosen, DirectoryFiles::CAP);
         }
-        chosen.extend(self.share(others, MAX_FILES - chosen.len()));
+        chosen.extend(self.share(others, DirectoryFiles::CAP - chosen.len()));
         chosen
     }
 
@@ -457,16 +449,20 @@ fn inode(path: &Path) -> Option<u64> {
     fs::metadata(path).ok().map(|metadata| metadata.ino())
 }
 
-fn all_processes() -> Vec<u32> {
+fn all_processes() -> Bounded<ScopeProcesses, Vec<u32>> {
     let entries = fs::read_dir("/proc").into_iter().flatten().flatten();
     let processes = entries.filter_map(|entry| entry.file_name().to_str()?.parse().ok());
-    processes.take(MAX_PROCESSES).collect()
+    processes.take(ScopeProcesses::CAP).collect()
 }
 
-fn processes_of(cgroup: &Path, depth: usize, processes: &mut Vec<u32>) {
+fn processes_of(cgroup: &Path, depth: usize, processes: &mut Bounded<ScopeProcesses, Vec<u32>>) {
     let members = fs::read_to_string(cgroup.join("cgroup.procs")).unwrap_or_default();
     let members = members.lines().filter_map(|line| line.parse::<u32>().ok());
-    processes.extend(members.take(MAX_PROCESSES.saturating_sub(processes.len())));
+    for process in members {
+        if processes.push(process).is_some() {
+            return;
+        }
+    }
     let entries = fs::read_dir(cgroup).into_iter().flatten().flatten();
     for entry in entries.filter(|_| depth > 0) {
         if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
@@ -478,6 +474,7 @@ fn processes_of(cgroup: &Path, depth: usize, processes: &mut Vec<u32>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     #[test]
     fn processes_are_listed_again_after_a_new_one_and_now_and_then() {
@@ -574,7 +571,7 @@ mod tests {
     fn files_of_living_processes_are_found_among_more_forged_ones_than_are_kept() {
         let directory = tempfile::tempdir().unwrap();
         let file = |name: &str| fs::File::create(directory.path().join(name)).unwrap();
-        for number in 0..MAX_FILES + 500 {
+        for number in 0..DirectoryFiles::CAP + 500 {
             file(&format!("fastrtps_{number:016x}"));
         }
         let real = ["fastrtps_port7411", "fastrtps_ffffffffffffffff"];
@@ -584,7 +581,7 @@ mod tests {
             lock.try_lock().unwrap();
             lock
         });
-        for number in 0..MAX_FILES + 500 {
+        for number in 0..DirectoryFiles::CAP + 500 {
             file(&format!("fastrtps_port{}", 20_000 + number));
         }
         let mut directories =
@@ -592,12 +589,36 @@ mod tests {
         directories.find();
         directories.list();
         let found = files(&directories);
-        assert_eq!(found.len(), MAX_FILES);
+        assert_eq!(found.len(), DirectoryFiles::CAP);
         for name in real {
             assert!(found.contains(&Name::parse(name).unwrap()), "{name}");
         }
         assert!(directories.left_out > 0);
+        assert_driven::<DirectoryFiles>();
         drop(locks);
+    }
+
+    #[test]
+    fn directories_beyond_the_cap_are_left_out_and_counted() {
+        let above = tempfile::tempdir().unwrap();
+        let paths = (0..70).map(|number| above.path().join(number.to_string()));
+        let paths: Vec<_> = paths
+            .inspect(|path| fs::create_dir(path).unwrap())
+            .collect();
+        let mut directories = ShmDirectories::new(Scope::Directories(paths));
+        directories.find();
+        assert_driven::<Directories>();
+        assert_eq!(directories.left_out, 70 - Directories::CAP as u64);
+    }
+
+    #[test]
+    fn processes_of_a_control_group_beyond_the_cap_are_not_inspected() {
+        let cgroup = tempfile::tempdir().unwrap();
+        let list: String = (1..10_000).map(|process| format!("{process}\n")).collect();
+        fs::write(cgroup.path().join("cgroup.procs"), list).unwrap();
+        let processes = Scope::Cgroup(cgroup.path().to_path_buf()).processes();
+        assert_eq!(processes.len(), ScopeProcesses::CAP);
+        assert_driven::<ScopeProcesses>();
     }
 
     #[test]
@@ -622,19 +643,22 @@ mod tests {
         flood(0..MAX_LISTED - real.len());
         make(real[1]);
         directories.list();
-        assert_eq!(directories.left_out, (MAX_LISTED - MAX_FILES) as u64);
+        assert_eq!(
+            directories.left_out,
+            (MAX_LISTED - DirectoryFiles::CAP) as u64
+        );
         let has_real = |directories: &ShmDirectories| {
             let found = files(directories);
-            assert_eq!(found.len(), MAX_FILES);
+            assert_eq!(found.len(), DirectoryFiles::CAP);
             real.map(|name| found.contains(&Name::parse(name).unwrap()))
         };
         assert_eq!(has_real(&directories), [true; 2]);
-        flood(MAX_LISTED..MAX_LISTED + 2 * MAX_FILES);
+        flood(MAX_LISTED..MAX_LISTED + 2 * DirectoryFiles::CAP);
         directories.left_out = 0;
         directories.list();
         // One for all unread entries, plus the files beyond the cap.
         let left_out = usize::try_from(directories.left_out).unwrap();
-        let bound = 1 + MAX_LISTED - MAX_FILES..=1 + MAX_LISTED;
+        let bound = 1 + MAX_LISTED - DirectoryFiles::CAP..=1 + MAX_LISTED;
         assert!(bound.contains(&left_out), "{left_out}");
         assert_eq!(has_real(&directories), [true; 2]);
         fs::remove_file(path(real[0])).unwrap();
@@ -646,7 +670,7 @@ mod tests {
     fn a_user_who_makes_too_many_files_hides_none_of_another_user() {
         let directory = tempfile::tempdir().unwrap();
         let file = |name: &str| directory.path().join(name);
-        for number in 0..MAX_FILES + 500 {
+        for number in 0..DirectoryFiles::CAP + 500 {
             fs::write(file(&format!("fastrtps_{number:016x}")), "").unwrap();
         }
         let real = Name::parse("fastrtps_port7411").unwrap();
@@ -657,7 +681,7 @@ mod tests {
         directories.find();
         directories.list();
         let found = files(&directories);
-        assert!(found.len() == MAX_FILES && found.contains(&real));
+        assert!(found.len() == DirectoryFiles::CAP && found.contains(&real));
     }
 
     #[test]

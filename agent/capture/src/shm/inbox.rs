@@ -3,13 +3,12 @@
 use std::os::fd::BorrowedFd;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use ros2probe_model::bounded::{Bounded, Counted, Sum};
 use ros2probe_wire::record::{Record, Sample};
 
 use crate::bell::Bell;
+use crate::tables::{InboxBytes, InboxItems};
 
-/// Most waiting records, and most bytes of captured messages.
-const MAX_RECORDS: usize = 16_384;
-const MAX_BYTES: usize = 16 << 20;
 /// Bytes from which the worker is woken: a camera fills them in a fifth of a second.
 const WAKE_BYTES: usize = 1 << 20;
 
@@ -41,9 +40,8 @@ pub struct Inbox {
 
 #[derive(Debug, Default)]
 struct Waiting {
-    items: Vec<Item>,
-    bytes: usize,
-    refused: u64,
+    items: Bounded<Counted<InboxItems>, Vec<Item>>,
+    bytes: Sum<InboxBytes>,
 }
 
 impl Inbox {
@@ -69,13 +67,13 @@ impl Inbox {
             return;
         }
         let waiting = &mut *self.waiting();
-        let was_woken = waiting.bytes >= WAKE_BYTES;
+        let was_woken = waiting.bytes.used() >= WAKE_BYTES;
         for item in found.drain(..) {
             waiting.put(item);
         }
         if let Some(bell) = self.bell.as_ref()
             && !was_woken
-            && waiting.bytes >= WAKE_BYTES
+            && waiting.bytes.used() >= WAKE_BYTES
         {
             bell.ring();
         }
@@ -85,17 +83,21 @@ impl Inbox {
     #[must_use]
     pub fn take(&self) -> Vec<Item> {
         let waiting = &mut *self.waiting();
-        if let Some(bell) = self.bell.as_ref().filter(|_| waiting.bytes >= WAKE_BYTES) {
+        if let Some(bell) = self
+            .bell
+            .as_ref()
+            .filter(|_| waiting.bytes.used() >= WAKE_BYTES)
+        {
             bell.silence();
         }
-        waiting.bytes = 0;
-        std::mem::take(&mut waiting.items)
+        waiting.bytes.clear();
+        waiting.items.take()
     }
 
     /// Returns the number of items that did not fit.
     #[must_use]
     pub fn refused(&self) -> u64 {
-        self.waiting().refused
+        self.waiting().items.facts().evictions
     }
 
     /// Locks the queue; no operation under this lock can panic.
@@ -106,28 +108,23 @@ impl Inbox {
 
 impl Waiting {
     fn put(&mut self, item: Item) {
-        match &item {
-            Item::Record(record) => {
-                if let Some(Item::Record(last)) = self.items.last_mut()
-                    && matches!(record.sample(), Some(Sample::DataFrag(_)))
-                    && (last.kind, last.writer) == (record.kind, record.writer)
-                    && last.extend(record)
-                {
-                    return;
-                }
-            }
-            Item::Message { bytes, .. } if self.bytes + bytes.len() > MAX_BYTES => {
-                self.refused += 1;
-                return;
-            }
-            Item::Message { bytes, .. } => self.bytes += bytes.len(),
-            Item::Uncertain(_) => {}
-        }
-        if self.items.len() >= MAX_RECORDS {
-            self.refused += 1;
+        if let Item::Record(record) = &item
+            && let Some(Item::Record(last)) = self.items.last_mut()
+            && matches!(record.sample(), Some(Sample::DataFrag(_)))
+            && (last.kind, last.writer) == (record.kind, record.writer)
+            && last.extend(record)
+        {
             return;
         }
-        self.items.push(item);
+        let length = match &item {
+            Item::Message { bytes, .. } => bytes.len(),
+            Item::Record(_) | Item::Uncertain(_) => 0,
+        };
+        if length > self.bytes.room() {
+            self.items.refuse();
+        } else if self.items.push(item).is_none() {
+            self.bytes.add(length);
+        }
     }
 }
 
@@ -139,6 +136,7 @@ mod tests {
 
     use super::*;
     use crate::system::wait;
+    use crate::tables::tests::assert_driven;
 
     fn fragment(start: u32) -> Item {
         Item::Record(Record {
@@ -220,9 +218,11 @@ mod tests {
         assert_eq!((inbox.take().len(), inbox.refused()), (4, 1));
         inbox.put(&mut vec![message()]);
         assert_eq!(inbox.take().len(), 1);
-        let mut flood: Vec<_> = (0..MAX_RECORDS as u64 + 3).map(Item::Uncertain).collect();
+        let cap = InboxItems::CAP;
+        let mut flood: Vec<_> = (0..cap as u64 + 3).map(Item::Uncertain).collect();
         inbox.put(&mut flood);
-        assert_eq!((inbox.take().len(), inbox.refused()), (MAX_RECORDS, 4));
+        assert_eq!((inbox.take().len(), inbox.refused()), (cap, 4));
+        assert_driven::<InboxItems>();
     }
 
     #[test]
@@ -235,6 +235,7 @@ mod tests {
         };
         inbox.put(&mut (0..20).map(|_| message()).collect());
         assert_eq!((inbox.take().len(), inbox.refused()), (16, 4));
+        assert_driven::<InboxBytes>();
         inbox.put(&mut vec![message()]);
         assert_eq!((inbox.take().len(), inbox.refused()), (1, 4));
     }

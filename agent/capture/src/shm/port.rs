@@ -5,8 +5,11 @@
 //! `write_p`, then fills the cell, and sets its reference counter last. So a cell counts as filled
 //! if it is referenced or if it differs from its content one round before.
 
+use ros2probe_model::bounded::Bounded;
+
 use super::cell::{Cell, Descriptor};
 use super::source::Source;
+use crate::tables::PortCells;
 
 /// PortNode follows the allocator's administration, at 0x100 on x86-64 and 0x110 on aarch64: it is
 /// found in the first page by its content.
@@ -18,8 +21,6 @@ const RING: u64 = 16;
 const PORT_ID: u64 = 20;
 const CAPACITY: u64 = 36;
 const TOTAL_CELLS: u64 = 8;
-/// Most cells accepted. Fast DDS has 512 by default; a larger ring would cost too much memory here.
-const MAX_CAPACITY: u32 = 1 << 11;
 /// A cell that is not filled after this time stays unfilled: its writer died.
 const UNFILLED_NANOSECONDS: u64 = 100_000_000;
 /// Attempts to read a ring while no writer moves it.
@@ -41,7 +42,7 @@ pub struct Port {
     layout: Layout,
     /// Position of the next cell: its index, plus the capacity in every other round.
     position: u32,
-    shadow: Vec<Descriptor>,
+    shadow: Bounded<PortCells, Vec<Descriptor>>,
     unfilled_since: Option<u64>,
     looked: u64,
     pace: PeakRate,
@@ -81,7 +82,7 @@ impl Port {
         let mut port = Self {
             layout,
             position: 0,
-            shadow: vec![Descriptor::default(); layout.capacity as usize],
+            shadow: Bounded::default(),
             unfilled_since: None,
             looked: now,
             pace: PeakRate::default(),
@@ -99,9 +100,7 @@ impl Port {
             }
             before = after;
         }
-        for (shadow, cell) in port.shadow.iter_mut().zip(&cells) {
-            *shadow = cell.descriptor;
-        }
+        port.shadow = cells.iter().map(|cell| cell.descriptor).collect();
         let oldest = layout.index(port.position);
         let (newer, older) = cells.split_at_checked(oldest as usize)?;
         let filled = older.iter().chain(newer).map(|cell| cell.descriptor);
@@ -213,7 +212,7 @@ impl Layout {
         let capacity = source.word(node + CAPACITY)?;
         let ring = u64::from(source.word(node + RING)?);
         let cells = u64::from(source.word(node + CELLS)?);
-        let fits = (1..=MAX_CAPACITY).contains(&capacity)
+        let fits = (1..=PortCells::CAP as u32).contains(&capacity)
             && ring.is_multiple_of(4)
             && source.word(ring + TOTAL_CELLS)? == capacity;
         let last = cells + u64::from(capacity - fits.then_some(1)?) * Cell::LEN as u64;
@@ -264,6 +263,7 @@ mod tests {
 
     use super::super::image::PortImage;
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     use ros2probe_wire::time::SECOND;
 
@@ -377,6 +377,16 @@ mod tests {
     }
 
     #[test]
+    fn a_ring_with_more_cells_than_are_kept_is_none() {
+        let capacity = PortCells::CAP as u32;
+        let image = PortImage::new(7411, capacity, 0x100);
+        assert!(Port::attach(image.bytes(), 7411, 0).is_some());
+        let image = PortImage::new(7411, capacity + 1, 0x100);
+        assert!(Port::attach(image.bytes(), 7411, 0).is_none());
+        assert_driven::<PortCells>();
+    }
+
+    #[test]
     fn a_port_that_is_cut_off_or_contradicts_itself_is_none() {
         let image = PortImage::new(7411, 8, 0x100);
         let (mut port, _) = Port::attach(image.bytes(), 7411, 0).unwrap();
@@ -407,12 +417,12 @@ mod tests {
             };
             change(&mut bytes, &damage);
             if let Some((mut port, backlog)) = Port::attach(bytes.as_slice(), 7411, 0) {
-                prop_assert!(backlog.len() <= MAX_CAPACITY as usize);
+                prop_assert!(backlog.len() <= PortCells::CAP);
                 for now in 1..4 {
                     change(&mut bytes, &later);
                     let mut found = Vec::new();
                     let _ = port.poll(bytes.as_slice(), now * SECOND, &mut found);
-                    prop_assert!(found.len() <= MAX_CAPACITY as usize);
+                    prop_assert!(found.len() <= PortCells::CAP);
                 }
             }
         }

@@ -22,11 +22,10 @@ use super::port::Port;
 use super::segment::{Buffer, Message, Refusal};
 use super::source::SharedFile;
 use crate::system::thread_cpu;
+use crate::tables::{AbandonedPorts, Ports, Segments};
 use recent_messages::{Identity, RecentMessages};
+use ros2probe_model::bounded::Bounded;
 
-/// Most ports and segments open at once.
-const MAX_PORTS: usize = 512;
-const MAX_SEGMENTS: usize = 512;
 /// Most messages read per poll; the rest of a flood is read in the next.
 const MAX_PER_POLL: usize = 2048;
 const MAX_PER_URGENT_POLL: usize = 64;
@@ -50,12 +49,12 @@ const URGENT_FIND_EVERY: u64 = 10_000_000_000;
 pub struct Tap {
     directories: ShmDirectories,
     /// Ports, by number.
-    ports: Vec<Open>,
+    ports: Bounded<Ports, Vec<Open>>,
     /// Ports that are listed but not initialized yet.
     unborn: Vec<(PortKey, PathBuf)>,
     /// Ports of dead processes, with their inodes: they are tried again at the next scan.
-    abandoned: HashSet<(PortKey, u64)>,
-    segments: HashMap<SegmentKey, Segment>,
+    abandoned: Bounded<AbandonedPorts, HashSet<(PortKey, u64)>>,
+    segments: Bounded<Segments, HashMap<SegmentKey, Segment>>,
     remembered: RecentMessages,
     /// The rules and the interest map.
     pub classifier: MessageClassifier,
@@ -148,10 +147,10 @@ impl Tap {
     pub fn new(directories: ShmDirectories, calendar: impl FnMut() -> u64 + 'static) -> Self {
         Self {
             directories,
-            ports: Vec::new(),
+            ports: Bounded::default(),
             unborn: Vec::new(),
-            abandoned: HashSet::new(),
-            segments: HashMap::new(),
+            abandoned: Bounded::default(),
+            segments: Bounded::default(),
             remembered: RecentMessages::default(),
             classifier: MessageClassifier::default(),
             is_hurried: false,
@@ -190,7 +189,7 @@ impl Tap {
         if self.directories.directories.is_empty() {
             self.found = 0;
         }
-        for open in &mut self.ports {
+        for open in self.ports.iter_mut() {
             (open.due, open.busy) = (0, open.busy.max(self.now));
         }
     }
@@ -434,7 +433,7 @@ impl Tap {
             Some(Segment::Missing(since)) if now.saturating_sub(*since) < RETRY => return,
             _ => {}
         }
-        if self.segments.len() >= MAX_SEGMENTS && !self.segments.contains_key(&key) {
+        if self.segments.is_full() && !self.segments.contains_key(&key) {
             self.counters.left_out += 1;
             return;
         }
@@ -514,7 +513,7 @@ impl Tap {
             let Ok(file) = SharedFile::open(&path) else {
                 continue;
             };
-            if self.ports.len() + attached.len() >= MAX_PORTS && !self.make_room(file.user()) {
+            if self.ports.len() + attached.len() >= Ports::CAP && !self.make_room(file.user()) {
                 self.counters.left_out += 1;
                 continue;
             }

@@ -17,14 +17,13 @@ use rustix::io::Errno;
 use super::library::LibraryError;
 use super::processes::{LibraryId, Mapped, Processes};
 use crate::error_chain::in_words;
+use crate::tables::Libraries;
+use ros2probe_model::bounded::Bounded;
 
 /// How long an unused library stays attached.
 pub const LINGER: Duration = Duration::from_secs(60);
 /// Pause before another attempt to attach to a library.
 pub const RETRY: Duration = Duration::from_secs(5);
-/// Most libraries with a probe: images of containers on one host.
-pub const MAX_LIBRARIES: usize = 64;
-
 /// A file whose open blocks is not a library.
 const UNBLOCKED: OFlags = OFlags::NONBLOCK.union(OFlags::NOCTTY);
 /// Beginning of the names of file systems in user space.
@@ -45,7 +44,7 @@ const DISTRIBUTIONS: &str = "/opt/ros";
 pub struct Attachments<P> {
     attach: Attach<P>,
     meaning: &'static str,
-    libraries: BTreeMap<LibraryId, Library<P>>,
+    libraries: Bounded<Libraries, BTreeMap<LibraryId, Library<P>>>,
 }
 
 /// Attaches to a library's file.
@@ -104,7 +103,7 @@ impl<P> Attachments<P> {
         Self {
             attach,
             meaning,
-            libraries: BTreeMap::new(),
+            libraries: Bounded::default(),
         }
     }
 
@@ -130,7 +129,7 @@ impl<P> Attachments<P> {
                 device: format!("{:02x}:{:02x}", libc::major(device), libc::minor(device)),
                 inode: metadata.ino(),
             };
-            if self.libraries.contains_key(&id) || self.libraries.len() >= MAX_LIBRARIES {
+            if self.libraries.contains_key(&id) || self.libraries.is_full() {
                 continue;
             }
             // A failure is reported when a process uses the library.
@@ -175,7 +174,7 @@ impl<P> Attachments<P> {
             .libraries
             .get(id)
             .is_some_and(|known| known.probe.is_ok() || now - known.tried < RETRY);
-        if !is_known && (self.libraries.contains_key(id) || self.libraries.len() < MAX_LIBRARIES) {
+        if !is_known && (self.libraries.contains_key(id) || !self.libraries.is_full()) {
             // Refers to the file that the process maps, even if its path now names another one.
             let file = PathBuf::from(format!("/proc/{process}/map_files/{range}"));
             let opened = answers(process, id).and_then(|()| open_mapped(&file, process, mapped));
@@ -225,7 +224,7 @@ pub fn installed(is_library: fn(&str) -> bool) -> Vec<PathBuf> {
     let distributions = fs::read_dir(DISTRIBUTIONS).into_iter().flatten().flatten();
     directories.extend(
         distributions
-            .take(MAX_LIBRARIES)
+            .take(Libraries::CAP)
             .map(|entry| entry.path().join("lib")),
     );
     let entries = directories

@@ -9,6 +9,8 @@ use std::io::{self, Read as _};
 use std::path::PathBuf;
 
 use crate::shm::directories::Scope;
+use crate::tables::MappedLibraries;
+use ros2probe_model::bounded::Bounded;
 
 /// Names of the library: Fast DDS 2.x, 3.x. A version may follow.
 const LIBRARIES: [&str; 2] = ["libfastrtps.so", "libfastdds.so"];
@@ -50,7 +52,7 @@ pub struct Mapped {
 #[derive(Clone, Default, PartialEq, Eq, Debug)]
 pub struct Use {
     /// Files of the library.
-    pub libraries: Vec<Mapped>,
+    pub libraries: Bounded<MappedLibraries, Vec<Mapped>>,
     /// Whether it maps files of Fast DDS's shared memory.
     pub shares: bool,
 }
@@ -110,7 +112,7 @@ impl Use {
 
     /// Returns whether the process uses Fast DDS at all.
     #[must_use]
-    pub const fn is_any(&self) -> bool {
+    pub fn is_any(&self) -> bool {
         self.shares || !self.libraries.is_empty()
     }
 }
@@ -243,6 +245,7 @@ fn holder(line: &str) -> Option<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tables::tests::assert_driven;
 
     #[test]
     fn libraries_and_shared_memory_are_found_in_a_map() {
@@ -297,6 +300,20 @@ mod tests {
         }
         let nonsense = "nonsense /usr/lib/libfastdds.so";
         assert!(!Use::parse(nonsense, is_library).is_any());
+    }
+
+    #[test]
+    fn of_a_process_with_too_many_libraries_the_first_ones_are_known() {
+        let line = |inode| {
+            format!("7f0000000000-7f0000001000 r-xp 00000000 fe:00 {inode} /libfastdds.so\n")
+        };
+        let text: String = (1..=1000).map(line).collect();
+        let found = Use::parse(&text, is_library);
+        assert_driven::<MappedLibraries>();
+        assert_eq!(
+            found.libraries.last().unwrap().id.inode,
+            MappedLibraries::CAP as u64
+        );
     }
 
     #[test]

@@ -382,10 +382,12 @@ mod tests {
     use std::fs;
     use std::os::fd::AsRawFd as _;
 
-    use super::super::attachments::{LINGER, MAX_LIBRARIES, RETRY};
+    use super::super::attachments::{LINGER, RETRY};
     use super::super::processes::Use;
     use super::*;
     use crate::filter::{Filter, FilterSettings};
+    use crate::tables::tests::assert_driven;
+    use crate::tables::{Libraries, MappedLibraries};
 
     /// Maps a file into this process permanently.
     fn map(file: &fs::File) {
@@ -406,7 +408,7 @@ mod tests {
     #[test]
     fn a_library_beyond_the_cap_is_reported_as_uncovered_until_another_is_no_longer_used() {
         let directory = tempfile::tempdir().unwrap();
-        for number in 0..=MAX_LIBRARIES {
+        for number in 0..=Libraries::CAP {
             let path = directory.path().join(format!("library.{number}"));
             fs::write(&path, library::tests::library()).unwrap();
             map(&fs::File::open(&path).unwrap());
@@ -415,7 +417,7 @@ mod tests {
         let maps = fs::read_to_string("/proc/self/maps").unwrap();
         let maps = maps.replace("/library.", "/libfastdds.so.");
         let mut used = Use::parse(&maps, is_library);
-        assert_eq!(used.libraries.len(), MAX_LIBRARIES + 1);
+        assert_driven::<MappedLibraries>();
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
         let (_filter, probes) = Filter::load_uprobe(&FilterSettings::default(), None)
@@ -425,7 +427,7 @@ mod tests {
         attachments.follow(&all, start);
         attachments.follow(&all, start + RETRY);
         let facts = super::facts(&attachments, &all);
-        assert_eq!(facts.libraries.len(), MAX_LIBRARIES);
+        assert_driven::<Libraries>();
         let refused = facts.libraries.iter().find_map(|each| each.refused.clone());
         assert_eq!(refused, None);
         let uncovered = facts.uncovered.unwrap();
@@ -441,7 +443,7 @@ mod tests {
         attachments.follow(&fewer, later);
         attachments.follow(&fewer, later + EVERY);
         let facts = super::facts(&attachments, &fewer);
-        assert_eq!(facts.libraries.len(), MAX_LIBRARIES);
+        assert_eq!(facts.libraries.len(), Libraries::CAP);
         assert_eq!(facts.uncovered, None);
     }
 }

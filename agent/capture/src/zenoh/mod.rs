@@ -13,7 +13,9 @@ use std::collections::hash_map::Entry;
 use std::collections::{HashMap, VecDeque};
 use std::time::Duration;
 
-use crate::size::Size;
+use crate::tables::{ZenohOrder, ZenohStreamBytes, ZenohStreams};
+use ros2probe_model::bounded::{Bounded, Counted, Sum};
+use ros2probe_model::snapshot::TableFacts;
 use ros2probe_model::zenoh::{Flow, StreamEvent, StreamId, StreamReport, Unseen};
 use ros2probe_wire::Timestamp;
 use ros2probe_wire::quic;
@@ -22,10 +24,6 @@ use ros2probe_wire::zenoh::PORT;
 pub use chunks::{flow, flow_of};
 use stream::{Stream, Took};
 
-/// Most directions of connections that are followed.
-const MAX_STREAMS: usize = 4096;
-/// Most bytes of unfinished batches and of segments out of order, of all connections.
-const MAX_BYTES: usize = 12 << 20;
 /// Interval at which segments that wait are examined.
 const EXAMINATION_INTERVAL: Duration = Duration::from_millis(100);
 
@@ -93,8 +91,6 @@ pub struct Counters {
     pub gaps: u64,
     /// Bytes before a boundary was found.
     pub unsynchronized_bytes: u64,
-    /// Connections dropped because too many were open, or too many bytes waited.
-    pub evicted: u64,
 }
 
 /// All followed connections.
@@ -102,12 +98,12 @@ pub struct Counters {
 pub struct Streams {
     /// TCP ports of Zenoh.
     ports: Vec<u16>,
-    streams: HashMap<StreamId, Box<Stream>>,
+    streams: Bounded<Counted<ZenohStreams>, HashMap<StreamId, Box<Stream>>>,
     /// Streams of each flow: two if both sockets are of this host.
     flows: HashMap<Flow, usize>,
     /// The order in which to evict, with streams that may be gone.
-    order: VecDeque<StreamId>,
-    bytes: usize,
+    order: Bounded<ZenohOrder, VecDeque<StreamId>>,
+    bytes: Sum<Counted<ZenohStreamBytes>>,
     /// When they were last examined for segments that wait too long.
     examined: Timestamp,
     counters: Counters,
@@ -125,10 +121,10 @@ impl Streams {
     pub fn new(ports: Vec<u16>) -> Self {
         Self {
             ports,
-            streams: HashMap::new(),
+            streams: Bounded::default(),
             flows: HashMap::new(),
-            order: VecDeque::new(),
-            bytes: 0,
+            order: Bounded::default(),
+            bytes: Sum::default(),
             examined: Timestamp(0),
             counters: Counters::default(),
         }
@@ -176,7 +172,8 @@ impl Streams {
             stream.give_up(counters, &mut |event| pass(event));
         }
         let (after, is_zenoh) = (stream.held(), stream.is_zenoh());
-        self.bytes = (self.bytes + after).saturating_sub(before);
+        self.bytes.sub(before);
+        self.bytes.add(after);
         if chunk.end || took == Took::NotZenoh {
             if (is_zenoh || was_zenoh) && chunk.end {
                 pass(StreamEvent::End);
@@ -188,7 +185,7 @@ impl Streams {
         if took == Took::Tls {
             pass(StreamEvent::Unseen(Unseen::Tls));
         }
-        while self.bytes > MAX_BYTES {
+        while self.bytes.is_exceeded() {
             self.evict();
         }
     }
@@ -235,7 +232,7 @@ impl Streams {
         }
         self.examined = now;
         let counters = &mut self.counters;
-        for (id, stream) in &mut self.streams {
+        for (id, stream) in self.streams.iter_mut() {
             if !stream.has_waited(now) {
                 continue;
             }
@@ -247,7 +244,8 @@ impl Streams {
                     event,
                 });
             });
-            self.bytes = (self.bytes + stream.held()).saturating_sub(before);
+            self.bytes.sub(before);
+            self.bytes.add(stream.held());
         }
     }
 
@@ -266,33 +264,18 @@ impl Streams {
     /// Returns the number of bytes that wait.
     #[must_use]
     pub const fn bytes(&self) -> usize {
-        self.bytes
+        self.bytes.used()
     }
 
-    /// Returns the size and cap of each table.
+    /// Returns the rows of the metrics. A connection that a cap removes leaves both tables.
     #[must_use]
-    pub fn sizes(&self) -> [Size; 4] {
-        // The destructuring makes a new table fail to compile until it is listed here.
-        let Self {
-            ports: _,
-            streams,
-            flows,
-            order,
-            bytes,
-            examined: _,
-            counters: _,
-        } = self;
-        [
-            Size::new("zenoh.streams", streams.len(), MAX_STREAMS),
-            Size::new("zenoh.streams.flows", flows.len(), MAX_STREAMS),
-            Size::new("zenoh.streams.order", order.len(), 2 * MAX_STREAMS),
-            Size::new("zenoh.streams.bytes", *bytes, MAX_BYTES),
-        ]
+    pub fn tables(&self) -> [TableFacts; 2] {
+        [self.streams.facts(), self.bytes.facts()]
     }
 
     fn forget(&mut self, id: &StreamId) {
         if let Some(stream) = self.streams.remove(id) {
-            self.bytes = self.bytes.saturating_sub(stream.held());
+            self.bytes.sub(stream.held());
             if let Entry::Occupied(mut count) = self.flows.entry(id.flow) {
                 *count.get_mut() -= 1;
                 if *count.get() == 0 {
@@ -300,15 +283,15 @@ impl Streams {
                 }
             }
         }
-        if self.order.len() >= 2 * MAX_STREAMS {
-            let streams = &self.streams;
-            self.order.retain(|id| streams.contains_key(id));
-        }
     }
 
     fn make_room(&mut self) {
-        while self.streams.len() >= MAX_STREAMS {
+        while self.streams.is_full() {
             self.evict();
+        }
+        if self.order.is_full() {
+            let streams = &self.streams;
+            self.order.retain(|id| streams.contains_key(id));
         }
     }
 
@@ -320,13 +303,14 @@ impl Streams {
         let oldest = stranger.or_else(|| self.order.iter().position(|id| known(id).is_some()));
         match oldest.and_then(|position| self.order.remove(position)) {
             Some(id) => {
-                self.counters.evicted += 1;
+                self.streams.refuse();
+                self.bytes.refuse();
                 self.forget(&id);
             }
             None => {
                 self.streams.clear();
                 self.flows.clear();
-                self.bytes = 0;
+                self.bytes.clear();
             }
         }
     }

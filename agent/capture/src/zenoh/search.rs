@@ -4,12 +4,13 @@
 //! as they can be read as batches. Two messages that continue the numbers of a lane are proof. A
 //! KEEP_ALIVE alone in its batch, or an INIT, needs no other one.
 
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::zenoh::{Batch, Lane, Message, Resolution, VERSION};
+
+use crate::tables::SearchedBytes;
 
 /// Messages of a lane that continue its numbers and so make a boundary certain.
 const CERTAIN: u32 = 2;
-/// Most bytes that are collected: three batches of the largest size.
-const MAX_HELD: usize = 3 * (2 + u16::MAX as usize);
 /// Largest version that is another version of Zenoh rather than something else.
 const PLAUSIBLE_VERSION: u8 = 0x3f;
 
@@ -26,46 +27,46 @@ pub enum Looks {
 /// Bytes from a place where a batch may begin.
 #[derive(Debug, Default)]
 pub struct Search {
-    held: Vec<u8>,
+    held: Bounded<SearchedBytes, Vec<u8>>,
 }
 
 impl Search {
     /// Returns the number of bytes collected.
-    pub const fn held(&self) -> usize {
+    pub fn held(&self) -> usize {
         self.held.capacity()
     }
 
     /// Returns whether nothing is collected.
-    pub const fn is_empty(&self) -> bool {
+    pub fn is_empty(&self) -> bool {
         self.held.is_empty()
     }
 
     /// Adds the bytes of a segment. If `begins`, the connection begins with the first of them all.
     pub fn add(&mut self, bytes: &[u8], length: usize, begins: bool) -> Looks {
-        if bytes.len() < length || self.held.len() + length > MAX_HELD {
+        let was_empty = self.held.is_empty();
+        if bytes.len() < length || !self.held.extend_from_slice(bytes) {
             // Without all bytes no boundary can be found.
-            self.held = Vec::new();
+            self.held.take();
             return if begins {
                 Looks::Other
             } else {
                 Looks::Undecided
             };
         }
-        let was_empty = self.held.is_empty();
-        self.held.extend_from_slice(bytes);
         let looks = self.judge(begins);
         if begins || was_empty || !matches!(looks, Looks::Other) {
             return self.settled(looks);
         }
         // The collected bytes began within a batch: this segment may begin with one.
-        self.held = bytes.to_vec();
+        self.held.take();
+        self.held.extend_from_slice(bytes);
         let looks = self.judge(false);
         self.settled(looks)
     }
 
     fn settled(&mut self, looks: Looks) -> Looks {
         if matches!(looks, Looks::Other) {
-            self.held = Vec::new();
+            self.held.take();
         }
         looks
     }
@@ -89,7 +90,7 @@ impl Search {
                 return Looks::Other;
             }
             if lanes.certain >= CERTAIN {
-                return Looks::Zenoh(std::mem::take(&mut self.held));
+                return Looks::Zenoh(self.held.take());
             }
             (rest, is_first) = (after, false);
         }

@@ -3,16 +3,14 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use ros2probe_model::bounded::{Bounded, Sum};
 use ros2probe_model::zenoh::StreamEvent;
 use ros2probe_wire::Timestamp;
 
 use super::search::{Looks, Search, begins_tls};
 use super::{Before, Chunk, Counters};
+use crate::tables::{SegmentsAhead, SegmentsAheadBytes};
 
-/// Most segments of a connection that wait for missing ones.
-const MAX_AHEAD: usize = 4096;
-/// Most bytes of these segments.
-const MAX_AHEAD_BYTES: usize = 4 << 20;
 /// Farthest that a segment may be ahead of the missing bytes: the largest TCP window.
 const WINDOW: u32 = 1 << 30;
 /// Time after which missing bytes were not captured. TCP sends them again before, but late if the
@@ -84,8 +82,8 @@ pub struct Stream {
     /// TCP sequence number of the next byte.
     next: u32,
     position: Position,
-    ahead: VecDeque<Ahead>,
-    ahead_bytes: usize,
+    ahead: Bounded<SegmentsAhead, VecDeque<Ahead>>,
+    ahead_bytes: Sum<SegmentsAheadBytes>,
     /// When the first segment began to wait.
     waiting_since: Timestamp,
     /// Whether batches were read in it, or it is encrypted on a port of Zenoh.
@@ -104,8 +102,8 @@ impl Stream {
             first: chunk.sequence_number,
             next: chunk.sequence_number.wrapping_add(u32::from(chunk.syn)),
             position,
-            ahead: VecDeque::new(),
-            ahead_bytes: 0,
+            ahead: Bounded::default(),
+            ahead_bytes: Sum::default(),
             waiting_since: Timestamp(0),
             was_zenoh: false,
             is_zenoh_port,
@@ -129,7 +127,7 @@ impl Stream {
             Position::Batch(partial) => partial.captured.capacity(),
             Position::Other => 0,
         };
-        partial + self.ahead_bytes
+        partial + self.ahead_bytes.used()
     }
 
     /// Returns whether segments wait for missing ones.
@@ -168,7 +166,7 @@ impl Stream {
                 self.waiting_since = chunk.time;
             }
             self.keep(start, chunk);
-            let is_full = self.ahead.len() > MAX_AHEAD || self.ahead_bytes > MAX_AHEAD_BYTES;
+            let is_full = self.ahead.is_full() || self.ahead_bytes.is_exceeded();
             if is_full || self.has_waited(chunk.time) {
                 self.give_up(counters, report);
             }
@@ -210,7 +208,7 @@ impl Stream {
         report: &mut impl FnMut(StreamEvent<'_>),
     ) {
         self.ahead.clear();
-        self.ahead_bytes = 0;
+        self.ahead_bytes.clear();
         self.next = start;
         self.position = Position::Searching(Search::default());
         if self.was_zenoh {
@@ -239,23 +237,26 @@ impl Stream {
             before: chunk.before,
             bytes: chunk.bytes.into(),
         };
-        self.ahead_bytes += ahead.held();
+        self.ahead_bytes.add(ahead.held());
         self.ahead.insert(position, ahead);
     }
 
     /// Reads the segments that waited for the last one.
     fn catch_up(&mut self, counters: &mut Counters, report: &mut impl FnMut(StreamEvent<'_>)) {
-        while let Some(first) = self.ahead.pop_front() {
-            if first.before == Before::Skipped {
-                self.skip_to(first.sequence_number);
+        while let Some(first) = self.ahead.front() {
+            let (start, before) = (first.sequence_number, first.before);
+            if before == Before::Skipped {
+                self.skip_to(start);
             }
-            let distance = first.sequence_number.wrapping_sub(self.next);
+            let distance = start.wrapping_sub(self.next);
             if distance != 0 && distance < WINDOW {
-                self.ahead.push_front(first);
                 break;
             }
-            self.ahead_bytes -= first.held();
-            let (start, length) = (first.sequence_number, first.length);
+            let Some(first) = self.ahead.pop_front() else {
+                break;
+            };
+            self.ahead_bytes.sub(first.held());
+            let length = first.length;
             self.read(
                 start,
                 &first.bytes,

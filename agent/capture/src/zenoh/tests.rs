@@ -6,6 +6,8 @@ use ros2probe_wire::Expansion;
 
 use super::*;
 use crate::pcap::PcapReader;
+use crate::tables::tests::assert_driven;
+use crate::tables::{SearchedBytes, SegmentsAhead, SegmentsAheadBytes};
 
 /// What a replay of a capture reports.
 #[derive(Default, PartialEq, Eq, Debug)]
@@ -93,10 +95,12 @@ fn follow(segments: &[Segment]) -> (Reported, Counters) {
         };
         streams.advance(segment.time, |report| reported.note(report));
         streams.chunk(&chunk, |report| reported.note(report));
-        for size in streams.sizes() {
-            assert!(size.entries <= size.cap, "{size:?}");
+        for table in streams.tables() {
+            assert!(table.size <= table.limit, "{table:?}");
         }
     }
+    let [table, _] = streams.tables();
+    assert_eq!(table.evictions, 0);
     (reported, streams.counters())
 }
 
@@ -105,7 +109,7 @@ fn a_capture_has_as_many_batches_as_an_independent_decoder_found() {
     let (reported, counters) = follow(&segments());
     assert_eq!(reported.batches.len(), 3517);
     assert_eq!(counters.batches, 3517);
-    assert_eq!((reported.gaps, counters.gaps, counters.evicted), (0, 0, 0));
+    assert_eq!((reported.gaps, counters.gaps), (0, 0));
     assert_eq!(counters.retransmitted_bytes, 797);
 }
 
@@ -275,8 +279,10 @@ fn more_directions_than_there_is_room_for_push_out_the_oldest_stranger() {
     for port in 2..5002 {
         streams.chunk(&chunk(port, 1, &[0; 10]), |_| {});
     }
-    assert_eq!(streams.sizes()[0].entries, MAX_STREAMS);
-    assert_eq!(streams.counters().evicted, 5001 - MAX_STREAMS as u64);
+    assert_driven::<ZenohStreams>();
+    let [table, bytes] = streams.tables();
+    assert_eq!(table.evictions, 5001 - ZenohStreams::CAP as u64);
+    assert_eq!(bytes.evictions, table.evictions);
     assert!(streams.follows_flow(&zenoh.stream.flow));
     assert!(!streams.follows_flow(&chunk(2, 1, &[]).stream.flow));
 }
@@ -291,10 +297,11 @@ fn unfinished_batches_keep_within_their_bytes() {
             ..chunk(port, 1, &begun)
         };
         streams.chunk(&begun, |_| {});
-        assert!(streams.bytes() <= MAX_BYTES);
+        assert!(streams.bytes() <= ZenohStreamBytes::CAP);
     }
-    assert!(streams.bytes() > MAX_BYTES - 70_000);
-    assert!(streams.counters().evicted > 100);
+    assert_driven::<ZenohStreamBytes>();
+    assert!(streams.bytes() > ZenohStreamBytes::CAP - 70_000);
+    assert!(streams.tables()[1].evictions > 100);
 }
 
 #[test]
@@ -311,6 +318,7 @@ fn so_many_segments_wait_for_missing_bytes_that_then_are_given_up() {
     assert_eq!(streams.counters().gaps, 0);
     streams.chunk(&chunk(1, 100_000, &[1, 0, 4]), |_| {});
     assert_eq!(streams.counters().gaps, 1);
+    assert_driven::<SegmentsAhead>();
 }
 
 #[test]
@@ -330,6 +338,7 @@ fn so_many_bytes_wait_for_missing_ones_that_then_are_given_up() {
     assert!((63 << 16..4 << 20).contains(&streams.bytes()));
     streams.chunk(&chunk(1, 100 + (63 << 16), &segment), |_| {});
     assert_eq!(streams.counters().gaps, 1);
+    assert_driven::<SegmentsAheadBytes>();
 }
 
 #[test]
@@ -349,6 +358,26 @@ fn bytes_that_may_be_batches_are_collected_up_to_three_of_the_largest() {
     // Memory is reserved ahead.
     assert!((3 * 65_537..=6 * 65_537).contains(&most), "{most} bytes");
     assert_eq!(streams.counters().batches, 0);
+    assert_driven::<SearchedBytes>();
+}
+
+#[test]
+fn connections_that_ended_leave_the_order_once_it_is_full() {
+    let mut streams = Streams::default();
+    for turn in 0..20_000 {
+        let stays = turn % 8 == 0;
+        let port = 1 + turn;
+        streams.chunk(&chunk(port, 1, &[0; 10]), |_| {});
+        let end = Chunk {
+            end: true,
+            ..chunk(port, 11, &[])
+        };
+        if !stays {
+            streams.chunk(&end, |_| {});
+        }
+    }
+    assert_eq!(streams.streams.len(), 2_500);
+    assert_driven::<ZenohOrder>();
 }
 
 /// Zenoh sends one in place of the rest of a message that it drops.

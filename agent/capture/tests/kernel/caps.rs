@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use ros2probe_capture::filter_reader::{FilterReader, MAX_WAITING};
+use ros2probe_capture::filter_reader::FilterReader;
 use ros2probe_capture::system::Clocks;
+use ros2probe_capture::tables::{FreshDatagrams, WaitingRecords};
 use ros2probe_model::observer::{Observer, Settings};
 use ros2probe_testing::program_run::{self, Hook, Kernel};
 use ros2probe_wire::filter::{
@@ -134,6 +135,27 @@ fn runs_beyond_the_table_are_a_record_for_each_fragment() {
 }
 
 #[test]
+fn captured_datagrams_beyond_those_that_may_wait_stay_in_the_ring() {
+    let kernel = Kernel::load_hook(Hook::Ingress);
+    let mut intake = FilterReader::new(kernel.filter, &[]);
+    let mut observer = Observer::new(Settings::default());
+    // All datagrams are younger than this, so none is read.
+    let before = Clocks::read();
+    for number in 1..=100 {
+        let message = program_run::message(writer(0), number..=number, 16);
+        let datagram = program_run::datagram(&message);
+        program_run::run(intake.filter().program(), &datagram, 1);
+    }
+    intake.poll(&before, &mut observer);
+    assert_eq!(intake.datagrams(), FreshDatagrams::CAP as u64);
+    intake.poll(&before, &mut observer);
+    assert_eq!(intake.datagrams(), FreshDatagrams::CAP as u64);
+    intake.drain(&Clocks::read(), &mut observer);
+    intake.drain(&Clocks::read(), &mut observer);
+    assert_eq!(intake.datagrams(), 100);
+}
+
+#[test]
 fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_is_counted() {
     use ros2probe_wire::time::SECOND;
     const SAMPLES: u32 = 32;
@@ -166,7 +188,7 @@ fn records_beyond_those_that_may_wait_stay_in_the_ring_and_what_it_cannot_hold_i
         intake.poll(&before, &mut observer);
     }
     let taken = intake.copied_bytes() as usize / size_of::<Record>();
-    assert_eq!(taken, MAX_WAITING);
+    assert_eq!(taken, WaitingRecords::CAP);
     assert_eq!(observer.snapshot(before.now).records, 0);
 
     // Afterwards there is room again: records left in the ring count too, and so do new ones.

@@ -9,8 +9,10 @@ use proptest::prelude::*;
 use ros2probe_daemon::discover::Refusal;
 use ros2probe_daemon::discover::message::{LocalParticipant, Message};
 use ros2probe_daemon::discover::session::{MOST_PACKETS, Outgoing, Session, Target};
+use ros2probe_model::bounded::ledger;
 use ros2probe_model::discovery::{Addresses, hexadecimal};
 use ros2probe_model::snapshot::{ParticipantFacts, ProcessFacts};
+use ros2probe_testing::model::forge::{self, SEDP_WRITERS};
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::MILLISECOND;
@@ -217,6 +219,33 @@ fn a_participant_that_announces_without_end_costs_no_more_packets() {
         let outgoing = recording.play(&mut session, &answers);
         assert_is_polite(&session, &recording, &outgoing);
         assert!(session.missing() > 0 && session.missing() <= 2 * 4096);
+    }
+}
+
+#[test]
+fn announcements_without_end_fill_no_table_beyond_its_cap() {
+    let recording = Recording::read("fastdds.txt");
+    let mut session = recording.session();
+    let now = Timestamp(START);
+    session.advance(now);
+    let prefix = recording.target.prefix;
+    let message = || forge::Message::from(prefix);
+    let mut put = |message: forge::Message| session.datagram(now, &message.bytes());
+    for number in 1..=10_000_u32 {
+        let [_, a, b, c] = number.to_be_bytes();
+        let entity = EntityId([a, b, c, 3]);
+        let endpoint = forge::endpoint(Guid::new(prefix, entity), "rt/a", "a::msg::dds_::B_", true);
+        put(message().data(SEDP_WRITERS, number.into(), &endpoint));
+        let (sample, payload) = (u64::from(20_000 + number), [5; 1000]);
+        put(message().fragment(SEDP_WRITERS, sample, 1, 64, &payload));
+        let range = [0, 0, 0, 0, 1, 0, 0, 0].repeat(2);
+        let heartbeat = [&[0; 4][..], &entity.0, &range, &[1, 0, 0, 0]].concat();
+        put(message().submessage(0x07, 1, &heartbeat));
+    }
+    let ledger = ledger();
+    for table in ["received", "endpoints", "partial", "writers"] {
+        let used = ledger[&*format!("discover.{table}")];
+        assert!(used.is_driven(), "{table}: {used:?}");
     }
 }
 

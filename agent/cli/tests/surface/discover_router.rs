@@ -8,11 +8,12 @@ mod command;
 use std::path::Path;
 
 use proptest::prelude::*;
-use ros2probe_daemon::discover::zenoh::graph::{EndpointKind, MOST_TOKENS};
+use ros2probe_daemon::discover::zenoh::graph::EndpointKind;
 use ros2probe_daemon::discover::zenoh::message;
 use ros2probe_daemon::discover::zenoh::session::{
     MOST_BYTES, MOST_MESSAGE_BYTES, Session, Step, Unusable,
 };
+use ros2probe_daemon::tables::RouterTokens;
 use ros2probe_wire::DomainId;
 use ros2probe_wire::zenoh::{Batch, Message, NetworkMessage, WhatAmI};
 use zenoh_buffers::reader::{HasReader, Reader as _};
@@ -276,22 +277,22 @@ fn a_missing_fragment_ends_the_conversation() {
 #[test]
 fn tokens_beyond_the_cap_end_the_conversation() {
     let mut session = asked();
-    for number in 0..MOST_TOKENS {
+    for number in 0..RouterTokens::CAP {
         session.receive(&frame(&token(&publisher(number)))).unwrap();
     }
     assert_eq!(
         (session.step(), publishers(&session)),
-        (Step::Request, MOST_TOKENS)
+        (Step::Request, RouterTokens::CAP)
     );
     // One that is known needs no room.
     session.receive(&frame(&token(&publisher(5)))).unwrap();
     assert_eq!(session.step(), Step::Request);
     session
-        .receive(&frame(&token(&publisher(MOST_TOKENS))))
+        .receive(&frame(&token(&publisher(RouterTokens::CAP))))
         .unwrap();
     assert_eq!(
         (session.step(), publishers(&session)),
-        (Step::Full, MOST_TOKENS)
+        (Step::Full, RouterTokens::CAP)
     );
 }
 

@@ -144,11 +144,13 @@ fn the_book_s_tables_are_those_of_the_sources() {
         ];
         derived.iter().any(|name| table.name.starts_with(name))
     };
+    let declared = |page, tables: &[Table]| {
+        let (begin, end) = ("src/tables.rs -->\n", "<!-- tables: end");
+        (page, begin, end, tables_markdown(tables))
+    };
     let tables = |page, derived| {
         let tables = ALL.iter().filter(|table| is_derived(table) == derived);
-        let tables: Vec<_> = tables.copied().collect();
-        let (begin, end) = ("model/src/tables.rs -->\n", "<!-- tables: end");
-        (page, begin, end, tables_markdown(&tables))
+        declared(page, &tables.copied().collect::<Vec<_>>())
     };
     for (page, begin, end, wanted) in [
         metrics("metrics-graph.md"),
@@ -170,6 +172,8 @@ fn the_book_s_tables_are_those_of_the_sources() {
         ),
         tables("limits-model.md", false),
         tables("limits-tables.md", true),
+        declared("limits-capture.md", ros2probe_capture::tables::ALL),
+        declared("limits-agent.md", ros2probe_daemon::tables::ALL),
     ] {
         let path = docs.join(page);
         let text = std::fs::read_to_string(&path).unwrap();

@@ -8,10 +8,10 @@ use ros2probe_wire::EntityId;
 use ros2probe_wire::discovery::Role;
 use ros2probe_wire::record::Gap;
 
-use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
+use crate::tables::ReceivedAnnouncements;
+use ros2probe_model::bounded::Bounded;
 
-/// Most announcements of one kind, independent of the range in a HEARTBEAT.
-pub(super) const MOST_ANNOUNCEMENTS: u64 = 4096;
+use super::message::{MOST_NUMBERS, PUBLICATIONS_READER, SUBSCRIPTIONS_READER};
 
 /// A writer of announcements and its state.
 #[derive(Debug)]
@@ -21,13 +21,13 @@ pub(super) struct Announcer {
     pub(super) role: Role,
     /// First and last sequence number in its HEARTBEAT.
     pub(super) available: Option<RangeInclusive<SequenceNumber>>,
-    pub(super) received: BTreeSet<SequenceNumber>,
+    pub(super) received: Bounded<ReceivedAnnouncements, BTreeSet<SequenceNumber>>,
     /// Sequence numbers of the last request.
     requested: BTreeSet<SequenceNumber>,
 }
 
 impl Announcer {
-    pub(super) const fn of(role: Role) -> Self {
+    pub(super) fn of(role: Role) -> Self {
         let (writer, reader) = match role {
             Role::Writer => (EntityId::SEDP_PUBLICATIONS_WRITER, PUBLICATIONS_READER),
             Role::Reader => (EntityId::SEDP_SUBSCRIPTIONS_WRITER, SUBSCRIPTIONS_READER),
@@ -37,7 +37,7 @@ impl Announcer {
             reader,
             role,
             available: None,
-            received: BTreeSet::new(),
+            received: Bounded::default(),
             requested: BTreeSet::new(),
         }
     }
@@ -49,7 +49,7 @@ impl Announcer {
             None => (SequenceNumber::FIRST, SequenceNumber::ZERO),
         };
         let first = first.max(SequenceNumber::FIRST);
-        let last = last.min(first.saturating_add(MOST_ANNOUNCEMENTS - 1));
+        let last = last.min(first.saturating_add(ReceivedAnnouncements::CAP as u64 - 1));
         first
             .until(last.next())
             .filter(|number| !self.received.contains(number))
@@ -79,6 +79,8 @@ impl Announcer {
             .missing()
             .filter(|number| irrelevant.contains(number) || listed.contains(number))
             .collect();
-        self.received.extend(skipped);
+        for number in skipped {
+            self.received.insert(number);
+        }
     }
 }

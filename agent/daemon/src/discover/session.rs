@@ -17,11 +17,13 @@ use ros2probe_wire::rtps::{InlineQos, Payload, VendorId};
 use ros2probe_wire::walk::{self, Envelope, Found};
 use ros2probe_wire::{EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
-use super::announcer::{Announcer, MOST_ANNOUNCEMENTS};
+use super::announcer::Announcer;
 use super::message::{
     LocalParticipant, MOST_NUMBERS, Message, NODES_READER, PUBLICATIONS_READER,
     SUBSCRIPTIONS_READER,
 };
+use crate::tables::{DiscoveredEndpoints, PartialAnnouncements, UserWriters};
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::discovery_fragments::DiscoveryFragments;
 
 /// Most packets sent to one participant, including the goodbye.
@@ -38,10 +40,6 @@ const TIMEOUT: Duration = Duration::from_millis(300);
 const NODES_TIMEOUT: Duration = Duration::from_millis(500);
 /// Longest conversation.
 const LIMIT: Duration = Duration::from_secs(3);
-/// Most fragmented samples in assembly.
-const MOST_PARTIAL: usize = 8;
-/// Most user writers whose HEARTBEAT is kept until the writer of the node list is known.
-const MOST_WRITERS: usize = 256;
 const NODES_TOPIC: &str = "ros_discovery_info";
 
 /// Participant that receives requests, and its addresses.
@@ -92,10 +90,10 @@ pub struct Session {
     requests: u32,
     discovery_fragments: DiscoveryFragments,
     /// Incomplete samples, each with the time of its last fragment.
-    partial: BTreeMap<(EntityId, SequenceNumber), Timestamp>,
-    endpoints: BTreeMap<Guid, EndpointAnnouncement>,
+    partial: Bounded<PartialAnnouncements, BTreeMap<(EntityId, SequenceNumber), Timestamp>>,
+    endpoints: Bounded<DiscoveredEndpoints, BTreeMap<Guid, EndpointAnnouncement>>,
     /// First and last sequence number of user writers, from their HEARTBEATs.
-    user_writers: BTreeMap<EntityId, RangeInclusive<SequenceNumber>>,
+    user_writers: Bounded<UserWriters, BTreeMap<EntityId, RangeInclusive<SequenceNumber>>>,
     nodes: Nodes,
     sent: Traffic,
     received: Traffic,
@@ -130,9 +128,9 @@ impl Session {
             asked: None,
             requests: 0,
             discovery_fragments: DiscoveryFragments::default(),
-            partial: BTreeMap::new(),
-            endpoints: BTreeMap::new(),
-            user_writers: BTreeMap::new(),
+            partial: Bounded::default(),
+            endpoints: Bounded::default(),
+            user_writers: Bounded::default(),
             nodes: Nodes::Open { since: None },
             sent: Traffic::default(),
             received: Traffic::default(),
@@ -238,7 +236,7 @@ impl Session {
 
     /// Endpoints of the participant.
     #[must_use]
-    pub const fn endpoints(&self) -> &BTreeMap<Guid, EndpointAnnouncement> {
+    pub fn endpoints(&self) -> &BTreeMap<Guid, EndpointAnnouncement> {
         &self.endpoints
     }
 
@@ -274,10 +272,7 @@ impl Session {
                 if let Some(announcer) = announcer {
                     announcer.available = Some(range);
                     self.heard.get_or_insert(now);
-                } else if !entity.is_builtin()
-                    && (self.user_writers.len() < MOST_WRITERS
-                        || self.user_writers.contains_key(&entity))
-                {
+                } else if !entity.is_builtin() {
                     self.user_writers.insert(entity, range);
                 }
             }
@@ -325,9 +320,7 @@ impl Session {
         };
         let key = (found.record.writer().entity, sample.sequence_number());
         let Some(bytes) = self.discovery_fragments.put(fragments, found.payload) else {
-            if self.partial.len() < MOST_PARTIAL || self.partial.contains_key(&key) {
-                self.partial.insert(key, now);
-            }
+            self.partial.insert(key, now);
             return None;
         };
         self.partial.remove(&key);
@@ -351,9 +344,7 @@ impl Session {
         let Some(announcer) = announcers.into_iter().find(|it| it.writer == entity) else {
             return;
         };
-        if announcer.received.len() < usize::try_from(MOST_ANNOUNCEMENTS).unwrap_or(usize::MAX) {
-            announcer.received.insert(number);
-        }
+        announcer.received.insert(number);
         match discovery::endpoint(announcer.role, vendor, payload, qos) {
             Ok(Discovery::Alive(endpoint)) if endpoint.guid.prefix == self.target.prefix => {
                 self.endpoints.insert(endpoint.guid, endpoint);

@@ -119,14 +119,14 @@ fn a_storm_is_limited_each_second_and_summed_up_in_one_event() {
     let mut more = taken(vec![node(1), other]);
     more.overflow = vec![(Class::Endpoint, 9)];
     log.add(more, second(1));
-    let batch = log.read(0, KEPT);
+    let batch = log.read(0, KeptEvents::CAP);
     assert_eq!(batch.records.len() as u64, u64::from(MOST) + 1);
     assert_eq!(names(&batch).last(), Some(&"ros2.topic.silent"));
     log.add(Taken::default(), second(1));
     assert_eq!(log.last(), batch.last);
 
     log.add(taken(vec![node(2 * SECOND)]), second(2));
-    let rest = log.read(batch.last, KEPT);
+    let rest = log.read(batch.last, KeptEvents::CAP);
     let suppressed = "ros2probe.events.suppressed";
     assert_eq!(
         names(&rest),
@@ -184,7 +184,7 @@ fn a_replay_at_full_speed_prints_the_same_as_one_at_the_capture_s_pace() {
     }
     let recorded = |log: &EventLog| {
         log.settle();
-        let records = log.read(0, KEPT).records;
+        let records = log.read(0, KeptEvents::CAP).records;
         let recorded = records
             .iter()
             .map(|record| (record.at, record.definition.name));
@@ -204,10 +204,11 @@ fn an_overwritten_sample_is_reported_to_the_reader_that_missed_it() {
         log.add(taken((0..200).map(|each| node(at.0 + each)).collect()), at);
     }
     assert_eq!(log.last(), 5000);
-    let batch = log.read(100, KEPT);
-    let lost = 5000 - KEPT as u64 - 100;
+    let batch = log.read(100, KeptEvents::CAP);
+    let lost = 5000 - KeptEvents::CAP as u64 - 100;
     assert_eq!((batch.lagged, batch.last), (lost, 5000));
-    assert_eq!(batch.records.len(), KEPT);
+    assert_eq!(batch.records.len(), KeptEvents::CAP);
+    crate::tables::tests::assert_driven::<KeptEvents>();
     assert_eq!(log.read(4000, 1).lagged, 0);
     log.overtook(Reader::Otlp, lost);
     assert!(log.dropped().contains(&("otlp_lagged", lost)));

@@ -20,7 +20,9 @@ use ros2probe_capture::host_tap::HostTap;
 use ros2probe_capture::live::{CaptureError, LiveSource, Part};
 use ros2probe_capture::reassembly::Limits;
 use ros2probe_capture::shm;
+use ros2probe_capture::tables::{ZenohStreamBytes, ZenohStreams};
 use ros2probe_capture::zenoh::Streams;
+use ros2probe_model::bounded::Declared as _;
 use ros2probe_model::observer::Observer;
 use ros2probe_model::snapshot::TableFacts;
 
@@ -158,22 +160,21 @@ impl Source {
             Self::Live(live) => live.streams().collect(),
             Self::Replay(replay) => vec![replay.streams()],
         };
-        let evictions = streams.iter().map(|each| each.counters().evicted).sum();
-        let table = |table, index: usize| {
-            let sizes = || {
-                streams
-                    .iter()
-                    .filter_map(|each| each.sizes().get(index).copied())
-            };
-            TableFacts {
-                table,
-                size: sizes().map(|size| size.entries as u64).sum(),
-                limit: sizes().map(|size| size.cap as u64).sum(),
-                bytes: None,
-                evictions,
+        let mut sums = [ZenohStreams::TABLE, ZenohStreamBytes::TABLE].map(|table| TableFacts {
+            table: table.name,
+            size: 0,
+            limit: 0,
+            bytes: None,
+            evictions: 0,
+        });
+        for each in streams {
+            for (sum, table) in sums.iter_mut().zip(each.tables()) {
+                sum.size += table.size;
+                sum.limit += table.limit;
+                sum.evictions += table.evictions;
             }
-        };
-        [table("zenoh_streams", 0), table("zenoh_stream_bytes", 3)]
+        }
+        sums
     }
 
     pub(super) fn facts(&mut self) -> AgentFacts {

@@ -11,23 +11,21 @@ use ros2probe_wire::names::DdsTopic;
 use ros2probe_wire::qos::Durability;
 
 use crate::config::{Retain, Watch};
+use crate::tables::{RetainedBytes, RetainedWriters};
+use ros2probe_model::bounded::{Bounded, Sum};
 use ros2probe_model::dispatch::{Sample, Topic};
 use ros2probe_model::naming::Naming;
 use ros2probe_model::selection::{Depth, SampleRequest, Selection};
 
 /// First id of requests for retention; lower ids belong to readers.
 const FIRST: u64 = 1 << 63;
-/// Most writers.
-const WRITERS: usize = 256;
-/// Most bytes of all samples together.
-const BYTES: usize = 4 << 20;
 
 /// Retained samples.
 #[derive(Debug, Default)]
 pub(super) struct Retained {
     sample_requests: Vec<SampleRequest>,
-    samples: BTreeMap<Guid, Arc<Sample>>,
-    bytes: usize,
+    samples: Bounded<RetainedWriters, BTreeMap<Guid, Arc<Sample>>>,
+    bytes: Sum<RetainedBytes>,
 }
 
 impl Retained {
@@ -50,7 +48,9 @@ impl Retained {
                 .iter()
                 .any(|request| covers(request, &sample.topic))
         });
-        self.bytes = self.samples.values().map(|sample| size(sample)).sum();
+        self.bytes.clear();
+        self.bytes
+            .add(self.samples.values().map(|sample| size(sample)).sum());
     }
 
     /// Requests to the model for these samples.
@@ -60,7 +60,7 @@ impl Retained {
 
     /// Bytes of retained samples.
     pub(super) const fn bytes(&self) -> usize {
-        self.bytes
+        self.bytes.used()
     }
 
     /// Retains a sample that was delivered to `to`, if one of these is a retention.
@@ -68,20 +68,19 @@ impl Retained {
         let is_ours = to.iter().any(|id| *id >= FIRST);
         let offered = sample.topic.offered.as_ref();
         let lasts = offered.is_some_and(|offered| offered.qos.durability != Durability::VOLATILE);
-        if !is_ours || !lasts || sample.payload.is_none() || size(sample) > BYTES {
+        if !is_ours || !lasts || sample.payload.is_none() || size(sample) > RetainedBytes::CAP {
             return;
         }
-        self.bytes += size(sample);
-        if let Some(before) = self.samples.insert(sample.writer, Arc::clone(sample)) {
-            self.bytes -= size(&before);
-        }
-        while self.bytes > BYTES || self.samples.len() > WRITERS {
+        self.forget(sample.writer);
+        while self.samples.is_full() || size(sample) > self.bytes.room() {
             let oldest = self.samples.iter().min_by_key(|(_, sample)| sample.time);
             let Some(oldest) = oldest.map(|(writer, _)| *writer) else {
                 return;
             };
             self.forget(oldest);
         }
+        self.bytes.add(size(sample));
+        self.samples.insert(sample.writer, Arc::clone(sample));
     }
 
     /// Samples that a new reader receives first, oldest first, from writers that still exist.
@@ -103,7 +102,7 @@ impl Retained {
 
     fn forget(&mut self, writer: Guid) {
         if let Some(sample) = self.samples.remove(&writer) {
-            self.bytes -= size(&sample);
+            self.bytes.sub(size(&sample));
         }
     }
 }
@@ -226,14 +225,29 @@ mod tests {
                 number,
                 number.into(),
                 Durability::TRANSIENT_LOCAL,
-                BYTES / 4,
+                RetainedBytes::CAP / 4,
             );
             retained.keep(&[id], &large);
-            assert!(retained.bytes() <= BYTES);
+            assert!(retained.bytes() <= RetainedBytes::CAP);
         }
         assert_eq!(times(&mut retained), [2, 3, 4, 5]);
-        let huge = sample("/maps/a", 9, 9, Durability::TRANSIENT_LOCAL, BYTES + 1);
+        let huge = sample(
+            "/maps/a",
+            9,
+            9,
+            Durability::TRANSIENT_LOCAL,
+            RetainedBytes::CAP + 1,
+        );
         retained.keep(&[id], &huge);
         assert_eq!(times(&mut retained), [2, 3, 4, 5]);
+        crate::tables::tests::assert_driven::<RetainedBytes>();
+        for number in 0..300 {
+            let mut small = sample("/maps/a", 1, 10 + number, Durability::TRANSIENT_LOCAL, 1);
+            let entity = EntityId([1, (number >> 8) as u8, number as u8, 3]);
+            Arc::get_mut(&mut small).unwrap().writer.entity = entity;
+            retained.keep(&[id], &small);
+        }
+        crate::tables::tests::assert_driven::<RetainedWriters>();
+        assert_eq!(times(&mut retained)[0], 10 + 300 - 256);
     }
 }

@@ -7,7 +7,7 @@ use std::collections::{
 use std::hash::Hash;
 use std::ops::RangeBounds;
 
-use super::{Bounded, Declared};
+use super::{Bounded, Declared, ledger};
 
 /// A container of the standard library.
 pub trait Collection: Default {
@@ -111,6 +111,22 @@ impl<D: Declared, T> Bounded<D, Vec<T>> {
         fn drain(range: impl RangeBounds<usize>) -> std::vec::Drain<'_, T>;
     }
 
+    /// Adds all these entries, or none. Returns whether they had room.
+    pub fn extend_from_slice(&mut self, entries: &[T]) -> bool
+    where
+        T: Clone,
+    {
+        let length = self.inner.len().saturating_add(entries.len());
+        let has_room = length <= self.declared.cap();
+        if has_room {
+            self.inner.extend_from_slice(entries);
+            ledger::filled(&D::TABLE, length, self.declared.cap());
+        } else {
+            self.refuse();
+        }
+        has_room
+    }
+
     /// Adds an entry. Returns it if there is no room.
     pub fn push(&mut self, entry: T) -> Option<T> {
         self.add(entry)
@@ -134,6 +150,7 @@ impl<D: Declared, T> Bounded<D, VecDeque<T>> {
         fn clear();
         fn pop_front() -> Option<T>;
         fn pop_back() -> Option<T>;
+        fn pop_front_if(is_due: impl FnOnce(&mut T) -> bool) -> Option<T>;
         fn remove(index: usize) -> Option<T>;
         fn get_mut(index: usize) -> Option<&mut T>;
         fn front_mut() -> Option<&mut T>;
@@ -143,6 +160,17 @@ impl<D: Declared, T> Bounded<D, VecDeque<T>> {
         fn drain(range: impl RangeBounds<usize>) -> vec_deque::Drain<'_, T>;
         fn make_contiguous() -> &mut [T];
         fn retain_mut(keep: impl FnMut(&mut T) -> bool);
+    }
+
+    /// Adds an entry at this place. Returns it if there is no room.
+    pub fn insert(&mut self, index: usize, entry: T) -> Option<T> {
+        if self.is_full() {
+            self.refuse();
+            return Some(entry);
+        }
+        self.inner.insert(index, entry);
+        ledger::filled(&D::TABLE, self.inner.len(), self.declared.cap());
+        None
     }
 
     /// Adds the newest entry. Returns the entry that has no room.

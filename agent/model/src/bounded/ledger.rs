@@ -19,6 +19,21 @@ pub struct Use {
     pub refused: u64,
 }
 
+impl Use {
+    /// Returns whether the table was filled to its cap, or to nine tenths of a cap in bytes, and
+    /// never beyond.
+    #[must_use]
+    pub const fn is_driven(&self) -> bool {
+        const IN_BYTES: usize = 1 << 18;
+        let least = if self.cap < IN_BYTES {
+            self.cap
+        } else {
+            self.cap / 10 * 9
+        };
+        self.largest >= least && self.largest <= self.cap
+    }
+}
+
 thread_local! {
     static LEDGER: RefCell<BTreeMap<&'static str, Use>> = const { RefCell::new(BTreeMap::new()) };
 }

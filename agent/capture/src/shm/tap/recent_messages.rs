@@ -2,14 +2,15 @@
 
 use std::collections::{HashSet, VecDeque};
 
-/// Messages remembered, so that none is read again at another port.
-pub(super) const REMEMBERED: usize = 8192;
+use ros2probe_model::bounded::Bounded;
+
+use crate::tables::RememberedMessages;
 
 /// The latest messages by position.
 #[derive(Default)]
 pub(super) struct RecentMessages {
     pub(super) set: HashSet<Identity>,
-    pub(super) order: VecDeque<Identity>,
+    pub(super) order: Bounded<RememberedMessages, VecDeque<Identity>>,
 }
 
 /// One use of one buffer.
@@ -22,13 +23,32 @@ pub(super) struct Identity {
 
 impl RecentMessages {
     pub(super) fn add(&mut self, identity: Identity) {
-        if self.order.len() >= REMEMBERED
-            && let Some(oldest) = self.order.pop_front()
+        if self.set.insert(identity)
+            && let Some(oldest) = self.order.push_back(identity)
         {
             self.set.remove(&oldest);
         }
-        if self.set.insert(identity) {
-            self.order.push_back(identity);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tables::tests::assert_driven;
+
+    #[test]
+    fn the_oldest_message_is_forgotten() {
+        let identity = |serial| Identity {
+            serial,
+            node: 0,
+            validity: 0,
+        };
+        let mut recent = RecentMessages::default();
+        for serial in 0..10_000 {
+            recent.add(identity(serial));
         }
+        assert_driven::<RememberedMessages>();
+        assert_eq!(recent.set.len(), RememberedMessages::CAP);
+        assert!(!recent.set.contains(&identity(0)) && recent.set.contains(&identity(9_999)));
     }
 }

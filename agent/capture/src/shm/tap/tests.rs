@@ -17,6 +17,7 @@ use super::super::cpu_allowance::{SAVINGS, SHARE};
 use super::super::directories::Scope;
 use super::super::image::{PortImage, SegmentImage};
 use super::*;
+use crate::tables::tests::assert_driven;
 
 fn writer() -> Guid {
     let mut bytes = [9; 16];
@@ -472,15 +473,15 @@ fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_ot
     let mut host = Host::new();
     let crowd: Vec<_> = (0..600).map(|number| host.port(20_000 + number)).collect();
     host.poll_after(SECOND);
-    assert_eq!(host.tap.ports.len(), MAX_PORTS);
-    assert!(host.tap.counters.left_out >= 600 - MAX_PORTS as u64);
+    assert_eq!(host.tap.ports.len(), Ports::CAP);
+    assert!(host.tap.counters.left_out >= 600 - Ports::CAP as u64);
 
     let real = host.port(7411);
     for path in [7411].map(|number| host.path().join(format!("fastrtps_port{number}"))) {
         std::os::unix::fs::chown(path, Some(64_123), None).unwrap();
     }
     host.poll_after(SECOND);
-    assert_eq!(host.tap.ports.len(), MAX_PORTS);
+    assert_eq!(host.tap.ports.len(), Ports::CAP);
     assert!(host.tap.ports.iter().any(|open| open.key.2 == 7411));
     drop((crowd, real));
 
@@ -490,7 +491,32 @@ fn ports_and_segments_beyond_the_caps_are_left_out_and_one_user_s_keep_out_no_ot
         host.tap
             .open_segment((directory, generation, SegmentId(id)), host.now);
     }
-    assert_eq!(host.tap.segments.len(), MAX_SEGMENTS);
+    assert_eq!(host.tap.segments.len(), Segments::CAP);
+    assert_driven::<Ports>();
+    assert_driven::<Segments>();
+}
+
+#[test]
+fn ports_of_dead_processes_beyond_the_cap_are_opened_again() {
+    let mut host = Host::new();
+    host.poll_after(SECOND);
+    for number in 20_000..20_000 + AbandonedPorts::CAP as u32 + 10 {
+        // The lock beside the port is free: its process is dead.
+        let name = format!("fastrtps_port{number}_el");
+        fs::write(host.path().join(name), "").unwrap();
+    }
+    let numbers: Vec<_> = (20_000..20_000 + AbandonedPorts::CAP as u32 + 10).collect();
+    for group in numbers.chunks(400) {
+        let ports: Vec<_> = group.iter().map(|number| host.port(*number)).collect();
+        // Not a search, which forgets the ports of dead processes.
+        host.tap.found = host.now + 1000 * SECOND;
+        host.poll_after(100 * SECOND);
+        for port in ports {
+            fs::remove_file(port.path(host.path())).unwrap();
+        }
+    }
+    assert!(host.tap.ports.is_empty());
+    assert_driven::<AbandonedPorts>();
 }
 
 #[test]

@@ -1,6 +1,10 @@
 //! The table of limits: the page, /health and docs/limits-*.md agree about each cap.
 
 use super::*;
+use ros2probe_capture::tables as capture;
+use ros2probe_daemon::tables as daemon;
+use ros2probe_model::bounded::Table;
+use ros2probe_model::tables as model;
 
 #[test]
 fn every_limit_of_the_configuration_is_on_the_page_and_in_the_answer_on_health() {
@@ -85,9 +89,13 @@ fn every_cap_names_the_test_that_drives_it_over() {
         let (name, path) = line.split(" | ").nth(2)?.split_once("` in `")?;
         Some((name.trim_matches('`'), path.trim_matches('`')))
     });
-    let declared = ros2probe_model::tables::ALL.iter();
-    let declared = declared.map(|table| (table.name, "agent/model/src/tables.rs"));
-    let rows: BTreeSet<_> = rows.chain(declared).collect();
+    let declared =
+        |all: &'static [Table], path: &'static str| all.iter().map(move |table| (table.name, path));
+    let rows = rows
+        .chain(declared(model::ALL, "agent/model/src/tables.rs"))
+        .chain(declared(capture::ALL, "agent/capture/src/tables.rs"))
+        .chain(declared(daemon::ALL, "agent/daemon/src/tables.rs"));
+    let rows: BTreeSet<_> = rows.collect();
     let fixed = driven::fixed();
     let named: Vec<_> = fixed
         .iter()

@@ -2,12 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use crate::tables::RouterTokens;
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::DomainId;
 pub use ros2probe_wire::zenoh::EndpointKind;
 use ros2probe_wire::zenoh::{Gid, Token};
-
-/// Most tokens.
-pub const MOST_TOKENS: usize = 65_536;
 
 /// Nodes and endpoints of one domain, each list sorted.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -29,7 +28,7 @@ impl DomainGraph {
 /// A collection of tokens, each counted once.
 #[derive(Debug, Default)]
 pub(super) struct Tokens {
-    by_gid: BTreeMap<Gid, Described>,
+    by_gid: Bounded<RouterTokens, BTreeMap<Gid, Described>>,
     unreadable: usize,
 }
 
@@ -64,11 +63,7 @@ impl Tokens {
             }
         };
         let gid = Gid::of_token(token);
-        if self.by_gid.len() >= MOST_TOKENS && !self.by_gid.contains_key(&gid) {
-            return false;
-        }
-        self.by_gid.insert(gid, described);
-        true
+        self.by_gid.insert(gid, described).is_none()
     }
 
     /// Counts a token whose key cannot be resolved.

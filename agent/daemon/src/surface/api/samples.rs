@@ -31,7 +31,9 @@ use crate::subscriptions::line::{line, offered};
 use crate::subscriptions::{
     Candidate, Choice, Depth, Item, Overflow, Refused, Request, Selection, Subscription,
 };
+use crate::tables::DescribedWriters;
 use ros2probe_api::samples::{LINES, Line, Open, OpenTopic, SAMPLES};
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::snapshot::Snapshot;
 
 /// Largest number of names and globs per request, and of characters in them and in a regular
@@ -39,8 +41,6 @@ use ros2probe_model::snapshot::Snapshot;
 const MAX_PATTERNS: usize = 256;
 const MAX_LIST: usize = 16_384;
 const MAX_REGEX: usize = 4_096;
-/// Largest number of writers whose QoS is sent to one client.
-const WRITERS: usize = 65_536;
 /// Size of a piece of the answer, in bytes.
 const BATCH_BYTES: usize = 16 * 1024;
 /// Default queue sizes: for a few thousand arrivals, and for messages with payloads.
@@ -90,7 +90,7 @@ struct Stream {
     payload: Option<Bytes>,
     first: Option<Line>,
     /// Writers whose QoS has been sent.
-    introduced: HashSet<Guid>,
+    introduced: Bounded<DescribedWriters, HashSet<Guid>>,
     ended: bool,
 }
 
@@ -176,7 +176,7 @@ async fn samples(
         stop: context.stop.clone(),
         payload: None,
         first: Some(first),
-        introduced: HashSet::new(),
+        introduced: Bounded::default(),
         ended: false,
     };
     let headers = [(CACHE_CONTROL, "no-store"), (CONTENT_TYPE, media_type)];
@@ -220,7 +220,6 @@ impl Stream {
         if let (Line::Sample(facts), Item::Sample(sample)) = (&mut line, item)
             && sample.payload.is_some()
             && let Some(announced) = &sample.topic.offered
-            && self.introduced.len() < WRITERS
             && self.introduced.insert(sample.writer)
         {
             facts.offered = Some(Box::new(offered(announced)));

@@ -9,15 +9,14 @@ use std::hash::{BuildHasher as _, Hash as _, Hasher as _};
 
 use crate::surface::catalogue::Metric;
 use crate::surface::metric_sink::Label;
-
-/// Largest number of series.
-const MAX_SERIES: usize = 200_000;
+use crate::tables::SeriesStarts;
+use ros2probe_model::bounded::Bounded;
 
 /// The series of the last collection.
 #[derive(Debug)]
 pub(super) struct Starts {
     hashes: RandomState,
-    series: HashMap<u64, Series>,
+    series: Bounded<SeriesStarts, HashMap<u64, Series>>,
     agent: u64,
     /// Times of the previous and of the current collection.
     previous: u64,
@@ -36,7 +35,7 @@ impl Starts {
     pub(super) fn new(agent: u64) -> Self {
         Self {
             hashes: RandomState::new(),
-            series: HashMap::new(),
+            series: Bounded::default(),
             agent,
             previous: agent,
             now: agent,
@@ -59,14 +58,14 @@ impl Starts {
     pub(super) fn start(&mut self, metric: &Metric, labels: &[Label<'_>], value: f64) -> u64 {
         let (previous, now) = (self.previous, self.now);
         let key = self.key(metric, labels);
-        if self.series.len() >= MAX_SERIES && !self.series.contains_key(&key) {
-            return self.agent;
-        }
-        let series = self.series.entry(key).or_insert(Series {
+        let new = || Series {
             start: previous,
             seen: now,
             value,
-        });
+        };
+        let Some(series) = self.series.get_or_insert_with(key, new) else {
+            return self.agent;
+        };
         if value < series.value {
             series.start = previous;
         }
@@ -126,10 +125,10 @@ mod tests {
         starts.begin(200);
         starts.end();
         starts.begin(300);
-        for index in 0..MAX_SERIES as u64 {
+        for index in 0..SeriesStarts::CAP as u64 {
             assert_eq!(starts.start(metric, &[Label::Number(index)], 1.0), 200);
         }
         assert_eq!(starts.start(metric, &[Label::Text("late")], 1.0), 100);
-        assert_eq!(starts.series.len(), MAX_SERIES);
+        crate::tables::tests::assert_driven::<SeriesStarts>();
     }
 }

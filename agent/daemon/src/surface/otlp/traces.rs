@@ -23,12 +23,13 @@ use super::client::Request;
 use super::exports::{Exports, Reason, Signal};
 use super::points::{attribute, key_value, scope};
 use super::signal_sender::SignalSender;
+use crate::tables::WaitingSpans;
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::chain::spans::{ChainSpan, ChainSpans};
 use ros2probe_model::identity::Identity;
 use ros2probe_model::trace::{Span, SpanStage, Spans};
 
-/// Largest number of spans in the queue, and in one request.
-const WAITING: usize = 4096;
+/// Largest number of spans in one request.
 const REQUEST: usize = 512;
 /// Time for which spans are collected into one request.
 const GATHER: Duration = Duration::from_secs(1);
@@ -38,7 +39,7 @@ const FLAGS: u32 = 0b11;
 /// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
 pub struct SpanQueue {
-    waiting: Mutex<VecDeque<QueuedSpan>>,
+    waiting: Mutex<Bounded<WaitingSpans, VecDeque<QueuedSpan>>>,
     news: Notify,
 }
 
@@ -84,11 +85,10 @@ impl SpanQueue {
             return 0;
         }
         let mut waiting = self.waiting();
-        let room = WAITING.saturating_sub(waiting.len());
-        waiting.extend(spans.by_ref().take(room));
+        let refused = spans.filter_map(|span| waiting.push_back(span)).count();
         drop(waiting);
         self.news.notify_one();
-        spans.count() as u64
+        refused as u64
     }
 
     fn take(&self) -> Vec<QueuedSpan> {
@@ -107,7 +107,7 @@ impl SpanQueue {
         }
     }
 
-    fn waiting(&self) -> MutexGuard<'_, VecDeque<QueuedSpan>> {
+    fn waiting(&self) -> MutexGuard<'_, Bounded<WaitingSpans, VecDeque<QueuedSpan>>> {
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -342,7 +342,7 @@ mod tests {
         let queue = SpanQueue::default();
         let spans = |count| vec![QueuedSpan::Message(span(SpanStage::Send)); count];
         assert_eq!(queue.put(Vec::new()), 0);
-        assert_eq!(queue.put(spans(WAITING - 1)), 0);
+        assert_eq!(queue.put(spans(WaitingSpans::CAP - 1)), 0);
         assert_eq!(queue.put(spans(3)), 2);
         queue.filled().await;
         let mut taken = 0;
@@ -350,6 +350,7 @@ mod tests {
             assert!(more <= REQUEST);
             taken += more;
         }
-        assert_eq!(taken, WAITING);
+        assert_eq!(taken, WaitingSpans::CAP);
+        crate::tables::tests::assert_driven::<WaitingSpans>();
     }
 }

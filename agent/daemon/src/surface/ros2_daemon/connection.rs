@@ -16,10 +16,11 @@ use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep_until};
 use tokio_util::sync::CancellationToken;
 
+use crate::tables::Ros2DaemonClients;
+use ros2probe_model::bounded::Bounded;
+
 /// Longest time from an answer to the end of the next request and its answer.
 pub(super) const IDLE: Duration = Duration::from_secs(10);
-/// Most connections to all ports.
-pub(super) const MAX_CLIENTS: usize = 16;
 
 /// The stream of a connection.
 #[derive(Debug)]
@@ -40,9 +41,9 @@ pub(super) struct ConnectionState {
     resets: Arc<AtomicBool>,
 }
 
-/// All connections.
+/// The connections to all ports.
 #[derive(Debug, Default)]
-pub(super) struct Connections(Vec<Arc<ConnectionState>>);
+pub(super) struct Connections(Bounded<Ros2DaemonClients, Vec<Arc<ConnectionState>>>);
 
 impl Stream {
     /// Takes over a stream.
@@ -105,7 +106,7 @@ impl Connections {
     /// Adds a connection. If all are in use, the one without a request for longest makes room;
     /// returns `false` if all have one.
     pub(super) fn join(&mut self, state: &Arc<ConnectionState>) -> bool {
-        if self.0.len() >= MAX_CLIENTS {
+        if self.0.is_full() {
             let idle = self.0.iter().enumerate();
             let idle = idle.filter(|(_, each)| !each.is_working.load(Ordering::Relaxed));
             let Some((at, _)) = idle.min_by_key(|(_, each)| each.since()) else {
@@ -187,7 +188,9 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn connections_beyond_the_cap_replace_the_longest_idle_one_and_no_busy_one() {
         let mut connections = Connections::default();
-        let all: Vec<_> = std::iter::repeat_with(state).take(MAX_CLIENTS).collect();
+        let all: Vec<_> = std::iter::repeat_with(state)
+            .take(Ros2DaemonClients::CAP)
+            .collect();
         for each in &all {
             assert!(connections.join(each));
             tokio::time::advance(Duration::from_millis(1)).await;
@@ -199,6 +202,7 @@ mod tests {
         all[2..].iter().for_each(|each| each.requested());
         next.requested();
         assert!(!connections.join(&state()));
+        crate::tables::tests::assert_driven::<Ros2DaemonClients>();
         connections.leave(&next);
         assert!(connections.join(&state()));
     }

@@ -32,6 +32,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::privilege::{self, Role, SpawnError, Unprivileged};
 use crate::snapshot_cell::SnapshotCell;
+use crate::tables::Ros2DaemonClients;
 use crate::watches::Watches;
 use connection::{ConnectionState, Connections, Stream};
 use figures::Refused;
@@ -112,7 +113,7 @@ impl Task {
 
     /// Accepts connections until the agent stops.
     async fn serve(self) {
-        let (releases, mut released) = mpsc::channel(connection::MAX_CLIENTS);
+        let (releases, mut released) = mpsc::channel(Ros2DaemonClients::CAP);
         let requests = Arc::new(Requests::new(&self, releases));
         let mut ports = Ports::new(Arc::clone(&self.figures));
         let mut connections = Connections::default();

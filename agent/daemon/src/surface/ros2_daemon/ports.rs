@@ -18,9 +18,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::figures::{PortState, Ros2DaemonFigures, port};
 use crate::surface::listen::listen;
+use crate::tables::Ros2DaemonPorts;
+use ros2probe_model::bounded::Bounded;
 
-/// Most domains with a port. A host has few, but any process can announce participants in each.
-pub(super) const MAX_PORTS: usize = 32;
 /// Time for which a released port stays free.
 pub(super) const RELEASED: Duration = Duration::from_secs(60);
 
@@ -31,7 +31,8 @@ const TAKEOVER: Duration = Duration::from_secs(3);
 #[derive(Debug)]
 pub(super) struct Ports {
     figures: Arc<Ros2DaemonFigures>,
-    ports: BTreeMap<u32, Port>,
+    /// A host has few domains, but any process can announce participants in each.
+    ports: Bounded<Ros2DaemonPorts, BTreeMap<u32, Port>>,
 }
 
 #[derive(Debug)]
@@ -58,10 +59,10 @@ pub(super) struct Accepted {
 
 impl Ports {
     /// Creates the ports, without any.
-    pub(super) const fn new(figures: Arc<Ros2DaemonFigures>) -> Self {
+    pub(super) fn new(figures: Arc<Ros2DaemonFigures>) -> Self {
         Self {
             figures,
-            ports: BTreeMap::new(),
+            ports: Bounded::default(),
         }
     }
 
@@ -72,9 +73,8 @@ impl Ports {
             if self.ports.contains_key(domain_id) {
                 continue;
             }
-            if self.ports.len() < MAX_PORTS {
-                self.ports.insert(*domain_id, Port::Waiting);
-            } else if port(*domain_id).is_some() {
+            let is_left_out = self.ports.insert(*domain_id, Port::Waiting).is_some();
+            if is_left_out && port(*domain_id).is_some() {
                 self.show(*domain_id, PortState::Limit);
             }
         }
@@ -115,7 +115,7 @@ impl Ports {
     /// Returns the next connection to any port. Never returns without a port.
     pub(super) async fn accept(&mut self) -> Accepted {
         std::future::poll_fn(|context| {
-            for (domain_id, port) in &self.ports {
+            for (domain_id, port) in &*self.ports {
                 let Port::Open(listener, end) = port else {
                     continue;
                 };
@@ -290,10 +290,11 @@ mod tests {
                 .ports
                 .insert(domain_id, Port::Released(Instant::now()));
         }
-        assert_eq!(ports.ports.len(), MAX_PORTS);
+        assert_eq!(ports.ports.len(), Ros2DaemonPorts::CAP);
         ports.update(&BTreeSet::from([DOMAIN]), Instant::now());
+        crate::tables::tests::assert_driven::<Ros2DaemonPorts>();
         assert_eq!(figures.ports().get(&DOMAIN), Some(&PortState::Limit));
-        assert_eq!(ports.ports.len(), MAX_PORTS);
+        assert_eq!(ports.ports.len(), Ros2DaemonPorts::CAP);
     }
 
     #[test]

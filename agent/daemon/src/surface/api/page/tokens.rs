@@ -5,16 +5,17 @@ use std::fmt::Write as _;
 use std::io;
 use std::sync::{Mutex, PoisonError};
 
+use ros2probe_model::bounded::Bounded;
 use subtle::ConstantTimeEq as _;
 
-/// Largest number of valid tokens; a further one replaces the oldest.
-const MAX_TOKENS: usize = 16;
+use crate::tables::PageTokens;
+
 /// Random bytes of a token, which is written in hexadecimal.
 const BYTES: usize = 32;
 
 /// The valid tokens, oldest first.
 #[derive(Default)]
-pub(in super::super) struct Tokens(Mutex<VecDeque<Box<[u8]>>>);
+pub(in super::super) struct Tokens(Mutex<Bounded<PageTokens, VecDeque<Box<[u8]>>>>);
 
 impl Tokens {
     /// Creates a token.
@@ -35,9 +36,6 @@ impl Tokens {
             let _ = write!(token, "{byte:02x}");
         }
         let mut tokens = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if tokens.len() >= MAX_TOKENS {
-            tokens.pop_front();
-        }
         tokens.push_back(token.as_bytes().into());
         Ok(token)
     }
@@ -66,8 +64,11 @@ mod tests {
     fn the_latest_tokens_are_valid_and_no_two_are_alike() {
         let tokens = Tokens::default();
         assert!(!tokens.know(b""));
-        let given: Vec<_> = (0..=MAX_TOKENS).map(|_| tokens.mint().unwrap()).collect();
+        let given: Vec<_> = (0..=PageTokens::CAP)
+            .map(|_| tokens.mint().unwrap())
+            .collect();
         assert!(given.iter().all(|token| token.len() == 64));
+        crate::tables::tests::assert_driven::<PageTokens>();
         assert!(!tokens.know(given[0].as_bytes()), "the oldest has gone");
         assert!(given[1..].iter().all(|token| tokens.know(token.as_bytes())));
         assert!(!tokens.know(&given[1].as_bytes()[1..]));

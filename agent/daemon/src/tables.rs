@@ -1,0 +1,59 @@
+//! Declarations of the daemon's tables: what clients, viewers and robots can fill, and how far.
+
+use ros2probe_model::bounded::Rule::Oldest;
+
+ros2probe_model::tables! {
+    /// Events kept for streams and export
+    KeptEvents { name: "events.kept", entries: 4096, rule: Oldest, reported: "`ros2probe_events_dropped_total`" }
+    /// Tokens of pages
+    PageTokens { name: "page.tokens", entries: 16, rule: Oldest, effect: "the oldest becomes invalid" }
+    /// Connections of the `ros2` command line
+    Ros2DaemonClients {
+        name: "ros2_daemon.clients", entries: 16, effect: "the longest idle one is closed",
+        reported: "`ros2probe_ros2_daemon_refused_total`",
+    }
+    /// Domains with a port as the ros2 daemon
+    Ros2DaemonPorts {
+        name: "ros2_daemon.ports", entries: 32, effect: "not answered", reported: "`ros2probe_ros2_daemon_ports`",
+    }
+    /// Spans that wait for export
+    WaitingSpans {
+        name: "otlp.spans", entries: 4096, effect: "dropped", reported: "`ros2probe_otlp_dropped_total`",
+    }
+    /// Series with a start time
+    SeriesStarts { name: "otlp.starts", entries: 200_000, effect: "further ones start with the agent" }
+    /// Writers with a retained message
+    RetainedWriters {
+        name: "retained.writers", entries: 256, effect: "the oldest is dropped", reported: "`ros2probe_retained_bytes`",
+    }
+    /// Bytes of retained messages
+    RetainedBytes {
+        name: "retained.bytes", entries: 4 << 20, effect: "the oldest is dropped",
+        reported: "`ros2probe_retained_bytes`",
+    }
+    /// Writers that one stream of messages has described
+    DescribedWriters { name: "samples.described", entries: 65_536, effect: "further ones are not described" }
+    /// Announcements of one kind that `rp discover` receives from a participant
+    ReceivedAnnouncements { name: "discover.received", entries: 4096 }
+    /// Endpoints of this participant
+    DiscoveredEndpoints { name: "discover.endpoints", entries: 2 * ReceivedAnnouncements::CAP }
+    /// Announcements of this participant with missing fragments
+    PartialAnnouncements { name: "discover.partial", entries: 8 }
+    /// Writers of user data of this participant
+    UserWriters { name: "discover.writers", entries: 256 }
+    /// Liveliness tokens of a router (`rp discover --router`)
+    RouterTokens {
+        name: "discover.tokens", entries: 65_536, effect: "a part is printed, and exit code 1", reported: "error",
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use ros2probe_model::bounded::{Declared, ledger};
+
+    /// Asserts that this test filled a table to its cap, and not beyond.
+    pub(crate) fn assert_driven<D: Declared>() {
+        let used = ledger()[D::TABLE.name];
+        assert!(used.is_driven(), "{}: {used:?}", D::TABLE.name);
+    }
+}
