@@ -484,11 +484,6 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
             "must be the URL of a gRPC receiver, as in `http://collector:4317`, or `off`"
                 .to_owned(),
         ),
-        "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(
-            "requires TLS, which this build lacks: use http:// to a collector on this host, or \
-             build with `--features tls`"
-                .to_owned(),
-        ),
         "otlp.headers_file" if !text.starts_with('/') => {
             Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
         }

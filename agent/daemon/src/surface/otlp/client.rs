@@ -58,7 +58,6 @@ impl Client {
         let endpoint = Endpoint::from(target.endpoint.clone())
             .user_agent(concat!("ros2probe/", env!("CARGO_PKG_VERSION")));
         let endpoint = endpoint.map_err(SettingsError::Client)?;
-        #[cfg(feature = "tls")]
         let endpoint = secured(endpoint, &target)?;
         let endpoint = endpoint
             .connect_timeout(target.timeout)
@@ -199,7 +198,6 @@ impl Client {
 }
 
 /// Configures TLS with the system's certificate authorities, or those in `SSL_CERT_FILE`.
-#[cfg(feature = "tls")]
 fn secured(endpoint: Endpoint, target: &Target) -> Result<Endpoint, SettingsError> {
     if target.endpoint.scheme_str() != Some("https") {
         return Ok(endpoint);

@@ -53,12 +53,6 @@ pub enum SettingsError {
         /// Its value.
         value: String,
     },
-    /// The build lacks the TLS feature.
-    #[error(
-        "the OTLP endpoint {0} requires TLS, which this build lacks: use http:// to a collector on \
-         this host, or build with `--features tls`"
-    )]
-    NoTls(String),
     /// A header cannot be sent.
     #[error("{place}: `{name}` is not a valid header: names are lower case, values ASCII")]
     Header {
@@ -185,9 +179,6 @@ fn target(
     let Some(endpoint) = otlp_endpoint(&value) else {
         return Err(SettingsError::Endpoint { name, value });
     };
-    if endpoint.scheme_str() == Some("https") && !cfg!(feature = "tls") {
-        return Err(SettingsError::NoTls(endpoint.to_string()));
-    }
     if let Some((name, value)) = variables.of(signal, "PROTOCOL")
         && value != "grpc"
     {
