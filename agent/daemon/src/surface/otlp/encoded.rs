@@ -2,10 +2,10 @@
 //! and gauges that are infinite.
 //!
 //! The model counts samples in buckets. An instrument of `opentelemetry_sdk` 0.33 only records
-//! single values, and the types of aggregated data have no public constructor: issue 3469 and its
-//! pull request 3489 of opentelemetry-rust propose them, issue 2505 a `MetricProducer`. Both are
-//! open. Since 0.33.1 (issue 3656), instruments drop values that are not finite, but a lag that is
-//! not known is infinite. This module goes once the SDK takes such points.
+//! single values, and the types of aggregated data have no public constructor. Of opentelemetry-rust,
+//! pull request 3489 (constructors, for issue 3469) and issue 2505 (`MetricProducer`) are open, and
+//! 0.33.1 is the newest release. Its instruments drop values that are not finite (issue 3656), but a
+//! lag that is not known is infinite. This module goes once the SDK takes such points.
 
 use std::io::Write as _;
 use std::sync::{Arc, PoisonError};

@@ -1,10 +1,10 @@
 //! The catalogue as observable instruments of the SDK.
 //!
-//! Counters have one provider for the life of the agent, because the SDK takes the time at which
-//! an instrument is created as the start of all its series. It has one start for all points of a
-//! metric (`data::Sum`, opentelemetry_sdk 0.33), so a series that begins later or again has the
-//! agent's start, too. Gauges get a new provider in each collection: the SDK keeps the memory of
-//! their series, and reserves it for the largest number.
+//! Counters have one provider for the life of the agent: the SDK starts the series of an instrument
+//! when it is created. It has one start for all points of a metric (`data::Sum`, opentelemetry_sdk
+//! 0.33; issue 2472). So a series that begins later or again has the agent's start, too. Gauges get
+//! a new provider in each collection: the SDK keeps the memory of their series, and reserves it for
+//! the largest number.
 //!
 //! Observable instruments report only the series that their callback observes, so series vanish
 //! with their facts. The limit on series exceeds what one request holds: none is merged into
