@@ -27,6 +27,9 @@ SOURCES := https://github.com/ros2probe/ros2probe/blob/main
 export PATH := $(TARGET)/tools/node/bin:$(PATH):$(HOME)/.cargo/bin:$(TARGET)/tools/usr/bin
 # A part of Rust that links for both architectures: no cross toolchain is needed.
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER := rust-lld
+# The C of ring needs no library: clang compiles it for both architectures.
+export CC_x86_64_unknown_linux_musl := clang
+export CC_aarch64_unknown_linux_musl := clang
 # The tests make network namespaces: build as the user, run the tests as root.
 ifneq ($(SUDO),)
 export CARGO_TARGET_$(HOST)_RUNNER := $(SUDO) env PATH=$(PATH)
@@ -51,7 +54,6 @@ test: ## format, spelling, lints, kernel object, and all tests with real DDS par
 	@$(MAKE) --no-print-directory arm
 	cargo build --workspace --bins --examples
 	cargo test --workspace --doc --quiet
-	cargo test --workspace --features ros2probe/tls --test surface --quiet -- web_config:: otlp_tls::
 	cargo nextest run --workspace $$(.ci/prerequisites.sh --left-out)
 	@.ci/prerequisites.sh --ros2-summary
 	@if [ -d "$(CORPUS)" ]; then $(MAKE) --no-print-directory test-corpus; fi

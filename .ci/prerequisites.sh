@@ -403,7 +403,7 @@ for need; do
         rust
         ;;
     test)
-        packages "${network_tools[@]}" gcc g++ make tshark systemd strace \
+        packages "${network_tools[@]}" clang gcc g++ make tshark systemd strace \
             libfastrtps-dev libfastcdr-dev cyclonedds-dev cyclonedds-tools
         prometheus
         schemathesis
@@ -430,7 +430,7 @@ for need; do
         nextest
         ;;
     dist)
-        packages gcc libc6-dev python3
+        packages clang gcc libc6-dev python3
         rust
         musl x86_64 aarch64
         bills
@@ -439,7 +439,7 @@ for need; do
         cargo_deb
         ;;
     vm)
-        packages mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs make \
+        packages clang mmdebstrap arch-test qemu-system-arm qemu-system-x86 qemu-user-static e2fsprogs make \
             g++-x86-64-linux-gnu g++-aarch64-linux-gnu libfastrtps-dev cyclonedds-dev cyclonedds-tools
         rust
         musl x86_64 aarch64

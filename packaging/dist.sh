@@ -27,6 +27,7 @@ for variable in $(compgen -e); do
         ;;
     esac
 done
+export CC_x86_64_unknown_linux_musl=clang CC_aarch64_unknown_linux_musl=clang
 export CARGO_INCREMENTAL=0 LC_ALL=C TZ=UTC
 umask 022
 

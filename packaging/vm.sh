@@ -189,7 +189,8 @@ robot() {
     local triple
     # The robot replaces epoll_wait of the C library.
     triple=$(machine "$1")-unknown-linux-musl
-    CARGO_TARGET_X86_64_UNKNOWN_LINUX_MUSL_LINKER=rust-lld CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER=rust-lld \
+    CC_x86_64_unknown_linux_musl=clang CC_aarch64_unknown_linux_musl=clang \
+        CARGO_TARGET_X86_64_UNKNOWN_LINUX_MUSL_LINKER=rust-lld CARGO_TARGET_AARCH64_UNKNOWN_LINUX_MUSL_LINKER=rust-lld \
         cargo rustc --quiet --release --package ros2probe --example robot --target "$triple" -- \
         -C link-arg=--allow-multiple-definition >&2
     echo "$target/$triple/release/examples/robot"

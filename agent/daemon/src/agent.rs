@@ -33,7 +33,7 @@ use crate::surface::api::reload::Reloads;
 use crate::surface::api::{self, reload};
 use crate::surface::foxglove;
 use crate::surface::http::Server;
-use crate::surface::otlp::{self, Exporter, Host, SpanQueue, SpanSink};
+use crate::surface::otlp::{self, Exporter, Host, Queues, SpanQueue, SpanSink};
 use crate::surface::ros2_daemon::Ros2Daemon;
 use crate::surface::{Exposition, Format, MetricSources};
 use crate::watches::Watches;
@@ -213,7 +213,7 @@ pub fn read_memory() -> Result<()> {
 pub fn run(options: Options) -> Result<()> {
     let (configured, file) = configuration(options.config.as_deref())?;
     let config = overridden(&configured, &options);
-    let log = Log::start(config.log);
+    let log = Log::start(config.log, config.otlp.log);
     let export = export(&config)?;
     let mut source = open(&options, &config)?;
     source.announce(&config.capture);
@@ -237,7 +237,11 @@ pub fn run(options: Options) -> Result<()> {
     let responder = Responder::start().context("cannot start the thread that answers requests")?;
     let spans = Arc::<SpanQueue>::default();
     let ros2_daemon = ros2_daemon(&config, options.report)?;
-    let exporter = export.map(|export| Exporter::start(export, &sources, Arc::clone(&spans)));
+    let queues = Queues {
+        spans: Arc::clone(&spans),
+        log: log.exported_lines(),
+    };
+    let exporter = export.map(|export| Exporter::start(export, &sources, queues));
     let exporter = exporter.transpose()?;
     let powerless = give_up()?;
     report_listeners(server.as_ref(), &control, viewers.as_ref(), &watches);

@@ -1,4 +1,4 @@
-//! Log on standard error, in a format that suits the journal.
+//! Log on standard error, in a format that suits the journal, and on request over OTLP.
 
 mod lines;
 
@@ -7,6 +7,7 @@ use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, Mutex};
 
 use crate::config::Level;
+use crate::surface::otlp::LogQueue;
 use lines::Lines;
 use tracing_subscriber::filter::{EnvFilter, LevelFilter};
 use tracing_subscriber::layer::SubscriberExt as _;
@@ -20,11 +21,13 @@ pub(crate) struct Log {
     /// Whether `RUST_LOG` is set, which then takes precedence.
     fixed: bool,
     lost: Arc<AtomicU64>,
+    exported: Option<Arc<LogQueue>>,
 }
 
 impl Log {
-    /// Starts logging at `level`, or as `RUST_LOG` sets.
-    pub(crate) fn start(level: Level) -> Self {
+    /// Starts logging at `level`, or as `RUST_LOG` sets. Lines of the level `exported` are queued for
+    /// export.
+    pub(crate) fn start(level: Level, exported: Option<Level>) -> Self {
         let fixed = EnvFilter::try_from_default_env().ok();
         let (filter, handle) = reload::Layer::new(fixed.clone().unwrap_or_else(|| filter(level)));
         // The journal adds its own timestamps.
@@ -33,20 +36,29 @@ impl Log {
         let target = Mutex::new(Lines::new(io::stderr(), Arc::clone(&lost)));
         let lines = fmt::layer().with_writer(target).with_target(false);
         let lines = if journal {
-            lines.without_time().boxed()
+            lines.without_time().with_filter(filter).boxed()
         } else {
-            lines.boxed()
+            lines.with_filter(filter).boxed()
         };
+        let queue = exported.map(|_| Arc::<LogQueue>::default());
+        let export = queue.as_ref().zip(exported);
+        let export = export.map(|(queue, level)| LogQueue::layer(queue, severity(level)));
         // Fails if a log exists already, which happens only in tests.
         let _ = tracing_subscriber::registry()
-            .with(filter)
             .with(lines)
+            .with(export)
             .try_init();
         Self {
             level: handle,
             fixed: fixed.is_some(),
             lost,
+            exported: queue,
         }
+    }
+
+    /// Lines that wait for export, if they are exported.
+    pub(crate) fn exported_lines(&self) -> Option<Arc<LogQueue>> {
+        self.exported.clone()
     }
 
     /// Counter of lines that standard error did not accept.
@@ -65,12 +77,15 @@ impl Log {
 }
 
 fn filter(level: Level) -> EnvFilter {
-    let level = match level {
+    EnvFilter::default().add_directive(severity(level).into())
+}
+
+const fn severity(level: Level) -> LevelFilter {
+    match level {
         Level::Error => LevelFilter::ERROR,
         Level::Warn => LevelFilter::WARN,
         Level::Info => LevelFilter::INFO,
         Level::Debug => LevelFilter::DEBUG,
         Level::Trace => LevelFilter::TRACE,
-    };
-    EnvFilter::default().add_directive(level.into())
+    }
 }

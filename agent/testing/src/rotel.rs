@@ -15,7 +15,10 @@ const PATIENCE: Duration = Duration::from_secs(30);
 pub struct Rotel {
     child: Child,
     output: PathBuf,
+    /// Where it takes gRPC.
     pub address: SocketAddr,
+    /// Where it takes HTTP.
+    pub http: SocketAddr,
 }
 
 /// One printed data point, span or record: fields and attributes by name.
@@ -72,6 +75,7 @@ impl Rotel {
             child,
             output,
             address,
+            http: other,
         };
         rotel.wait_for("it starts", |text| text.contains("Starting Rotel"));
         rotel

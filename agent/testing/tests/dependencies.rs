@@ -71,6 +71,34 @@ const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
         &["use axum::Router;", "Router::new()"],
     ),
     (
+        "opentelemetry",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/otlp/instruments.rs",
+        &["u64_observable_counter(", "f64_observable_gauge("],
+    ),
+    (
+        "opentelemetry_sdk",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/otlp/traces.rs",
+        &["-> SpanData {"],
+    ),
+    (
+        "opentelemetry-otlp",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/otlp/transport.rs",
+        &[
+            "MetricExporter::builder()",
+            "LogExporter::builder()",
+            "SpanExporter::builder()",
+        ],
+    ),
+    (
+        "opentelemetry-appender-tracing",
+        "ros2probe-daemon",
+        "agent/daemon/src/surface/otlp/own_log.rs",
+        &["OpenTelemetryTracingBridge::new("],
+    ),
+    (
         "prometheus-client",
         "ros2probe-daemon",
         "agent/daemon/src/surface/exposition.rs",
@@ -107,8 +135,19 @@ const CHOSEN: &[(&str, &str, &str, &[&str])] = &[
     ),
 ];
 
-/// What the chosen packages write in place of the product's own sources.
-const WRITTEN_BY_PACKAGES: &[&str] = &["# HELP ", "# TYPE ", "# UNIT ", "# EOF"];
+/// What the chosen packages write in place of the product's own sources: text of metrics, and
+/// services and variables of OTLP.
+const WRITTEN_BY_PACKAGES: &[&str] = &[
+    "# HELP ",
+    "# TYPE ",
+    "# UNIT ",
+    "# EOF",
+    "opentelemetry.proto.collector",
+    "ExportLogsServiceRequest",
+    "ExportTraceServiceRequest",
+    "OTEL_EXPORTER_OTLP_HEADERS",
+    "grpc-status-details-bin",
+];
 
 struct Workspace {
     /// Package id by name.

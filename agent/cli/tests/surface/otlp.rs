@@ -7,6 +7,12 @@ use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::rp;
+use opentelemetry_proto::tonic::collector::metrics::v1::metrics_service_server::{
+    MetricsService, MetricsServiceServer,
+};
+use opentelemetry_proto::tonic::collector::metrics::v1::{
+    ExportMetricsServiceRequest, ExportMetricsServiceResponse,
+};
 use ros2probe_daemon::surface::catalogue::{CATALOGUE, Kind};
 use ros2probe_testing::local_agent::{self, LocalAgent, metric};
 use ros2probe_testing::repository;
@@ -113,7 +119,7 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
     let page = page_series(&agent.get("/metrics").body);
     assert!(page.len() > 200, "{}", page.len());
 
-    // The requests of one second hold the final state; each begins with the same metric.
+    // The requests of one second hold the final state.
     let complete = |text: &str| text.matches("-> Name: process.start_time").count();
     let seen = complete(&receiver.text());
     let text = receiver.wait_for("another export is complete", |text| {
@@ -161,10 +167,15 @@ fn a_real_receiver_gets_what_the_page_shows_and_may_go_and_come_back() {
 
 /// The last export that is complete has each series of the page, and names the robot.
 fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
-    let all = exports(text);
+    // Records and spans have a trace ID, and come when they happen.
+    let is_metric = |item: &Item| !item.fields.contains_key("Trace ID");
+    let metrics = exports(text).into_iter();
+    let metrics = metrics.filter(|export| export.items.iter().all(is_metric));
+    let all: Vec<_> = metrics.collect();
+    // Counters are the first request.
     let first = |export: &Export| {
-        let item = export.items.first();
-        item.is_some_and(|item| item.fields["Name"] == "ros2.participants")
+        let mut items = export.items.iter();
+        items.any(|item| item.fields["Name"] == "process.cpu")
     };
     let ends: Vec<usize> = (0..all.len()).filter(|index| first(&all[*index])).collect();
     let [.., begin, end] = ends[..] else {
@@ -198,6 +209,116 @@ fn assert_exported(text: &str, page: &BTreeMap<String, f64>) {
         );
     }
     assert!(resource.contains_key("service.instance.id") && resource.contains_key("host.name"));
+}
+
+#[test]
+fn over_http_a_real_receiver_gets_the_same() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!(
+        "watch: [{{topic: /**, per_subscriber: true}}, {{topic: /chatter, trace: 1}}]\n\
+         metrics: {{per_writer: true}}\n\
+         otlp: {{endpoint: 'http://{}', protocol: http/protobuf, compression: gzip, interval_s: 1, \
+         robot: marvin, attributes: {{site: hall 2}}}}\n",
+        receiver.http
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let mut agent = LocalAgent::start(&mut rp(), &["--config", configuration, "--speed", "max"]);
+    agent.wait_for_log("the capture has ended");
+    let page = page_series(&agent.get("/metrics").body);
+    let complete = |text: &str| text.matches("-> Name: process.start_time").count();
+    let seen = complete(&receiver.text());
+    let text = receiver.wait_for("another export is complete", |text| {
+        complete(text) >= seen + 3 && text.contains("EventName: ") && text.contains("Span ID")
+    });
+    assert_exported(&text, &page);
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+}
+
+#[test]
+fn the_agent_s_own_log_comes_on_request_and_exports_add_nothing_to_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory.path(), None);
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = format!(
+        "otlp: {{endpoint: 'http://{}', interval_s: 1, log: info, events: false}}\n",
+        receiver.address
+    );
+    std::fs::write(&configuration, yaml).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let mut agent = LocalAgent::start(&mut rp(), &["--config", configuration, "--speed", "max"]);
+    receiver.wait_for("the end of the capture is logged", |text| {
+        text.contains("the capture has ended")
+    });
+    let delivered = |signal: &str| {
+        format!("ros2probe_otlp_exports_total{{signal=\"{signal}\",outcome=\"delivered\"}}")
+    };
+    let requests = |signal: &str| metric(&agent.get("/metrics").body, &delivered(signal)).unwrap();
+    let (lines, metrics) = (requests("log"), requests("metrics"));
+    // The first success of each signal is a line of the export thread.
+    agent.wait_for_metric(&delivered("metrics"), |count| count > metrics + 5.0);
+    assert!(
+        requests("log") <= lines + 1.0,
+        "{} requests",
+        requests("log")
+    );
+    assert!(!receiver.text().contains("exporting to the OTLP receiver"));
+    agent.signal("-TERM");
+    assert!(agent.wait().success());
+}
+
+/// A receiver that checks the headers of each request.
+struct HeaderReceiver;
+
+#[tonic::async_trait]
+impl MetricsService for HeaderReceiver {
+    async fn export(
+        &self,
+        request: tonic::Request<ExportMetricsServiceRequest>,
+    ) -> Result<tonic::Response<ExportMetricsServiceResponse>, tonic::Status> {
+        let header = |name| request.metadata().get(name).map(|value| value.to_str());
+        for (name, value) in [("authorization", "Bearer file"), ("x-scope", "hall 2")] {
+            if header(name).and_then(Result::ok) != Some(value) {
+                return Err(tonic::Status::unauthenticated(name));
+            }
+        }
+        Ok(tonic::Response::new(ExportMetricsServiceResponse::default()))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn headers_of_the_environment_join_those_of_the_file_which_win() {
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = listener.local_addr().unwrap();
+    let service = MetricsServiceServer::new(HeaderReceiver)
+        .accept_compressed(tonic::codec::CompressionEncoding::Gzip);
+    let server = tonic::transport::Server::builder().add_service(service);
+    let incoming = tonic::transport::server::TcpIncoming::from(listener);
+    tokio::spawn(server.serve_with_incoming(incoming));
+
+    let directory = tempfile::tempdir().unwrap();
+    let configuration = directory.path().join("ros2probe.yaml");
+    let yaml = "otlp: {interval_s: 1, events: false, headers: {authorization: Bearer file}}\n";
+    std::fs::write(&configuration, yaml).unwrap();
+    let configuration = configuration.to_str().unwrap();
+    let mut command = rp();
+    command
+        .env("OTEL_EXPORTER_OTLP_ENDPOINT", format!("http://{address}"))
+        .env("OTEL_EXPORTER_OTLP_COMPRESSION", "gzip")
+        .env(
+            "OTEL_EXPORTER_OTLP_HEADERS",
+            "x-scope=hall%202,authorization=other",
+        );
+    let agent = LocalAgent::start(&mut command, &["--config", configuration, "--speed", "max"]);
+    let requests = |outcome: &str| {
+        format!("ros2probe_otlp_exports_total{{signal=\"metrics\",outcome=\"{outcome}\"}}")
+    };
+    // Each export has three requests; the last one holds histograms.
+    agent.wait_for_metric(&requests("delivered"), |count| count > 8.0);
+    agent.wait_for_metric(&requests("failed"), |count| count < 0.5);
 }
 
 /// An event: its name and attributes.

@@ -1,5 +1,4 @@
-//! The metrics listener behind a `web.yml`: passwords always, encryption with the feature `tls`
-//! (`cargo test --features tls --test surface web_config::`).
+//! The metrics listener behind a `web.yml`: passwords and encryption.
 
 use std::process::{Command, Output};
 
@@ -117,18 +116,6 @@ fn a_file_that_would_leave_the_listener_open_does_not_start_the_agent() {
     );
 }
 
-#[cfg(not(feature = "tls"))]
-#[test]
-fn encryption_that_is_not_built_in_is_an_error_that_says_what_to_do() {
-    let web = Web::new("tls_server_config: {cert_file: a.crt, key_file: a.key}\n");
-    let said = refused(&web);
-    assert!(
-        said.contains("this build lacks") && said.contains("--features tls"),
-        "{said}"
-    );
-}
-
-#[cfg(feature = "tls")]
 #[test]
 fn an_encrypted_listener_answers_only_clients_that_trust_its_certificate() {
     let hash = bcrypt::hash("open sesame", 4).unwrap();

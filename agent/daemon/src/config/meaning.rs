@@ -480,15 +480,9 @@ pub(super) fn check_text(key: &str, text: &str) -> Result<(), String> {
                  `[::1]:{port}`, or `off`"
             ))
         }
-        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => Err(
-            "must be the URL of a gRPC receiver, as in `http://collector:4317`, or `off`"
-                .to_owned(),
-        ),
-        "otlp.endpoint" if text.starts_with("https://") && !cfg!(feature = "tls") => Err(
-            "requires TLS, which this build lacks: use http:// to a collector on this host, or \
-             build with `--features tls`"
-                .to_owned(),
-        ),
+        "otlp.endpoint" if text != "off" && otlp_endpoint(text).is_none() => {
+            Err("must be the URL of a receiver, as in `http://collector:4317`, or `off`".to_owned())
+        }
         "otlp.headers_file" if !text.starts_with('/') => {
             Err("must be an absolute path, as in `/etc/ros2probe/otlp.headers`".to_owned())
         }
@@ -565,10 +559,12 @@ fn otlp(shape: OtlpShape) -> OtlpSettings {
         timeout: shape.timeout_s.map(Duration::from_secs),
         headers: shape.headers.unwrap_or_default(),
         headers_file: shape.headers_file.map(PathBuf::from),
+        protocol: shape.protocol,
         compression: shape.compression,
         metrics: shape.metrics,
         events: shape.events,
         traces: shape.traces,
+        log: shape.log,
         robot: shape.robot,
         attributes: shape.attributes.unwrap_or_default(),
     }

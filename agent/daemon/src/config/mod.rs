@@ -270,6 +270,8 @@ pub struct OtlpSettings {
     pub headers: BTreeMap<String, String>,
     /// File with further headers.
     pub headers_file: Option<PathBuf>,
+    /// Protocol of requests.
+    pub protocol: Option<OtlpProtocol>,
     /// Whether requests are compressed.
     pub compression: Option<Compression>,
     /// Whether metrics are exported.
@@ -278,6 +280,8 @@ pub struct OtlpSettings {
     pub events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub traces: Option<bool>,
+    /// Least severe level of exported lines of the log; no line is exported without it.
+    pub log: Option<Level>,
     /// Name of the robot.
     pub robot: Option<String>,
     /// Additional attributes of the resource.
@@ -294,6 +298,17 @@ pub enum Endpoint {
     Off,
     /// This URL.
     At(String),
+}
+
+/// Protocol of exports.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize, JsonSchema)]
+pub enum OtlpProtocol {
+    /// gRPC.
+    #[serde(rename = "grpc")]
+    Grpc,
+    /// Protobuf in HTTP/1.1 requests, which pass through proxies.
+    #[serde(rename = "http/protobuf")]
+    HttpProtobuf,
 }
 
 /// Compression of requests.

@@ -11,8 +11,8 @@ use serde::{Deserialize, Serialize};
 
 use super::limits::LimitsShape;
 use super::{
-    Access, Compression, ExactChoice, InsideChoice, Level, PageChoice, Retain, ShmMode,
-    SourceChoice, defaults,
+    Access, Compression, ExactChoice, InsideChoice, Level, OtlpProtocol, PageChoice, Retain,
+    ShmMode, SourceChoice, defaults,
 };
 
 /// Configuration of the ros2probe agent. Every key is optional.
@@ -512,6 +512,9 @@ pub(super) struct OtlpShape {
     pub(super) headers: Option<BTreeMap<String, String>>,
     /// Absolute path of a file with one `name: value` per line.
     pub(super) headers_file: Option<String>,
+    /// `grpc`, the default, or `http/protobuf`, which appends `/v1/metrics` and the like to the
+    /// endpoint.
+    pub(super) protocol: Option<OtlpProtocol>,
     /// `none`, or `gzip` for slow links.
     pub(super) compression: Option<Compression>,
     /// Whether metrics are exported.
@@ -520,6 +523,9 @@ pub(super) struct OtlpShape {
     pub(super) events: Option<bool>,
     /// Whether spans are exported, for watches with `trace`.
     pub(super) traces: Option<bool>,
+    /// Exports lines of the agent's own log of this level or a more severe one, e.g. `warn`. By
+    /// default none is exported.
+    pub(super) log: Option<Level>,
     /// Name of this robot: the attribute `robot.name` of all exports.
     pub(super) robot: Option<String>,
     /// Additional attributes of the resource, names and values.

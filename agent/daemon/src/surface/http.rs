@@ -30,7 +30,6 @@ use super::large_responses::LargeResponses;
 use super::limited_listener::{LimitedListener, Refusal};
 use super::listen::listen;
 use super::serving::{self, Plain};
-#[cfg(feature = "tls")]
 use super::tls::Acceptor;
 use super::web_config::{WebConfig, WebConfigError};
 use crate::config::Limit;
@@ -62,7 +61,6 @@ pub enum ListenError {
     #[error(transparent)]
     Web(#[from] WebConfigError),
     /// TLS cannot be set up.
-    #[cfg(feature = "tls")]
     #[error(transparent)]
     Tls(#[from] super::tls::TlsError),
 }
@@ -73,7 +71,6 @@ pub struct Server {
     listener: std::net::TcpListener,
     sources: MetricSources,
     gate: Option<Arc<Gate>>,
-    #[cfg(feature = "tls")]
     acceptor: Option<Acceptor>,
 }
 
@@ -98,7 +95,6 @@ impl Server {
         let web = web_config.map(WebConfig::load).transpose()?;
         let web = web.unwrap_or_default();
         let gate = (!web.users.is_empty()).then(|| Arc::new(Gate::new(web.users)));
-        #[cfg(feature = "tls")]
         let acceptor = web.tls.as_ref().map(Acceptor::new).transpose()?;
         let listener =
             listen(address).map_err(|source| ListenError::Address { address, source })?;
@@ -106,7 +102,6 @@ impl Server {
             listener,
             sources,
             gate,
-            #[cfg(feature = "tls")]
             acceptor,
         })
     }
@@ -132,11 +127,8 @@ impl Server {
                 "{connections} connections are open, which is the limit (limits.metrics_clients)\n"
             ),
         );
-        #[cfg(feature = "tls")]
         // A client that expects a TLS handshake cannot read a plain answer.
         let full = self.acceptor.is_none().then_some(full);
-        #[cfg(not(feature = "tls"))]
-        let full = Some(full);
         let listener = TcpListener::from_std(self.listener)?;
         let listener =
             LimitedListener::new(listener, Arc::clone(&self.sources.limits), limit, full);
@@ -145,7 +137,6 @@ impl Server {
             router = router.layer(middleware::from_fn_with_state(gate, basic_auth::guard));
         }
         let router = router.layer(middleware::from_fn(own_names));
-        #[cfg(feature = "tls")]
         if let Some(acceptor) = self.acceptor {
             serving::serve(listener, acceptor, router, Local::of, stop).await;
             return Ok(());

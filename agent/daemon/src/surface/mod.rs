@@ -28,7 +28,6 @@ pub mod ros2_daemon;
 mod ros2_metrics;
 mod service_metrics;
 mod serving;
-#[cfg(feature = "tls")]
 mod tls;
 pub mod web_config;
 mod zenoh_metrics;

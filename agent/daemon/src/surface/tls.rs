@@ -1,4 +1,6 @@
-//! TLS on the metrics listener (feature `tls`: rustls with ring, which is partly C and assembly).
+//! TLS on the metrics listener, by rustls. Its provider is ring, which is partly C and assembly: the
+//! one in pure Rust, rustls-rustcrypto, is an alpha, and graviola needs AES instructions, which a
+//! Raspberry Pi 4 lacks.
 //!
 //! The handshake takes place while the connection is read, so a slow client only delays itself. The
 //! limits of the underlying connection apply as well.

@@ -56,15 +56,6 @@ pub enum WebConfigError {
         /// Description of the error.
         reason: String,
     },
-    /// The build lacks TLS.
-    #[error(
-        "{} (`metrics.web_config`) requires TLS, which this build lacks: build `rp` with \
-         `--features tls`, or encrypt with a proxy", path.display()
-    )]
-    WithoutTls {
-        /// Path of the file.
-        path: PathBuf,
-    },
 }
 
 #[derive(Deserialize)]
@@ -88,8 +79,7 @@ impl WebConfig {
     /// Reads and validates the file; paths in it are relative to it.
     ///
     /// # Errors
-    /// Fails if the file cannot be read, has unknown or invalid settings, or needs a missing
-    /// feature.
+    /// Fails if the file cannot be read, or has unknown or invalid settings.
     pub fn load(path: &Path) -> Result<Self, WebConfigError> {
         let text =
             crate::file::read_text(path, MAX_BYTES).map_err(|source| WebConfigError::Read {
@@ -101,10 +91,6 @@ impl WebConfig {
             path: path.to_path_buf(),
             reason,
         })?;
-        if config.tls.is_some() && !cfg!(feature = "tls") {
-            let path = path.to_path_buf();
-            return Err(WebConfigError::WithoutTls { path });
-        }
         Ok(config)
     }
 

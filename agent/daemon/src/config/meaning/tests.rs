@@ -222,7 +222,7 @@ otlp:
 ";
     assert_eq!(
         report(source),
-        "f:2:13: otlp.endpoint: must be the URL of a gRPC receiver, as in \
+        "f:2:13: otlp.endpoint: must be the URL of a receiver, as in \
              `http://collector:4317`, or `off`\n\
              f:3:22: otlp.headers.c: is `3`, must be text\n\
              f:4:17: otlp.headers_file: must be an absolute path, as in \

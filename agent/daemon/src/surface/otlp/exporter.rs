@@ -4,23 +4,38 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::{Duration, SystemTime};
 
+use opentelemetry::Context;
+use opentelemetry_sdk::logs::LogExporter as _;
+use opentelemetry_sdk::trace::SpanExporter as _;
 use tokio::runtime::{Builder, Runtime};
 use tokio::sync::oneshot;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
-use super::client::Client;
-use super::events::Reporter;
+use super::delivery::{Delivery, Export};
+use super::events::{LogExport, Reporter};
 use super::exports::Signal;
-use super::metrics::Collector;
+use super::metrics::{Collector, MetricExport};
+use super::own_log::{self, LogQueue};
+use super::points::scope;
+use super::reports::Reports;
 use super::settings::{Settings, SettingsError, Target};
-use super::signal_sender::SignalSender;
-use super::traces::{SpanQueue, Tracing};
+use super::traces::{SpanExport, SpanQueue, Tracing};
+use super::transport::Transport;
 use crate::privilege::{self, Role, SpawnError};
 use crate::surface::collect::MetricSources;
 
 /// Longest time to stop, whatever the receiver does.
 const ENDING: Duration = Duration::from_secs(2);
+
+/// Queues whose content is exported.
+#[derive(Debug, Default)]
+pub struct Queues {
+    /// Spans.
+    pub spans: Arc<SpanQueue>,
+    /// Lines of the agent's own log, if they are exported.
+    pub log: Option<Arc<LogQueue>>,
+}
 
 /// The running thread.
 pub struct Exporter {
@@ -52,18 +67,26 @@ impl Exporter {
     pub fn start(
         settings: Settings,
         sources: &MetricSources,
-        spans: Arc<SpanQueue>,
+        queues: Queues,
     ) -> Result<Self, StartError> {
         // Blocking threads resolve names, at most one per signal.
         let mut runtime = Builder::new_current_thread();
-        let runtime = runtime.max_blocking_threads(3).enable_all().build();
+        let runtime = runtime
+            .max_blocking_threads(Signal::ALL.len())
+            .enable_all()
+            .build();
         let runtime = runtime.map_err(StartError::Runtime)?;
         let stop = CancellationToken::new();
-        let jobs = Jobs::new(settings, sources, spans, &stop, &runtime)?;
+        let reports = Reports::dispatch();
+        let jobs = tracing::dispatcher::with_default(&reports, || {
+            Jobs::new(settings, sources, queues, &stop, &runtime)
+        })?;
         let (tell, ended) = oneshot::channel();
         let thread = std::thread::Builder::new().name("otlp".to_owned());
         let thread = privilege::spawn(Role::Export, thread, move || {
-            runtime.block_on(jobs.run());
+            // Log lines of this thread are not exported: each could cause the next one.
+            let _suppressed = Context::enter_telemetry_suppressed_scope();
+            tracing::dispatcher::with_default(&reports, || runtime.block_on(jobs.run()));
             // A pending name resolution must not delay the end.
             runtime.shutdown_background();
             let _ = tell.send(());
@@ -88,69 +111,107 @@ impl Exporter {
 
 /// Work of the thread.
 struct Jobs {
-    spans: Arc<SpanQueue>,
-    metrics: Option<(Collector, SignalSender, Duration)>,
-    events: Option<(Reporter, SignalSender)>,
-    traces: Option<(Tracing, SignalSender)>,
+    queues: Queues,
+    metrics: Option<(Collector, Delivery<MetricExport>, Duration)>,
+    events: Option<(Reporter, Delivery<LogExport>)>,
+    traces: Option<(Tracing, Delivery<SpanExport>)>,
+    log: Option<Delivery<LogExport>>,
 }
 
 impl Jobs {
     fn new(
         settings: Settings,
         sources: &MetricSources,
-        spans: Arc<SpanQueue>,
+        queues: Queues,
         stop: &CancellationToken,
         runtime: &Runtime,
     ) -> Result<Self, SettingsError> {
         // Connections need the runtime from their creation on.
         let _inside = runtime.enter();
-        let sender = |signal: Signal, target: Option<Target>| {
-            let client =
-                target.map(|target| Client::new(signal, target, Arc::clone(&sources.exports)));
-            Ok(client
-                .transpose()?
-                .map(|client| SignalSender::new(client, stop.clone())))
+        let resource = &settings.resource;
+        let metrics = delivery(
+            Signal::Metrics,
+            settings.metrics,
+            sources,
+            stop,
+            |transport| {
+                let (exporter, encoded) = transport.metrics()?;
+                Ok(MetricExport { exporter, encoded })
+            },
+        )?;
+        let logs = |transport: &Transport| {
+            let mut exporter = transport.logs()?;
+            exporter.set_resource(resource);
+            let scope = scope();
+            Ok(LogExport { exporter, scope })
         };
-        let metrics = sender(Signal::Metrics, settings.metrics)?;
-        let events = sender(Signal::Events, settings.events)?;
-        let collector = || {
-            Collector::new(
-                sources.clone(),
-                settings.resource.clone(),
-                SystemTime::now(),
-            )
-        };
-        let traces = sender(Signal::Traces, settings.traces)?;
-        let tracing = || Tracing::new(settings.resource.clone(), settings.host);
+        let events = delivery(Signal::Events, settings.events, sources, stop, logs)?;
+        let log = delivery(Signal::Log, settings.log, sources, stop, logs)?;
+        let traces = delivery(
+            Signal::Traces,
+            settings.traces,
+            sources,
+            stop,
+            |transport| {
+                let mut exporter = transport.spans()?;
+                exporter.set_resource(resource);
+                Ok(SpanExport(exporter))
+            },
+        )?;
+        let collector = || Collector::new(sources.clone(), resource, SystemTime::now());
+        let reporter = || Reporter::new(Arc::clone(&sources.events));
         Ok(Self {
-            spans,
-            traces: traces.map(|sender| (tracing(), sender)),
-            metrics: metrics.map(|sender| (collector(), sender, settings.interval)),
-            events: events.map(|sender| {
-                (
-                    Reporter::new(Arc::clone(&sources.events), settings.resource.clone()),
-                    sender,
-                )
-            }),
+            queues,
+            metrics: metrics.map(|delivery| (collector(), delivery, settings.interval)),
+            events: events.map(|delivery| (reporter(), delivery)),
+            traces: traces.map(|delivery| (Tracing::new(settings.host), delivery)),
+            log,
         })
     }
 
     async fn run(self) {
         let metrics = async {
-            if let Some((collector, sender, interval)) = self.metrics {
-                collector.run(sender, interval).await;
+            if let Some((collector, delivery, interval)) = self.metrics {
+                collector.run(delivery, interval).await;
             }
         };
         let events = async {
-            if let Some((reporter, sender)) = self.events {
-                reporter.run(sender).await;
+            if let Some((reporter, delivery)) = self.events {
+                reporter.run(delivery).await;
             }
         };
         let traces = async {
-            if let Some((tracing, sender)) = self.traces {
-                tracing.run(sender, &self.spans).await;
+            if let Some((tracing, delivery)) = self.traces {
+                tracing.run(delivery, &self.queues.spans).await;
             }
         };
-        tokio::join!(metrics, events, traces);
+        let log = async {
+            if let Some((delivery, queue)) = self.log.zip(self.queues.log.as_ref()) {
+                own_log::run(delivery, queue).await;
+            }
+        };
+        tokio::join!(metrics, events, traces, log);
     }
+}
+
+/// Returns the delivery of a signal, if it has a target.
+fn delivery<E: Export>(
+    signal: Signal,
+    target: Option<Target>,
+    sources: &MetricSources,
+    stop: &CancellationToken,
+    exporter: impl FnOnce(&Transport) -> Result<E, SettingsError>,
+) -> Result<Option<Delivery<E>>, SettingsError> {
+    let Some(target) = target else {
+        return Ok(None);
+    };
+    let transport = Transport::new(target)?;
+    let exporter = exporter(&transport)?;
+    Ok(Some(Delivery::new(
+        exporter,
+        signal,
+        transport.endpoint(),
+        Arc::clone(&sources.exports),
+        stop.clone(),
+    )))
 }

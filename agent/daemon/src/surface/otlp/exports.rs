@@ -12,6 +12,8 @@ pub enum Signal {
     Events,
     /// Spans.
     Traces,
+    /// Lines of the agent's own log.
+    Log,
 }
 
 /// Result of a request.
@@ -52,7 +54,7 @@ pub struct Exports {
 
 impl Signal {
     /// All signals.
-    pub const ALL: [Self; 3] = [Self::Metrics, Self::Events, Self::Traces];
+    pub const ALL: [Self; 4] = [Self::Metrics, Self::Events, Self::Traces, Self::Log];
 
     /// Returns the label value.
     #[must_use]
@@ -61,6 +63,7 @@ impl Signal {
             Self::Metrics => "metrics",
             Self::Events => "events",
             Self::Traces => "traces",
+            Self::Log => "log",
         }
     }
 }

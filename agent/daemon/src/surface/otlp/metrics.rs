@@ -5,16 +5,42 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
-use opentelemetry_proto::tonic::resource::v1::Resource;
+use opentelemetry_otlp::MetricExporter;
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::error::OTelSdkResult;
+use opentelemetry_sdk::metrics::exporter::PushMetricExporter as _;
 use tokio::time::{MissedTickBehavior, interval_at};
 
-use super::points::{Collection, Points};
-use super::signal_sender::SignalSender;
+use super::delivery::{Delivery, Export, Settled};
+use super::encoded::EncodedSender;
+use super::points::{Batch, Collection, Points};
 use crate::surface::collect::{MetricSources, collect};
 use crate::surface::metric_sink::MetricSink;
 
 /// Longest time to wait for a fresh snapshot, as for a scrape.
 const REFRESH_TIMEOUT: Duration = Duration::from_millis(600);
+
+/// Exports metrics.
+pub(super) struct MetricExport {
+    pub(super) exporter: MetricExporter,
+    /// Sends the points that the exporter cannot carry.
+    pub(super) encoded: EncodedSender,
+}
+
+impl Export for MetricExport {
+    type Batch = Batch;
+
+    fn items(batch: &Batch) -> u64 {
+        batch.items()
+    }
+
+    async fn export(&self, batch: &Batch) -> OTelSdkResult {
+        match batch {
+            Batch::Metrics(metrics, _) => self.exporter.export(metrics).await,
+            Batch::Encoded(request, _) => self.encoded.send(request).await,
+        }
+    }
+}
 
 /// Collects the metrics.
 pub(super) struct Collector {
@@ -25,7 +51,7 @@ pub(super) struct Collector {
 
 impl Collector {
     /// Creates a collector for an agent that started at this time.
-    pub(super) fn new(sources: MetricSources, resource: Resource, started: SystemTime) -> Self {
+    pub(super) fn new(sources: MetricSources, resource: &Resource, started: SystemTime) -> Self {
         Self {
             sources,
             points: Points::new(resource, unix_nanoseconds(started)),
@@ -34,23 +60,38 @@ impl Collector {
     }
 
     /// Exports every `period`, and once at the end.
-    pub(super) async fn run(mut self, mut sender: SignalSender, period: Duration) {
+    pub(super) async fn run(mut self, mut delivery: Delivery<MetricExport>, period: Duration) {
         // The offset spreads the exports of a fleet that was switched on simultaneously.
         let mut ticks = interval_at(tokio::time::Instant::now() + period / 4, period);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             let now = tokio::select! {
                 now = ticks.tick() => now,
-                () = sender.stopped() => break,
+                () = delivery.stopped() => break,
             };
             self.sources.latest.refresh(REFRESH_TIMEOUT).await;
-            let Collection { requests, dropped } = self.collect(SystemTime::now());
-            sender.overflowed(dropped);
-            sender.deliver(requests, Some(now + period)).await;
+            let Collection { batches, dropped } = self.collect(SystemTime::now());
+            delivery.overflowed(dropped);
+            let mut is_overtaken = false;
+            for batch in batches {
+                if is_overtaken {
+                    delivery.superseded(&batch);
+                    continue;
+                }
+                is_overtaken = match delivery.deliver(&batch, Some(now + period)).await {
+                    Settled::Answered => false,
+                    Settled::Overtaken => true,
+                    Settled::Stopped => {
+                        // The last collection replaces it.
+                        delivery.superseded(&batch);
+                        true
+                    }
+                };
+            }
         }
-        let Collection { requests, dropped } = self.collect(SystemTime::now());
-        sender.overflowed(dropped);
-        sender.finish(requests, true).await;
+        let Collection { batches, dropped } = self.collect(SystemTime::now());
+        delivery.overflowed(dropped);
+        delivery.finish(batches).await;
     }
 
     /// Returns all metrics as of now.

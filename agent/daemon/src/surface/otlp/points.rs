@@ -1,69 +1,102 @@
-//! A collection as OTLP data points, encoded as it is written, so that a large robot's points are
-//! never all in memory as objects. Requests stay well below the 4 MiB that receivers accept by
-//! default.
+//! A collection as requests: points gather until a request is full, and become the SDK's form then.
+//! Requests stay well below the 4 MiB that receivers accept by default.
 //!
-//! OTLP's own types and encoding are used without the SDK: the SDK aggregates measurements itself
-//! and accepts no finished histograms and sums.
+//! Texts are shared between the points of a collection, so a large robot's names are in memory once.
 
+use std::collections::HashSet;
+use std::sync::Arc;
+
+use opentelemetry::{InstrumentationScope, Key, KeyValue, StringValue, Value};
 use opentelemetry_proto::tonic::collector::metrics::v1::ExportMetricsServiceRequest;
-use opentelemetry_proto::tonic::common::v1::any_value::Value;
-use opentelemetry_proto::tonic::common::v1::{AnyValue, InstrumentationScope, KeyValue};
-use opentelemetry_proto::tonic::metrics::v1::{
-    AggregationTemporality, Gauge, Histogram as HistogramFamily, HistogramDataPoint,
-    Metric as Family, NumberDataPoint, ResourceMetrics, ScopeMetrics, Sum, metric::Data,
-    number_data_point,
-};
-use opentelemetry_proto::tonic::resource::v1::Resource;
-use prost::Message as _;
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::metrics::data::ResourceMetrics;
 
-use super::client::Request;
+use super::encoded::Encoded;
+use super::instruments::{self, Instruments, REQUEST_POINTS, is_real};
 use super::starts::Starts;
 use crate::surface::catalogue::{Kind, Metric};
 use crate::surface::metric_sink::{Label, Number, write_capped};
 use ros2probe_model::histogram::Histogram;
 
-/// Encoded size in bytes at which a request ends.
+/// Estimated size in bytes at which a request ends.
 const REQUEST_BYTES: usize = 1 << 20;
-/// Largest encoded size of a collection; further points are dropped and counted.
+/// Largest estimated size of a collection; further points are dropped and counted.
 const COLLECTION_BYTES: usize = 16 << 20;
+/// Estimated size of a point without attributes, of a bucket, and of an attribute without its texts.
+const POINT_BYTES: usize = 30;
+const BUCKET_BYTES: usize = 17;
+const ATTRIBUTE_BYTES: usize = 8;
 
-/// Encodes one collection after the other.
-#[derive(Debug)]
+/// Gathers one collection after the other.
 pub(in crate::surface) struct Points {
-    resource: Resource,
+    instruments: Instruments,
     starts: Starts,
     now: u64,
     /// The metric of the current samples.
     metric: Option<&'static Metric>,
-    families: Vec<Family>,
-    /// Encoded size and number of the points in `families`.
-    bytes: usize,
-    items: u64,
-    requests: Vec<Request>,
+    counters: Gathered<instruments::Points>,
+    gauges: Gathered<instruments::Points>,
+    encoded: Gathered<Encoded>,
+    names: Names,
+    /// Attributes of the current point.
+    attributes: Vec<KeyValue>,
+    batches: Vec<Batch>,
     total: usize,
     dropped: u64,
 }
 
+/// Points of a request, and their estimated size.
+struct Gathered<P> {
+    points: P,
+    bytes: usize,
+}
+
+/// A request.
+pub(super) enum Batch {
+    /// Points in the SDK's form, and their number.
+    Metrics(ResourceMetrics, u64),
+    /// Points that the SDK cannot carry, and their number.
+    Encoded(ExportMetricsServiceRequest, u64),
+}
+
 /// The result of a collection.
-#[derive(Debug, Default)]
+#[derive(Default)]
 pub(super) struct Collection {
-    pub(super) requests: Vec<Request>,
+    pub(super) batches: Vec<Batch>,
     /// Points dropped because the collection was too large.
     pub(super) dropped: u64,
 }
 
+impl Batch {
+    /// Returns the number of points.
+    pub(super) const fn items(&self) -> u64 {
+        match self {
+            Self::Metrics(_, items) | Self::Encoded(_, items) => *items,
+        }
+    }
+}
+
 impl Points {
-    /// Creates an encoder for an agent that started at this time, in Unix nanoseconds.
-    pub(super) fn new(resource: Resource, started: u64) -> Self {
+    /// Creates a collection for an agent that started at this time, in Unix nanoseconds.
+    pub(super) fn new(resource: &Resource, started: u64) -> Self {
+        let gathered = || Gathered {
+            points: instruments::Points::default(),
+            bytes: 0,
+        };
         Self {
-            resource,
+            instruments: Instruments::new(resource.clone(), scope()),
             starts: Starts::new(started),
             now: started,
             metric: None,
-            families: Vec::new(),
-            bytes: 0,
-            items: 0,
-            requests: Vec::new(),
+            counters: gathered(),
+            gauges: gathered(),
+            encoded: Gathered {
+                points: Encoded::new(resource, scope()),
+                bytes: 0,
+            },
+            names: Names::default(),
+            attributes: Vec::new(),
+            batches: Vec::new(),
             total: 0,
             dropped: 0,
         }
@@ -77,223 +110,189 @@ impl Points {
 
     /// Ends the collection.
     pub(super) fn end(&mut self) -> Collection {
-        self.encode();
+        self.end_counters();
+        self.end_gauges();
+        self.end_encoded();
         self.starts.end();
+        self.names = Names::default();
         (self.metric, self.total) = (None, 0);
         Collection {
-            requests: std::mem::take(&mut self.requests),
+            batches: std::mem::take(&mut self.batches),
             dropped: std::mem::take(&mut self.dropped),
         }
     }
 
     /// Begins a family.
-    pub(in crate::surface) fn open(&mut self, metric: &'static Metric) {
-        if self.families.last().is_some_and(is_empty) {
-            self.families.pop();
-        }
+    pub(in crate::surface) const fn open(&mut self, metric: &'static Metric) {
         self.metric = Some(metric);
-        self.families.push(family(metric));
     }
 
     /// Adds a sample; the value of an info is ignored.
     pub(in crate::surface) fn number(&mut self, labels: &[Label<'_>], value: Number) {
         let Some(metric) = self.metric else { return };
-        let value = if metric.kind == Kind::Info {
-            Number::Count(1)
-        } else {
-            value
+        let Some(bytes) = self.attributes(metric, labels, POINT_BYTES) else {
+            return;
         };
-        let (value, real) = match value {
-            Number::Count(count) => {
-                let exact = i64::try_from(count).unwrap_or(i64::MAX);
-                #[expect(clippy::cast_precision_loss, reason = "only compared with itself")]
-                (number_data_point::Value::AsInt(exact), count as f64)
+        let value = match (metric.kind, value) {
+            (Kind::Info, _) => Number::Count(1),
+            #[expect(clippy::cast_precision_loss, reason = "seconds below 2^53")]
+            (Kind::Counter, Number::Count(count)) if is_real(metric) => Number::Real(count as f64),
+            (Kind::Gauge, Number::Real(real)) if !real.is_finite() => {
+                self.encoded_has_room(bytes);
+                let encoded = &mut self.encoded.points;
+                return encoded.gauge(metric, &self.attributes, real, self.now);
             }
-            Number::Real(real) => (number_data_point::Value::AsDouble(real), real),
+            (_, value) => value,
         };
-        let cumulative = metric.kind == Kind::Counter;
-        let point = NumberDataPoint {
-            attributes: attributes(metric, labels),
-            start_time_unix_nano: if cumulative {
-                self.starts.start(metric, labels, real)
-            } else {
-                0
-            },
-            time_unix_nano: self.now,
-            value: Some(value),
-            ..NumberDataPoint::default()
+        let (points, is_counter) = match metric.kind {
+            Kind::Counter => (&mut self.counters, true),
+            _ => (&mut self.gauges, false),
         };
-        if !self.fits(point.encoded_len()) {
+        points.bytes += bytes;
+        points.points.push(metric, &self.attributes, value);
+        if points.bytes < REQUEST_BYTES && points.points.len() < REQUEST_POINTS {
             return;
         }
-        match self.families.last_mut().and_then(|last| last.data.as_mut()) {
-            Some(Data::Sum(sum)) => sum.data_points.push(point),
-            Some(Data::Gauge(gauge)) => gauge.data_points.push(point),
-            _ => {}
+        if is_counter {
+            self.end_counters();
+        } else {
+            self.end_gauges();
         }
     }
 
     /// Adds a histogram.
     pub(in crate::surface) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) {
         let Some(metric) = self.metric else { return };
-        let (bounds, counts): (Vec<f64>, Vec<u64>) = values.buckets().unzip();
+        let bytes = POINT_BYTES + BUCKET_BYTES * values.buckets().count();
+        let Some(bytes) = self.attributes(metric, labels, bytes) else {
+            return;
+        };
         #[expect(clippy::cast_precision_loss, reason = "only compared with itself")]
         let start = self.starts.start(metric, labels, values.count() as f64);
-        let point = HistogramDataPoint {
-            attributes: attributes(metric, labels),
-            start_time_unix_nano: start,
-            time_unix_nano: self.now,
-            count: values.count(),
-            sum: Some(values.sum()),
-            bucket_counts: counts,
-            // The last bucket has no bound.
-            explicit_bounds: bounds
-                .into_iter()
-                .filter(|bound| bound.is_finite())
-                .collect(),
-            ..HistogramDataPoint::default()
-        };
-        if !self.fits(point.encoded_len()) {
-            return;
-        }
-        if let Some(Data::Histogram(family)) =
-            self.families.last_mut().and_then(|last| last.data.as_mut())
-        {
-            family.data_points.push(point);
-        }
+        self.encoded_has_room(bytes);
+        let encoded = &mut self.encoded.points;
+        encoded.histogram(metric, &self.attributes, values, [start, self.now]);
     }
 
-    /// Reserves space for a point; returns `false` if the collection is full.
-    fn fits(&mut self, length: usize) -> bool {
-        if self.total + length > COLLECTION_BYTES {
+    /// Converts labels to attributes of the next point, whose estimated size it returns. Empty
+    /// labels are omitted, as Prometheus treats them as missing. `None` if the collection is full.
+    fn attributes(
+        &mut self,
+        metric: &Metric,
+        labels: &[Label<'_>],
+        mut bytes: usize,
+    ) -> Option<usize> {
+        self.attributes.clear();
+        for (name, label) in metric.labels.iter().copied().zip(labels) {
+            if matches!(label, Label::Text("")) {
+                continue;
+            }
+            let value = value(label, &mut self.names);
+            bytes += ATTRIBUTE_BYTES + name.len();
+            if let Value::String(text) = &value {
+                bytes += text.as_str().len();
+            }
+            self.attributes
+                .push(KeyValue::new(Key::from_static_str(name), value));
+        }
+        if self.total + bytes > COLLECTION_BYTES {
             self.dropped += 1;
-            return false;
+            return None;
         }
-        if self.bytes + length > REQUEST_BYTES {
-            self.encode();
-            self.families.extend(self.metric.map(family));
-        }
-        // Key and length of the field need further bytes.
-        self.bytes += length + 4;
-        self.total += length + 4;
-        self.items += 1;
-        true
+        self.total += bytes;
+        Some(bytes)
     }
 
-    /// Ends a request.
-    fn encode(&mut self) {
-        let mut metrics = std::mem::take(&mut self.families);
-        metrics.retain(|family| !is_empty(family));
-        self.bytes = 0;
-        let items = std::mem::take(&mut self.items);
-        if metrics.is_empty() {
-            return;
+    fn end_counters(&mut self) {
+        let points = self.counters.take();
+        if points.len() > 0 {
+            let items = points.len() as u64;
+            let metrics = self.instruments.counters(points);
+            self.batches.push(Batch::Metrics(metrics, items));
         }
-        let scope_metrics = vec![ScopeMetrics {
-            scope: Some(scope()),
-            metrics,
-            schema_url: String::new(),
-        }];
-        let request = ExportMetricsServiceRequest {
-            resource_metrics: vec![ResourceMetrics {
-                resource: Some(self.resource.clone()),
-                scope_metrics,
-                schema_url: String::new(),
-            }],
-        };
-        self.requests.push(Request {
-            body: request.encode_to_vec().into(),
-            items,
-        });
+    }
+
+    fn end_gauges(&mut self) {
+        let points = self.gauges.take();
+        if points.len() > 0 {
+            let items = points.len() as u64;
+            let metrics = self.instruments.gauges(points);
+            self.batches.push(Batch::Metrics(metrics, items));
+        }
+    }
+
+    fn encoded_has_room(&mut self, bytes: usize) {
+        if self.encoded.bytes + bytes > REQUEST_BYTES {
+            self.end_encoded();
+        }
+        self.encoded.bytes += bytes;
+    }
+
+    fn end_encoded(&mut self) {
+        self.encoded.bytes = 0;
+        if let Some((request, items)) = self.encoded.points.take() {
+            self.batches.push(Batch::Encoded(request, items));
+        }
+    }
+}
+
+impl Gathered<instruments::Points> {
+    fn take(&mut self) -> instruments::Points {
+        self.bytes = 0;
+        std::mem::take(&mut self.points)
     }
 }
 
 /// Returns the instrumentation scope of all signals.
 pub(super) fn scope() -> InstrumentationScope {
-    InstrumentationScope {
-        name: env!("CARGO_PKG_NAME").to_owned(),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        ..InstrumentationScope::default()
-    }
+    InstrumentationScope::builder(env!("CARGO_PKG_NAME"))
+        .with_version(env!("CARGO_PKG_VERSION"))
+        .build()
 }
 
-/// Returns a text attribute.
-pub(super) fn attribute(key: &str, value: impl Into<String>) -> KeyValue {
-    key_value(key, Value::StringValue(value.into()))
+/// Texts of a collection.
+#[derive(Default)]
+struct Names {
+    known: HashSet<Arc<str>>,
+    capped: String,
 }
 
-/// Returns an attribute of any type.
-pub(super) fn key_value(key: &str, value: Value) -> KeyValue {
-    KeyValue {
-        key: key.to_owned(),
-        value: Some(AnyValue { value: Some(value) }),
-        ..KeyValue::default()
-    }
-}
-
-fn family(metric: &Metric) -> Family {
-    let temporality = AggregationTemporality::Cumulative.into();
-    let data = match metric.kind {
-        Kind::Counter => Data::Sum(Sum {
-            data_points: Vec::new(),
-            aggregation_temporality: temporality,
-            is_monotonic: true,
-        }),
-        Kind::Gauge | Kind::Info => Data::Gauge(Gauge::default()),
-        Kind::Histogram => Data::Histogram(HistogramFamily {
-            data_points: Vec::new(),
-            aggregation_temporality: temporality,
-        }),
-    };
-    Family {
-        name: metric.otlp_name(),
-        description: metric.help.to_owned(),
-        unit: metric.ucum().to_owned(),
-        metadata: Vec::new(),
-        data: Some(data),
-    }
-}
-
-fn is_empty(family: &Family) -> bool {
-    match &family.data {
-        Some(Data::Sum(sum)) => sum.data_points.is_empty(),
-        Some(Data::Gauge(gauge)) => gauge.data_points.is_empty(),
-        Some(Data::Histogram(histogram)) => histogram.data_points.is_empty(),
-        _ => true,
-    }
-}
-
-/// Converts labels to attributes; empty ones are omitted, as Prometheus treats them as missing.
-fn attributes(metric: &Metric, labels: &[Label<'_>]) -> Vec<KeyValue> {
-    let named = metric.labels.iter().zip(labels);
-    named
-        .filter(|(_, label)| !matches!(label, Label::Text("")))
-        .map(|(name, label)| key_value(name, value(label)))
-        .collect()
-}
-
-fn value(label: &Label<'_>) -> Value {
-    match label {
-        Label::Text(label) => {
-            let mut text = String::new();
-            // As on the page, the cap keeps text from the network from determining the size of a
-            // request. Writing to memory cannot fail.
-            let _ = write_capped(&mut text, label);
-            Value::StringValue(text)
+impl Names {
+    fn shared(&mut self, text: &str) -> Arc<str> {
+        self.capped.clear();
+        // As on the page, the cap keeps text from the network from determining the size of a
+        // request. Writing to memory cannot fail.
+        let _ = write_capped(&mut self.capped, text);
+        if let Some(known) = self.known.get(self.capped.as_str()) {
+            return Arc::clone(known);
         }
+        let shared = Arc::<str>::from(self.capped.as_str());
+        self.known.insert(Arc::clone(&shared));
+        shared
+    }
+}
+
+fn value(label: &Label<'_>, names: &mut Names) -> Value {
+    match label {
+        Label::Text(text) => Value::String(StringValue::from(names.shared(text))),
         Label::Number(number) => match i64::try_from(*number) {
-            Ok(number) => Value::IntValue(number),
-            Err(_) => Value::StringValue(number.to_string()),
+            Ok(number) => Value::I64(number),
+            Err(_) => number.to_string().into(),
         },
-        Label::Guid(guid) => Value::StringValue(guid.to_string()),
-        Label::Address(address) => Value::StringValue(address.to_string()),
-        Label::Vendor(vendor) => Value::StringValue(vendor.to_string()),
-        Label::Subscriber(subscriber) => Value::StringValue(subscriber.to_string()),
+        Label::Guid(guid) => guid.to_string().into(),
+        Label::Address(address) => address.to_string().into(),
+        Label::Vendor(vendor) => vendor.to_string().into(),
+        Label::Subscriber(subscriber) => subscriber.to_string().into(),
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use opentelemetry_proto::tonic::common::v1::{self as proto, any_value};
+    use opentelemetry_proto::tonic::metrics::v1::metric::Data;
+    use opentelemetry_proto::tonic::metrics::v1::{Metric as Family, number_data_point};
+    use prost::Message as _;
+
     use super::*;
     use crate::surface::catalogue::CATALOGUE;
 
@@ -301,21 +300,47 @@ mod tests {
         CATALOGUE.iter().find(|metric| metric.name == name).unwrap()
     }
 
+    fn requests(collection: &Collection) -> Vec<ExportMetricsServiceRequest> {
+        let batches = collection.batches.iter();
+        let requests = batches.map(|batch| match batch {
+            Batch::Metrics(metrics, _) => metrics.into(),
+            Batch::Encoded(request, _) => request.clone(),
+        });
+        requests.collect()
+    }
+
     fn families(collection: &Collection) -> Vec<Family> {
-        let requests = collection
-            .requests
-            .iter()
-            .map(|request| ExportMetricsServiceRequest::decode(request.body.clone()).unwrap());
-        requests
+        requests(collection)
+            .into_iter()
             .flat_map(|request| request.resource_metrics)
             .flat_map(|resource| resource.scope_metrics)
             .flat_map(|scope| scope.metrics)
             .collect()
     }
 
+    fn attribute(key: &str, value: any_value::Value) -> proto::KeyValue {
+        proto::KeyValue {
+            key: key.to_owned(),
+            value: Some(proto::AnyValue { value: Some(value) }),
+            ..proto::KeyValue::default()
+        }
+    }
+
+    fn text(text: &str) -> any_value::Value {
+        any_value::Value::StringValue(text.to_owned())
+    }
+
+    fn empty() -> Points {
+        Points::new(&Resource::builder_empty().build(), 7)
+    }
+
+    fn items(collection: &Collection) -> u64 {
+        collection.batches.iter().map(Batch::items).sum()
+    }
+
     #[test]
     fn each_kind_becomes_what_maps_back_to_it() {
-        let mut points = Points::new(Resource::default(), 7);
+        let mut points = empty();
         let topic = [Label::Number(5), Label::Text("/points")];
         let mut histogram = Histogram::default();
         histogram.observe(0.001);
@@ -331,7 +356,7 @@ mod tests {
         points.open(metric("ros2_topic_latency_seconds"));
         points.histogram(&topic, &histogram);
         let collection = points.end();
-        assert_eq!(collection.requests.first().unwrap().items, 4);
+        assert_eq!((items(&collection), collection.batches.len()), (4, 3));
 
         let families = families(&collection);
         let [messages, publishers, build, latency] = families.as_slice() else {
@@ -342,29 +367,35 @@ mod tests {
         };
         assert!(sum.is_monotonic && sum.aggregation_temporality == 2);
         let point = sum.data_points.first().unwrap();
-        assert_eq!((point.start_time_unix_nano, point.time_unix_nano), (7, 9));
+        assert!(point.start_time_unix_nano < point.time_unix_nano);
         assert_eq!(point.value, Some(number_data_point::Value::AsInt(3)));
         assert_eq!(
             point.attributes,
             [
-                key_value("domain_id", Value::IntValue(5)),
-                attribute("topic", "/points")
+                attribute("domain_id", any_value::Value::IntValue(5)),
+                attribute("topic", text("/points"))
             ]
         );
         let Some(Data::Gauge(gauge)) = &publishers.data else {
             panic!("{publishers:?}")
         };
-        assert_eq!(gauge.data_points.first().unwrap().start_time_unix_nano, 0);
+        let gauge = gauge.data_points.first().unwrap();
+        assert_eq!(gauge.value, Some(number_data_point::Value::AsInt(2)));
+        assert_eq!(gauge.attributes, point.attributes);
         let Some(Data::Gauge(info)) = &build.data else {
             panic!("{build:?}")
         };
         let info = info.data_points.first().unwrap();
         assert_eq!(info.value, Some(number_data_point::Value::AsInt(1)));
-        assert_eq!(info.attributes, [attribute("version", "1")]);
+        assert_eq!(info.attributes, [attribute("version", text("1"))]);
         let Some(Data::Histogram(latency)) = &latency.data else {
             panic!("{latency:?}")
         };
         let latency = latency.data_points.first().unwrap();
+        assert_eq!(
+            (latency.start_time_unix_nano, latency.time_unix_nano),
+            (7, 9)
+        );
         assert_eq!(
             latency.explicit_bounds.len() + 1,
             latency.bucket_counts.len()
@@ -378,7 +409,7 @@ mod tests {
     #[test]
     fn a_large_robot_comes_in_several_requests_and_no_point_twice_or_never() {
         const POINTS: u64 = 60_000;
-        let mut points = Points::new(Resource::default(), 0);
+        let mut points = empty();
         points.begin(1);
         for name in [
             "ros2_topic_messages_total",
@@ -393,19 +424,11 @@ mod tests {
             }
         }
         let collection = points.end();
-        assert!(collection.requests.len() > 2 && collection.dropped == 0);
-        for request in &collection.requests {
-            assert!(
-                request.body.len() < 2 * REQUEST_BYTES,
-                "{}",
-                request.body.len()
-            );
+        assert!(collection.batches.len() > 2 && collection.dropped == 0);
+        for request in requests(&collection) {
+            let bytes = request.encoded_len();
+            assert!(bytes < 2 * REQUEST_BYTES, "{bytes}");
         }
-        let items: u64 = collection
-            .requests
-            .iter()
-            .map(|request| request.items)
-            .sum();
         let found: usize = families(&collection)
             .iter()
             .map(|family| match &family.data {
@@ -413,12 +436,12 @@ mod tests {
                 other => panic!("{other:?}"),
             })
             .sum();
-        assert_eq!((items, found as u64), (POINTS, POINTS));
+        assert_eq!((items(&collection), found as u64), (POINTS, POINTS));
     }
 
     #[test]
     fn what_has_no_room_is_counted() {
-        let mut points = Points::new(Resource::default(), 0);
+        let mut points = empty();
         let name = "x".repeat(250);
         points.begin(1);
         points.open(metric("ros2_topic_publishers"));
@@ -429,17 +452,12 @@ mod tests {
             );
         }
         let collection = points.end();
-        let kept: u64 = collection
-            .requests
-            .iter()
-            .map(|request| request.items)
-            .sum();
+        let kept = items(&collection);
         assert!(collection.dropped > 0);
         assert_eq!(kept + collection.dropped, 100_000);
-        let bytes: usize = collection
-            .requests
+        let bytes: usize = requests(&collection)
             .iter()
-            .map(|request| request.body.len())
+            .map(|it| it.encoded_len())
             .sum();
         assert!(bytes < COLLECTION_BYTES + (1 << 20), "{bytes}");
 
@@ -447,5 +465,54 @@ mod tests {
         points.open(metric("ros2_topic_publishers"));
         points.number(&[Label::Number(0), Label::Text("/p")], Number::Count(1));
         assert_eq!(points.end().dropped, 0, "the next collection begins anew");
+    }
+
+    #[test]
+    fn a_series_that_is_gone_is_in_no_later_collection() {
+        let mut points = empty();
+        for (now, topics) in [(1, &["/imu", "/points"][..]), (2, &["/points"]), (3, &[])] {
+            points.begin(now);
+            for name in ["ros2_topic_messages_total", "ros2_topic_publishers"] {
+                points.open(metric(name));
+                for topic in topics {
+                    let labels = [Label::Number(0), Label::Text(topic)];
+                    points.number(&labels, Number::Count(now));
+                }
+            }
+            let collection = points.end();
+            let found: Vec<usize> = families(&collection)
+                .iter()
+                .map(|family| match &family.data {
+                    Some(Data::Sum(sum)) => sum.data_points.len(),
+                    Some(Data::Gauge(gauge)) => gauge.data_points.len(),
+                    other => panic!("{other:?}"),
+                })
+                .collect();
+            let wanted = vec![topics.len(); if topics.is_empty() { 0 } else { 2 }];
+            assert_eq!(found, wanted, "at {now}");
+        }
+    }
+
+    #[test]
+    fn numbers_keep_their_kind_and_a_lag_that_is_not_known_stays_infinite() {
+        let mut points = empty();
+        points.begin(1);
+        points.open(metric("process_cpu_seconds_total"));
+        points.number(&[], Number::Real(1.5));
+        points.open(metric("ros2_topic_rate_hertz"));
+        let topic = |name| [Label::Number(0), Label::Text(name)];
+        points.number(&topic("/points"), Number::Real(0.5));
+        points.number(&topic("/imu"), Number::Real(f64::INFINITY));
+        let values: Vec<_> = families(&points.end())
+            .iter()
+            .flat_map(|family| match family.data.clone() {
+                Some(Data::Sum(sum)) => sum.data_points,
+                Some(Data::Gauge(gauge)) => gauge.data_points,
+                other => panic!("{other:?}"),
+            })
+            .map(|point| point.value.unwrap())
+            .collect();
+        let real = number_data_point::Value::AsDouble;
+        assert_eq!(values, [real(1.5), real(0.5), real(f64::INFINITY)]);
     }
 }

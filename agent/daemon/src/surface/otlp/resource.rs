@@ -1,11 +1,13 @@
 //! The resource: attributes that all points, records and spans of this agent share.
 
-use std::collections::BTreeMap;
 use std::fs;
 
-use opentelemetry_proto::tonic::resource::v1::Resource;
+use opentelemetry::{KeyValue, Value};
+use opentelemetry_sdk::Resource;
+use opentelemetry_sdk::resource::{EnvResourceDetector, ResourceDetector as _};
+use percent_encoding::percent_decode_str;
 
-use super::points::attribute;
+use crate::config::OtlpSettings;
 use ros2probe_model::identity::Identity;
 
 /// Identity of a host, from its operating system.
@@ -42,34 +44,51 @@ impl Host {
     }
 }
 
-/// Returns the resource for `host`; attributes in `given` are added and take precedence.
-pub(super) fn resource(host: &Host, given: &BTreeMap<String, String>) -> Resource {
-    let mut attributes = BTreeMap::from([
-        ("service.name".to_owned(), "ros2probe".to_owned()),
-        (
-            "service.version".to_owned(),
-            env!("CARGO_PKG_VERSION").to_owned(),
-        ),
-        ("service.instance.id".to_owned(), instance(host)),
-    ]);
-    let host = [("host.name", &host.name), ("host.id", &host.id)];
-    attributes.extend(
-        host.into_iter()
-            .filter_map(|(key, value)| Some((key.to_owned(), value.clone()?))),
-    );
-    attributes.extend(
-        given
-            .iter()
-            .map(|(key, value)| (key.clone(), value.clone())),
-    );
-    Resource {
-        attributes: attributes
-            .into_iter()
-            .filter(|(_, value)| !value.is_empty())
-            .map(|(key, value)| attribute(&key, value))
-            .collect(),
-        ..Resource::default()
-    }
+/// Returns the resource for `host`; attributes of the environment take precedence, then those of the
+/// file.
+pub(super) fn resource(host: &Host, file: &OtlpSettings) -> Resource {
+    let of_host = [("host.name", &host.name), ("host.id", &host.id)];
+    let of_host = of_host
+        .into_iter()
+        .filter_map(|(key, value)| Some(KeyValue::new(key, value.clone()?)));
+    let robot = file.robot.iter().map(|robot| ("robot.name", robot.clone()));
+    let of_file = file.attributes.iter();
+    let of_file = of_file.map(|(key, value)| KeyValue::new(key.clone(), value.clone()));
+    let resource = Resource::builder_empty()
+        .with_attributes([
+            KeyValue::new("service.name", "ros2probe"),
+            KeyValue::new("service.version", env!("CARGO_PKG_VERSION")),
+            KeyValue::new("service.instance.id", instance(host)),
+        ])
+        .with_attributes(of_host)
+        .with_attributes(environment(&EnvResourceDetector::new().detect()))
+        .with_attributes(service_name())
+        .with_attributes(of_file)
+        .with_attributes(robot.map(|(key, value)| KeyValue::new(key, value)))
+        .build();
+    // An empty value removes an attribute.
+    let kept = resource.iter();
+    let kept = kept.filter(|(_, value)| !value.as_str().is_empty());
+    let kept = kept.map(|(key, value)| KeyValue::new(key.clone(), value.clone()));
+    Resource::builder_empty().with_attributes(kept).build()
+}
+
+/// Returns the attributes of `OTEL_RESOURCE_ATTRIBUTES`. The SDK leaves their values percent-encoded.
+fn environment(detected: &Resource) -> Vec<KeyValue> {
+    let decoded = |value: &Value| {
+        let value = value.as_str();
+        percent_decode_str(&value).decode_utf8_lossy().into_owned()
+    };
+    let attributes = detected.iter();
+    attributes
+        .map(|(key, value)| KeyValue::new(key.clone(), decoded(value)))
+        .collect()
+}
+
+/// Returns the name in `OTEL_SERVICE_NAME`. The SDK's detector invents a name if it is unset.
+fn service_name() -> Option<KeyValue> {
+    let name = std::env::var("OTEL_SERVICE_NAME").ok()?;
+    Some(KeyValue::new("service.name", name)).filter(|name| !name.value.as_str().is_empty())
 }
 
 /// Returns a UUID (version 8) that survives restarts, so that a robot's series continue. It is
@@ -115,25 +134,38 @@ mod tests {
 
     #[test]
     fn what_is_given_replaces_what_is_known() {
-        let given = BTreeMap::from([
-            ("host.name".to_owned(), "R2".to_owned()),
-            ("service.instance.id".to_owned(), String::new()),
-            ("robot.name".to_owned(), "marvin".to_owned()),
-        ]);
+        let yaml = "otlp: {robot: marvin, attributes: {host.name: R2, service.instance.id: ''}}";
+        let file = crate::config::Config::parse(yaml.as_bytes()).unwrap().otlp;
         let host = Host {
             name: Some("robot-7".to_owned()),
             id: None,
         };
+        let resource = resource(&host, &file);
+        let mut attributes: Vec<_> = resource
+            .iter()
+            .map(|(key, value)| (key.as_str(), value.as_str().into_owned()))
+            .collect();
+        attributes.sort_unstable();
         assert_eq!(
-            resource(&host, &given).attributes,
+            attributes,
             [
-                attribute("host.name", "R2"),
-                attribute("robot.name", "marvin"),
-                attribute("service.name", "ros2probe"),
-                attribute("service.version", env!("CARGO_PKG_VERSION")),
+                ("host.name", "R2".to_owned()),
+                ("robot.name", "marvin".to_owned()),
+                ("service.name", "ros2probe".to_owned()),
+                ("service.version", env!("CARGO_PKG_VERSION").to_owned()),
             ]
         );
         let here = Host::read();
         assert!(here.name.is_some());
+    }
+
+    #[test]
+    fn values_of_the_environment_are_percent_decoded() {
+        let given = Resource::builder_empty();
+        let given = given.with_attribute(KeyValue::new("site", "hall%2C 2"));
+        assert_eq!(
+            environment(&given.build()),
+            [KeyValue::new("site", "hall, 2")]
+        );
     }
 }

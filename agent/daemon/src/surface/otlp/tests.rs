@@ -16,7 +16,7 @@ use tonic::transport::server::{Server, TcpIncoming};
 use tonic::{Code, Status};
 
 use super::exports::{Exports, Outcome, Reason, Signal};
-use super::{Exporter, Host, Settings};
+use super::{Exporter, Host, Queues, Settings};
 use crate::agent_facts::{AgentFacts, InsideSourceFacts, SourceKind};
 use crate::config::{Config, Watch, Watchlist};
 use crate::surface::{Exposition, Format, MetricSources};
@@ -115,7 +115,7 @@ fn start(address: SocketAddr, interval: u32, more: &str, sources: &MetricSources
     let config = Config::parse(yaml.as_bytes()).unwrap();
     let host = Host::default();
     let settings = Settings::resolve(&config.otlp, &|_| None, &host).unwrap();
-    Exporter::start(settings.unwrap(), sources, Arc::default()).unwrap()
+    Exporter::start(settings.unwrap(), sources, Queues::default()).unwrap()
 }
 
 /// Returns a snapshot of a managed node, observed from inside its process, whose timer publishes

@@ -1,5 +1,5 @@
 //! Export of spans: a bounded queue that the capture thread fills without waiting, and its
-//! requests.
+//! batches.
 //!
 //! A message's trace and its send span have the same ids on every agent. Ids of spans of one host
 //! depend on that host.
@@ -10,19 +10,20 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
-use opentelemetry_proto::tonic::common::v1::KeyValue;
-use opentelemetry_proto::tonic::common::v1::any_value::Value;
-use opentelemetry_proto::tonic::resource::v1::Resource;
-use opentelemetry_proto::tonic::trace::v1::span::SpanKind;
-use opentelemetry_proto::tonic::trace::v1::{ResourceSpans, ScopeSpans, Span as Exported};
-use prost::Message as _;
+use opentelemetry::trace::{
+    SpanContext, SpanId, SpanKind, Status, TraceFlags, TraceId, TraceState,
+};
+use opentelemetry::{InstrumentationScope, KeyValue, StringValue};
+use opentelemetry_otlp::SpanExporter;
+use opentelemetry_sdk::error::OTelSdkResult;
+use opentelemetry_sdk::trace::{SpanData, SpanEvents, SpanExporter as _, SpanLinks};
+use ros2probe_wire::Timestamp;
 use tokio::sync::Notify;
 
-use super::client::Request;
+use super::delivery::{Delivery, Export, Settled};
+use super::events::time;
 use super::exports::{Exports, Reason, Signal};
-use super::points::{attribute, key_value, scope};
-use super::signal_sender::SignalSender;
+use super::points::scope;
 use crate::tables::WaitingSpans;
 use ros2probe_model::bounded::Bounded;
 use ros2probe_model::chain::spans::{ChainSpan, ChainSpans};
@@ -34,7 +35,7 @@ const REQUEST: usize = 512;
 /// Time for which spans are collected into one request.
 const GATHER: Duration = Duration::from_secs(1);
 /// W3C trace flags: sampled, and a random trace id.
-const FLAGS: u32 = 0b11;
+const FLAGS: u8 = 0b11;
 
 /// The queue of spans between the capture thread and the exporter.
 #[derive(Debug, Default)]
@@ -112,97 +113,125 @@ impl SpanQueue {
     }
 }
 
-/// Encodes spans into requests.
+/// Exports spans.
+pub(super) struct SpanExport(pub(super) SpanExporter);
+
+impl Export for SpanExport {
+    type Batch = Vec<SpanData>;
+
+    fn items(batch: &Vec<SpanData>) -> u64 {
+        batch.len() as u64
+    }
+
+    async fn export(&self, batch: &Vec<SpanData>) -> OTelSdkResult {
+        self.0.export(batch.clone()).await
+    }
+}
+
+/// Converts spans to the SDK's form.
 pub(super) struct Tracing {
-    resource: Resource,
     /// Identity of this host, for ids of its own spans.
     host: u128,
+    scope: InstrumentationScope,
+}
+
+/// The parts of a span that depend on its kind.
+struct Parts {
+    trace_id: u128,
+    id: u64,
+    parent: Option<u64>,
+    kind: SpanKind,
+    name: String,
+    times: [Timestamp; 2],
+    attributes: Vec<KeyValue>,
+    links: SpanLinks,
 }
 
 impl Tracing {
-    pub(super) const fn new(resource: Resource, host: u128) -> Self {
-        Self { resource, host }
+    pub(super) fn new(host: u128) -> Self {
+        Self {
+            host,
+            scope: scope(),
+        }
     }
 
     /// Exports spans from the queue until the agent stops.
-    pub(super) async fn run(self, mut sender: SignalSender, queue: &SpanQueue) {
-        loop {
+    pub(super) async fn run(self, mut delivery: Delivery<SpanExport>, queue: &SpanQueue) {
+        let mut left = Vec::new();
+        while left.is_empty() {
             let gathered = async {
                 queue.filled().await;
                 tokio::time::sleep(GATHER).await;
             };
             tokio::select! {
                 () = gathered => {}
-                () = sender.stopped() => break,
+                () = delivery.stopped() => break,
             }
-            while !sender.is_stopped() {
-                let spans = queue.take();
-                if spans.is_empty() {
+            while let Some(batch) = self.take(queue) {
+                if delivery.deliver(&batch, None).await == Settled::Stopped {
+                    left.push(batch);
                     break;
                 }
-                sender.deliver(vec![self.request(&spans)], None).await;
             }
         }
-        let mut last = Vec::new();
-        loop {
-            let spans = queue.take();
-            if spans.is_empty() {
-                break;
-            }
-            last.push(self.request(&spans));
-        }
-        sender.finish(last, false).await;
+        left.extend(std::iter::from_fn(|| self.take(queue)));
+        delivery.finish(left).await;
     }
 
-    fn request(&self, spans: &[QueuedSpan]) -> Request {
-        let exported = |span: &QueuedSpan| match span {
-            QueuedSpan::Message(span) => self.exported(span),
-            QueuedSpan::Chain(span) => chains::exported(span, self.host),
-        };
-        let request = ExportTraceServiceRequest {
-            resource_spans: vec![ResourceSpans {
-                resource: Some(self.resource.clone()),
-                scope_spans: vec![ScopeSpans {
-                    scope: Some(scope()),
-                    spans: spans.iter().map(exported).collect(),
-                    schema_url: String::new(),
-                }],
-                schema_url: String::new(),
-            }],
-        };
-        Request {
-            body: request.encode_to_vec().into(),
-            items: spans.len() as u64,
-        }
+    /// Returns the next spans; `None` if the queue is empty.
+    fn take(&self, queue: &SpanQueue) -> Option<Vec<SpanData>> {
+        let spans = queue.take();
+        let exported = spans.iter().map(|span| match span {
+            QueuedSpan::Message(span) => self.of_message(span),
+            QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
+        });
+        let exported: Vec<_> = exported.collect();
+        (!exported.is_empty()).then_some(exported)
     }
 
-    fn exported(&self, span: &Span) -> Exported {
+    fn of_message(&self, span: &Span) -> SpanData {
         let (operation, kind) = match span.stage {
             SpanStage::Send => ("send", SpanKind::Producer),
             SpanStage::Receive => ("receive", SpanKind::Consumer),
             SpanStage::Settle(_) => ("settle", SpanKind::Client),
         };
         let message = &span.message;
-        let parent = match span.stage {
-            SpanStage::Send => Vec::new(),
-            SpanStage::Receive | SpanStage::Settle(_) => self.id(span, SpanStage::Send),
-        };
-        Exported {
-            trace_id: message.trace_id.to_be_bytes().to_vec(),
-            span_id: self.id(span, span.stage),
-            parent_span_id: parent,
-            flags: FLAGS,
+        self.exported(Parts {
+            trace_id: message.trace_id,
+            id: self.id(span, span.stage),
+            parent: match span.stage {
+                SpanStage::Send => None,
+                SpanStage::Receive | SpanStage::Settle(_) => Some(self.id(span, SpanStage::Send)),
+            },
+            kind,
             name: format!("{operation} {}", message.description.topic),
-            kind: kind.into(),
-            start_time_unix_nano: span.begin.0,
-            end_time_unix_nano: span.end.0,
+            times: [span.begin, span.end],
             attributes: attributes(span, operation),
-            ..Exported::default()
+            links: SpanLinks::default(),
+        })
+    }
+
+    fn exported(&self, parts: Parts) -> SpanData {
+        let [begin, end] = parts.times;
+        SpanData {
+            span_context: context(parts.trace_id, parts.id),
+            parent_span_id: parts.parent.map_or(SpanId::INVALID, SpanId::from),
+            parent_span_is_remote: false,
+            span_kind: parts.kind,
+            name: parts.name.into(),
+            start_time: time(begin),
+            end_time: time(end),
+            attributes: parts.attributes,
+            dropped_attributes_count: 0,
+            events: SpanEvents::default(),
+            links: parts.links,
+            status: Status::Unset,
+            instrumentation_scope: self.scope.clone(),
         }
     }
 
     /// Returns the id of the message's span at this stage.
-    fn id(&self, span: &Span, stage: SpanStage) -> Vec<u8> {
+    fn id(&self, span: &Span, stage: SpanStage) -> u64 {
         let trace_id = span.message.trace_id;
         match stage {
             SpanStage::Send => send_id(trace_id),
@@ -213,28 +242,37 @@ impl Tracing {
     }
 }
 
-/// Returns the id of the span of the message with this trace at its departure.
-fn send_id(trace_id: u128) -> Vec<u8> {
-    let mut identity = Identity::of(b"send");
-    identity.add(&trace_id.to_be_bytes());
-    (identity.bits() as u64).to_be_bytes().to_vec()
+fn context(trace_id: u128, id: u64) -> SpanContext {
+    let flags = TraceFlags::new(FLAGS);
+    let (trace_id, id) = (TraceId::from(trace_id), SpanId::from(id));
+    SpanContext::new(trace_id, id, flags, false, TraceState::NONE)
 }
 
-fn id(stage: &[u8], trace_id: u128, of: &[u8]) -> Vec<u8> {
+/// Returns the id of the span of the message with this trace at its departure.
+fn send_id(trace_id: u128) -> u64 {
+    let mut identity = Identity::of(b"send");
+    identity.add(&trace_id.to_be_bytes());
+    identity.bits() as u64
+}
+
+fn id(stage: &[u8], trace_id: u128, of: &[u8]) -> u64 {
     let mut identity = Identity::of(stage);
     identity.add(&trace_id.to_be_bytes());
     identity.add(of);
-    (identity.bits() as u64).to_be_bytes().to_vec()
+    identity.bits() as u64
 }
 
-fn int(key: &str, value: u64) -> KeyValue {
-    let value = i64::try_from(value).unwrap_or(i64::MAX);
-    key_value(key, Value::IntValue(value))
+fn int(key: &'static str, value: u64) -> KeyValue {
+    KeyValue::new(key, i64::try_from(value).unwrap_or(i64::MAX))
+}
+
+fn attribute(key: &'static str, value: impl Into<StringValue>) -> KeyValue {
+    KeyValue::new(key, value.into())
 }
 
 /// Returns the attributes: OpenTelemetry's messaging conventions, and the names of the metrics'
 /// labels.
-fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
+fn attributes(span: &Span, operation: &'static str) -> Vec<KeyValue> {
     let message = &span.message;
     let (writer, number) = (message.writer, message.sequence_number);
     let client = match span.stage {
@@ -245,14 +283,17 @@ fn attributes(span: &Span, operation: &str) -> Vec<KeyValue> {
         attribute("messaging.system", "dds"),
         attribute("messaging.operation.name", operation),
         attribute("messaging.operation.type", operation),
-        attribute("messaging.destination.name", &*message.description.topic),
+        attribute(
+            "messaging.destination.name",
+            message.description.topic.to_string(),
+        ),
         attribute("messaging.client.id", client.to_string()),
         attribute("messaging.message.id", format!("{writer}/{number}")),
         int("messaging.message.body.size", message.size.into()),
         int("domain_id", message.description.domain_id.into()),
         attribute("writer", writer.to_string()),
         int("sequence_number", number.0),
-        attribute("message_type", &*message.description.message_type),
+        attribute("message_type", message.description.message_type.to_string()),
     ];
     if let Some(time) = message.source.timestamp() {
         attributes.push(int("source_timestamp_unix_nano", time.0));
@@ -315,26 +356,24 @@ mod tests {
     #[test]
     fn two_hosts_report_one_trace_in_which_each_has_its_own_part() {
         let reader = Guid::new(GuidPrefix([2; 12]), EntityId([0, 0, 1, 4]));
-        let (one, two) = (
-            Tracing::new(Resource::default(), 1),
-            Tracing::new(Resource::default(), 2),
-        );
-        let sent = one.exported(&span(SpanStage::Send));
-        assert_eq!(sent, two.exported(&span(SpanStage::Send)));
-        assert_eq!((sent.trace_id.len(), sent.span_id.len()), (16, 8));
+        let (one, two) = (Tracing::new(1), Tracing::new(2));
+        let sent = one.of_message(&span(SpanStage::Send));
+        assert_eq!(sent, two.of_message(&span(SpanStage::Send)));
+        assert_eq!(sent.span_context.trace_flags().to_u8(), FLAGS);
         assert_eq!(sent.name, "send /points");
-        assert!(sent.parent_span_id.is_empty());
-        let received = [&one, &two].map(|tracing| tracing.exported(&span(SpanStage::Receive)));
-        let settled = one.exported(&span(SpanStage::Settle(reader)));
+        assert_eq!(sent.parent_span_id, SpanId::INVALID);
+        let received = [&one, &two].map(|tracing| tracing.of_message(&span(SpanStage::Receive)));
+        let settled = one.of_message(&span(SpanStage::Settle(reader)));
         let [first, second] = &received;
+        let id = |span: &SpanData| span.span_context.span_id();
         for child in [first, second, &settled] {
-            assert_eq!(child.trace_id, sent.trace_id);
-            assert_eq!(child.parent_span_id, sent.span_id);
-            assert_ne!(child.span_id, sent.span_id);
+            assert_eq!(child.span_context.trace_id(), sent.span_context.trace_id());
+            assert_eq!(child.parent_span_id, id(&sent));
+            assert_ne!(id(child), id(&sent));
         }
-        assert_ne!(first.span_id, second.span_id);
-        assert_ne!(first.span_id, settled.span_id);
-        assert_eq!(settled, two.exported(&span(SpanStage::Settle(reader))));
+        assert_ne!(id(first), id(second));
+        assert_ne!(id(first), id(&settled));
+        assert_eq!(settled, two.of_message(&span(SpanStage::Settle(reader))));
     }
 
     #[tokio::test]

@@ -1,37 +1,33 @@
-//! Spans of chains: from the model's form to that of OTLP.
+//! Spans of chains: from the model's form to that of the SDK.
 
-use opentelemetry_proto::tonic::common::v1::KeyValue;
-use opentelemetry_proto::tonic::trace::v1::Span as Exported;
-use opentelemetry_proto::tonic::trace::v1::span::{Link, SpanKind};
+use opentelemetry::KeyValue;
+use opentelemetry::trace::{Link, SpanKind};
+use opentelemetry_sdk::trace::SpanLinks;
 
-use super::{FLAGS, attribute, int, send_id};
+use super::{Parts, attribute, context, int, send_id};
 use ros2probe_model::chain::spans::{ChainMessage, ChainSpan, ChainStage, SpanId};
 use ros2probe_model::identity::Identity;
 
 /// Returns the span as it is exported by the agent of this host.
-pub(super) fn exported(span: &ChainSpan, host: u128) -> Exported {
+pub(super) fn parts(span: &ChainSpan, host: u128) -> Parts {
     let kind = match span.stage {
         ChainStage::Publish => SpanKind::Producer,
         ChainStage::Callback | ChainStage::Node => SpanKind::Consumer,
         ChainStage::Transit | ChainStage::Wait | ChainStage::Hop => SpanKind::Internal,
     };
-    let id = |id: SpanId| bytes(id, host);
-    Exported {
-        trace_id: span.trace_id.to_be_bytes().to_vec(),
-        span_id: id(span.id),
-        parent_span_id: span.parent.map(id).unwrap_or_default(),
-        flags: FLAGS,
+    Parts {
+        trace_id: span.trace_id,
+        id: bits(span.id, host),
+        parent: span.parent.map(|id| bits(id, host)),
+        kind,
         name: format!("{} {}", span.stage.label(), span.topic),
-        kind: kind.into(),
-        start_time_unix_nano: span.begin.0,
-        end_time_unix_nano: span.end.0,
+        times: [span.begin, span.end],
         attributes: attributes(span),
         links: links(span),
-        ..Exported::default()
     }
 }
 
-fn bytes(id: SpanId, host: u128) -> Vec<u8> {
+fn bits(id: SpanId, host: u128) -> u64 {
     let mut bits = id.bits;
     if id.is_of_host {
         let mut identity = Identity::of(b"span of a host");
@@ -39,21 +35,18 @@ fn bytes(id: SpanId, host: u128) -> Vec<u8> {
         identity.add(&host.to_be_bytes());
         bits = identity.bits() as u64;
     }
-    bits.to_be_bytes().to_vec()
+    bits
 }
 
 /// Returns the link from a publication to the message's own trace.
-fn links(span: &ChainSpan) -> Vec<Link> {
+fn links(span: &ChainSpan) -> SpanLinks {
     let message = span.message.as_ref();
     let own_trace = message.and_then(|message| message.own_trace);
     let own_trace = own_trace.filter(|_| span.stage == ChainStage::Publish);
-    let link = own_trace.map(|trace_id| Link {
-        trace_id: trace_id.to_be_bytes().to_vec(),
-        span_id: send_id(trace_id),
-        flags: FLAGS,
-        ..Link::default()
-    });
-    link.into_iter().collect()
+    let link = own_trace.map(|trace_id| Link::with_context(context(trace_id, send_id(trace_id))));
+    let mut links = SpanLinks::default();
+    links.links.extend(link);
+    links
 }
 
 /// Returns the attributes: OpenTelemetry's messaging conventions, and the names of the metrics'
@@ -67,7 +60,7 @@ fn attributes(span: &ChainSpan) -> Vec<KeyValue> {
     let mut attributes = vec![
         attribute("messaging.system", system),
         attribute("messaging.operation.name", span.stage.label()),
-        attribute("messaging.destination.name", &*span.topic),
+        attribute("messaging.destination.name", span.topic.to_string()),
         int("domain_id", span.domain_id.into()),
         attribute("method", span.method.label()),
     ];
@@ -82,7 +75,7 @@ fn attributes(span: &ChainSpan) -> Vec<KeyValue> {
         ("output", span.output.as_deref()),
     ];
     for (key, value) in texts {
-        attributes.extend(value.map(|value| attribute(key, value)));
+        attributes.extend(value.map(|value| attribute(key, value.to_owned())));
     }
     let Some(message) = &span.message else {
         return attributes;
@@ -106,7 +99,7 @@ fn attributes(span: &ChainSpan) -> Vec<KeyValue> {
         int("messaging.message.body.size", (*size).into()),
         attribute("writer", writer.to_string()),
         int("sequence_number", sequence_number.0),
-        attribute("message_type", &**message_type),
+        attribute("message_type", message_type.to_string()),
         attribute("stamp", format!("{seconds}.{nanoseconds:09}")),
     ]);
     attributes
@@ -116,7 +109,6 @@ fn attributes(span: &ChainSpan) -> Vec<KeyValue> {
 mod tests {
     use std::sync::Arc;
 
-    use opentelemetry_proto::tonic::common::v1::any_value::Value;
     use ros2probe_model::chain::trace::Method;
     use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Timestamp};
 
@@ -151,31 +143,26 @@ mod tests {
         }
     }
 
-    fn text(exported: &Exported, key: &str) -> Option<String> {
+    fn text(exported: &Parts, key: &str) -> Option<String> {
         let mut attributes = exported.attributes.iter();
-        let found = attributes.find(|each| each.key == key)?;
-        match found.value.clone()?.value? {
-            Value::StringValue(text) => Some(text),
-            Value::IntValue(number) => Some(number.to_string()),
-            _ => None,
-        }
+        let found = attributes.find(|each| each.key.as_str() == key)?;
+        Some(found.value.to_string())
     }
 
     #[test]
     fn a_span_of_a_host_has_another_id_there_and_all_others_the_same() {
         for stage in [ChainStage::Node, ChainStage::Hop] {
             let span = span(stage, None);
-            let (one, two) = (exported(&span, 1), exported(&span, 2));
-            assert_eq!(one.span_id == two.span_id, stage == ChainStage::Node);
+            let (one, two) = (parts(&span, 1), parts(&span, 2));
+            assert_eq!(one.id == two.id, stage == ChainStage::Node);
             assert_eq!(one.trace_id, two.trace_id);
-            assert_eq!(one.parent_span_id, two.parent_span_id);
-            assert_eq!((one.span_id.len(), one.trace_id.len()), (8, 16));
+            assert_eq!(one.parent, two.parent);
         }
     }
 
     #[test]
     fn attributes_name_the_message_the_node_and_the_method() {
-        let exported = exported(&span(ChainStage::Node, Some(message(Some(9)))), 1);
+        let exported = parts(&span(ChainStage::Node, Some(message(Some(9)))), 1);
         assert_eq!(exported.name, "node /points");
         for (key, value) in [
             ("messaging.system", "dds"),
@@ -196,14 +183,13 @@ mod tests {
 
     #[test]
     fn a_publication_links_to_the_trace_of_its_message_if_that_is_exported() {
-        let with = |own| exported(&span(ChainStage::Publish, Some(message(own))), 1);
+        let with = |own| parts(&span(ChainStage::Publish, Some(message(own))), 1);
         let [link] = &with(Some(9)).links[..] else {
             panic!("no link")
         };
-        assert_eq!(link.trace_id, 9_u128.to_be_bytes());
-        assert_eq!(link.span_id, send_id(9));
+        assert_eq!(link.span_context, context(9, send_id(9)));
         assert!(with(None).links.is_empty());
-        let inside = exported(&span(ChainStage::Publish, None), 1);
+        let inside = parts(&span(ChainStage::Publish, None), 1);
         assert_eq!(text(&inside, "messaging.system").as_deref(), Some("ros2"));
         assert_eq!(text(&inside, "writer"), None);
     }

@@ -1,0 +1,216 @@
+//! Delivery of one signal, in order and with bounded memory.
+//!
+//! The library repeats a request within its timeout. The delivery then offers the same batch again,
+//! until the receiver takes or refuses it. One batch is in progress, and callers collect no other
+//! before it is settled. Items that never arrive are counted by reason.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use opentelemetry_sdk::error::{OTelSdkError, OTelSdkResult};
+use tokio::time::{Instant, sleep, timeout_at};
+use tokio_util::sync::CancellationToken;
+
+use super::exports::{Exports, Outcome, Reason, Signal};
+use super::reports::Report;
+
+/// Pauses before a batch is offered again.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// Time for the last batches, out of the two seconds for stopping.
+const LAST: Duration = Duration::from_millis(1_400);
+
+/// An exporter of the library and the form of its batches.
+pub(super) trait Export {
+    /// Items that one request carries.
+    type Batch;
+
+    /// Returns the number of points, records or spans.
+    fn items(batch: &Self::Batch) -> u64;
+
+    /// Sends a batch; the library repeats the request within its timeout.
+    async fn export(&self, batch: &Self::Batch) -> OTelSdkResult;
+}
+
+/// An exporter that stops with the agent.
+pub(super) struct Delivery<E> {
+    exporter: E,
+    signal: Signal,
+    endpoint: String,
+    exports: Arc<Exports>,
+    stop: CancellationToken,
+    /// Whether the last request succeeded; `None` before the first.
+    works: Option<bool>,
+}
+
+/// What became of a batch.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Settled {
+    /// The receiver took or refused it.
+    Answered,
+    /// Newer points replace it. It is counted as dropped.
+    Overtaken,
+    /// The agent stops, and the batch is pending.
+    Stopped,
+}
+
+impl<E: Export> Delivery<E> {
+    pub(super) fn new(
+        exporter: E,
+        signal: Signal,
+        endpoint: String,
+        exports: Arc<Exports>,
+        stop: CancellationToken,
+    ) -> Self {
+        exports.enable(signal);
+        Self {
+            exporter,
+            signal,
+            endpoint,
+            exports,
+            stop,
+            works: None,
+        }
+    }
+
+    /// Completes when the agent stops.
+    pub(super) async fn stopped(&self) {
+        self.stop.cancelled().await;
+    }
+
+    /// Counts items that never became part of a batch.
+    pub(super) fn overflowed(&self, items: u64) {
+        self.drop(Reason::Overflow, items);
+    }
+
+    /// Delivers a batch until it is answered, until `newer`, or until the agent stops.
+    pub(super) async fn deliver(&mut self, batch: &E::Batch, newer: Option<Instant>) -> Settled {
+        let stop = self.stop.clone();
+        let settled = {
+            let offers = async {
+                let Some(newer) = newer else {
+                    self.offer(batch).await;
+                    return Settled::Answered;
+                };
+                match timeout_at(newer, self.offer(batch)).await {
+                    Ok(()) => Settled::Answered,
+                    Err(_) => Settled::Overtaken,
+                }
+            };
+            tokio::select! {
+                settled = offers => settled,
+                () = stop.cancelled() => Settled::Stopped,
+            }
+        };
+        if settled == Settled::Overtaken {
+            self.failed("no answer before the next export");
+            self.count(Outcome::Failed);
+            self.superseded(batch);
+        }
+        settled
+    }
+
+    /// Counts a batch as replaced by newer points.
+    pub(super) fn superseded(&self, batch: &E::Batch) {
+        self.drop(Reason::Superseded, E::items(batch));
+    }
+
+    /// Sends the last batches once each, until one fails.
+    pub(super) async fn finish(mut self, batches: Vec<E::Batch>) {
+        let deadline = Instant::now() + LAST;
+        let mut left = batches.iter();
+        while let Some(batch) = left.next() {
+            let sent = timeout_at(deadline, self.send(batch, false)).await;
+            if let Ok(Err((error, _))) = &sent {
+                self.failed(error);
+                self.count(Outcome::Failed);
+            }
+            if !matches!(sent, Ok(Ok(()))) {
+                let rest: u64 = left.map(E::items).sum();
+                return self.drop(Reason::Shutdown, E::items(batch) + rest);
+            }
+        }
+    }
+
+    /// Offers a batch until the receiver takes or refuses it.
+    async fn offer(&mut self, batch: &E::Batch) {
+        let (mut pause, mut is_again) = (FIRST_PAUSE, false);
+        while let Err((error, is_refused)) = self.send(batch, is_again).await {
+            self.failed(&error);
+            if is_refused {
+                self.count(Outcome::Failed);
+                return self.drop(Reason::Refused, E::items(batch));
+            }
+            is_again = true;
+            sleep(pause).await;
+            pause = (pause * 2).min(LONGEST_PAUSE);
+        }
+    }
+
+    /// Sends a batch and counts a success. An error comes with whether the receiver refuses it.
+    async fn send(&mut self, batch: &E::Batch, is_again: bool) -> Result<(), (String, bool)> {
+        let report = Report::new(self.signal, Arc::clone(&self.exports), is_again);
+        let (result, report) = report.of(self.exporter.export(batch)).await;
+        match result {
+            Ok(()) => {
+                self.delivered(report.rejected());
+                Ok(())
+            }
+            Err(error) => {
+                let error = match error {
+                    OTelSdkError::InternalFailure(reason) => reason,
+                    other => other.to_string(),
+                };
+                let is_refused = report.is_refused() && !is_of_connection(&error);
+                Err((error, is_refused))
+            }
+        }
+    }
+
+    fn delivered(&mut self, rejected: u64) {
+        if self.works != Some(true) {
+            self.works = Some(true);
+            tracing::info!(
+                signal = self.signal.label(),
+                endpoint = self.endpoint,
+                "exporting to the OTLP receiver"
+            );
+        }
+        self.count(if rejected == 0 {
+            Outcome::Delivered
+        } else {
+            Outcome::Partial
+        });
+        self.drop(Reason::Rejected, rejected);
+    }
+
+    /// Logs the first failure until a request succeeds again.
+    fn failed(&mut self, reason: &str) {
+        if self.works != Some(false) {
+            self.works = Some(false);
+            tracing::warn!(
+                signal = self.signal.label(),
+                endpoint = self.endpoint,
+                reason,
+                "the OTLP receiver refuses the export"
+            );
+        }
+    }
+
+    fn count(&self, outcome: Outcome) {
+        self.exports.count_request(self.signal, outcome);
+    }
+
+    fn drop(&self, reason: Reason, items: u64) {
+        if items > 0 {
+            self.exports.count_dropped(self.signal, reason, items);
+        }
+    }
+}
+
+/// Returns whether the connection broke below the request. The library does not repeat such a
+/// request, because tonic reports it with the code `Unknown`; it appends the cause only then.
+fn is_of_connection(error: &str) -> bool {
+    let after = error.split_once("gRPC code: ");
+    after.is_some_and(|(_, after)| after.contains(": "))
+}

@@ -1,0 +1,191 @@
+//! Outcomes of requests that `opentelemetry-otlp` does not return.
+//!
+//! The library returns a text for every failure. It reports a part that the receiver rejected, and a
+//! request that must not be repeated, as `tracing` events only (`*.PartialSuccess`,
+//! `Export.Failed.NonRetryable`). The export thread therefore has a subscriber of its own. It turns
+//! these events into outcomes of the request in progress, and drops the library's other events. All
+//! other lines of the thread go to the agent's log, so a receiver that is away costs one line there.
+
+use std::cell::Cell;
+use std::fmt;
+use std::sync::Arc;
+
+use opentelemetry_sdk::error::OTelSdkResult;
+use tracing::dispatcher::Dispatch;
+use tracing::field::{Field, Visit};
+use tracing::span::{Attributes, Id, Record};
+use tracing::subscriber::Interest;
+use tracing::{Event, Level, Metadata, Subscriber};
+
+use super::exports::{Exports, Outcome, Signal};
+
+tokio::task_local! {
+    static REPORT: Report;
+}
+
+/// What is known about a request.
+#[derive(Clone, Debug)]
+pub(super) struct Report {
+    signal: Signal,
+    exports: Arc<Exports>,
+    has_attempt: Cell<bool>,
+    is_refused: Cell<bool>,
+    rejected: Cell<u64>,
+}
+
+impl Report {
+    /// Creates the report of a request. A further attempt of it counts as retried; `is_again` makes
+    /// the first one of this report a further attempt.
+    pub(super) fn new(signal: Signal, exports: Arc<Exports>, is_again: bool) -> Self {
+        Self {
+            signal,
+            exports,
+            has_attempt: Cell::new(is_again),
+            is_refused: Cell::default(),
+            rejected: Cell::default(),
+        }
+    }
+
+    /// Runs an export and returns its result with the completed report.
+    pub(super) async fn of(
+        self,
+        export: impl Future<Output = OTelSdkResult>,
+    ) -> (OTelSdkResult, Self) {
+        let export = async {
+            let result = export.await;
+            (result, REPORT.with(Clone::clone))
+        };
+        REPORT.scope(self, export).await
+    }
+
+    /// Returns whether the library does not repeat the request.
+    pub(super) fn is_refused(&self) -> bool {
+        self.is_refused.get()
+    }
+
+    /// Returns the number of items that the receiver rejected while it took the others.
+    pub(super) fn rejected(&self) -> u64 {
+        self.rejected.get()
+    }
+}
+
+/// Notes that a request is sent; called by the transport.
+pub(super) fn attempt() {
+    // Fails outside an export.
+    let _ = REPORT.try_with(|report| {
+        if report.has_attempt.replace(true) {
+            report
+                .exports
+                .count_request(report.signal, Outcome::Retried);
+        }
+    });
+}
+
+/// Notes that the receiver rejected some items of the request in progress.
+pub(super) fn rejected(items: i64) {
+    let _ = REPORT.try_with(|report| report.rejected.set(u64::try_from(items).unwrap_or(0)));
+}
+
+/// Notes that the request in progress must not be repeated.
+pub(super) fn refused() {
+    let _ = REPORT.try_with(|report| report.is_refused.set(true));
+}
+
+/// The subscriber of the export thread.
+pub(super) struct Reports {
+    log: Dispatch,
+}
+
+impl Reports {
+    /// Creates a subscriber that passes other events on to the current one.
+    pub(super) fn dispatch() -> Dispatch {
+        let log = tracing::dispatcher::get_default(Clone::clone);
+        Dispatch::new(Self { log })
+    }
+}
+
+fn is_library(metadata: &Metadata<'_>) -> bool {
+    metadata.target().starts_with("opentelemetry")
+}
+
+fn is_report(metadata: &Metadata<'_>) -> bool {
+    *metadata.level() <= Level::WARN
+}
+
+impl Subscriber for Reports {
+    fn register_callsite(&self, metadata: &'static Metadata<'static>) -> Interest {
+        if !is_library(metadata) {
+            self.log.register_callsite(metadata)
+        } else if is_report(metadata) {
+            Interest::always()
+        } else {
+            Interest::never()
+        }
+    }
+
+    fn max_level_hint(&self) -> Option<tracing::level_filters::LevelFilter> {
+        let log = tracing::level_filters::LevelFilter::current();
+        Some(log.max(tracing::level_filters::LevelFilter::WARN))
+    }
+
+    fn enabled(&self, metadata: &Metadata<'_>) -> bool {
+        if is_library(metadata) {
+            is_report(metadata)
+        } else {
+            self.log.enabled(metadata)
+        }
+    }
+
+    fn event(&self, event: &Event<'_>) {
+        let metadata = event.metadata();
+        if !is_library(metadata) {
+            return self.log.event(event);
+        }
+        if metadata.name().ends_with(".PartialSuccess") {
+            event.record(&mut PartialSuccess);
+        } else if metadata.name() == "Export.Failed.NonRetryable" {
+            refused();
+        }
+    }
+
+    fn new_span(&self, span: &Attributes<'_>) -> Id {
+        self.log.new_span(span)
+    }
+
+    fn record(&self, span: &Id, values: &Record<'_>) {
+        self.log.record(span, values);
+    }
+
+    fn record_follows_from(&self, span: &Id, follows: &Id) {
+        self.log.record_follows_from(span, follows);
+    }
+
+    fn enter(&self, span: &Id) {
+        self.log.enter(span);
+    }
+
+    fn exit(&self, span: &Id) {
+        self.log.exit(span);
+    }
+
+    fn clone_span(&self, id: &Id) -> Id {
+        self.log.clone_span(id)
+    }
+
+    fn try_close(&self, id: Id) -> bool {
+        self.log.try_close(id)
+    }
+}
+
+/// Reads `rejected_data_points`, `rejected_log_records` or `rejected_spans`.
+struct PartialSuccess;
+
+impl Visit for PartialSuccess {
+    fn record_i64(&mut self, field: &Field, value: i64) {
+        if field.name().starts_with("rejected_") {
+            rejected(value);
+        }
+    }
+
+    fn record_debug(&mut self, _: &Field, _: &dyn fmt::Debug) {}
+}
