@@ -136,7 +136,8 @@ fn runs_beyond_the_table_are_a_record_for_each_fragment() {
 
 #[test]
 fn captured_datagrams_beyond_those_that_may_wait_stay_in_the_ring() {
-    let kernel = Kernel::load_hook(Hook::Ingress);
+    let mut kernel = Kernel::load_hook(Hook::Ingress);
+    kernel.set_interest(&BTreeMap::from([(writer(0), Verdict::Capture)]));
     let mut intake = FilterReader::new(kernel.filter, &[]);
     let mut observer = Observer::new(Settings::default());
     // All datagrams are younger than this, so none is read.

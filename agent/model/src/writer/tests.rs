@@ -399,16 +399,16 @@ fn a_writer_of_which_polling_misses_many_messages_seems_silent_for_long() {
         }
         bench.writer.seeming_silence(slowest).as_secs_f64()
     };
-    // Intervals of a second: 3 of 100 in a row, 10 of every fourth, 20 of every second.
+    // Intervals of a second. What hides a message may hide the next ones, unless it never did.
     let all = silence_of(&|_| true);
     let most = silence_of(&|number| number % 4 > 0);
     let half = silence_of(&|number| number % 2 == 0);
-    assert!((3.3..3.5).contains(&all), "{all}");
-    assert!((9.0..11.0).contains(&most), "{most}");
-    assert!((19.0..21.0).contains(&half), "{half}");
+    assert!((93.0..95.0).contains(&all), "{all}");
+    assert!((10.0..11.0).contains(&most), "{most}");
+    assert!((10.0..11.0).contains(&half), "{half}");
     // After one message, nothing is known.
     let one = silence_of(&|number| number == 1);
-    assert!((54.0..55.0).contains(&one), "{one}");
+    assert!(one > 200.0, "{one}");
     let mut bench = Bench::new(RELIABLE);
     bench.data(1).wait(1000).data(2);
     assert_eq!(bench.writer.seeming_silence(slowest), Duration::ZERO);

@@ -142,6 +142,24 @@ fn what_a_late_reader_did_not_subscribe_to_yet_is_neither_delivered_nor_lost() {
 }
 
 #[test]
+fn a_heartbeat_before_the_announcement_of_a_reader_takes_no_later_sample_from_it() {
+    let mut host = Host::new();
+    let carol = stranger(&mut host, CAROL, 7413).multicast(102);
+    host.heartbeat(carol, 1, 10);
+    host.wait(100);
+    host.subscribe(CAROL, 7);
+    host.wait(100);
+    (11..=30).for_each(|number| send(&mut host, number, &[carol]));
+    host.owner(carol, CAROL);
+    (31..=50).for_each(|number| send(&mut host, number, &[carol]));
+    rest(&mut host);
+    let deliveries = host.deliveries();
+    assert_eq!(deliveries.len(), 1, "{deliveries:#?}");
+    let facts = deliveries[0].delivered;
+    assert_eq!((facts.messages, facts.lost()), (32, 8));
+}
+
+#[test]
 fn a_reader_that_leaves_takes_its_process_from_the_subscribers_also_for_a_late_agent() {
     let mut host = Host::new();
     let bob = host.reader(BOB, 7411).multicast(101);
