@@ -85,8 +85,6 @@ pub struct Delivery {
     undelivered: Undelivered,
     loss_causes: LossCauses,
     first_seen: Timestamp,
-    /// Time of the first sample. A HEARTBEAT may come before the reader's announcement.
-    first_sample: Option<Timestamp>,
     last_seen: Timestamp,
     /// Time at which a matching reader appeared, if that is after the last sample.
     opened: Timestamp,
@@ -118,7 +116,6 @@ impl Delivery {
             undelivered: Undelivered::default(),
             loss_causes: LossCauses::default(),
             first_seen: now,
-            first_sample: None,
             last_seen: now,
             opened: Timestamp(0),
             waiting: None,
@@ -174,12 +171,6 @@ impl Delivery {
     #[must_use]
     pub const fn seen(&self) -> (Timestamp, Timestamp) {
         (self.first_seen, self.last_seen)
-    }
-
-    /// Returns the time of the first sample; `None` before it.
-    #[must_use]
-    pub const fn first_sample(&self) -> Option<Timestamp> {
-        self.first_sample
     }
 
     /// Returns the highest sequence number known to exist, plus one.
@@ -244,7 +235,6 @@ impl Delivery {
         context: &mut DeliveryContext<'_>,
     ) -> (bool, Option<CompleteSample>) {
         self.touch(sample.record());
-        self.first_sample.get_or_insert(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.is_empty() {
             return self.take(sample, context);
@@ -264,7 +254,6 @@ impl Delivery {
     /// Records that the socket's buffer was full for this DATA or DATA_FRAG.
     pub fn socket_full(&mut self, sample: Sample<'_>, context: &mut DeliveryContext<'_>) {
         self.touch(sample.record());
-        self.first_sample.get_or_insert(context.now);
         (self.waiting, self.presumed_lost, self.uses_network) = (None, false, true);
         if self.undelivered.note(sample) {
             context.budget.evictions += 1;
@@ -379,8 +368,6 @@ impl Delivery {
         *total = total.saturating_sub(std::mem::take(&mut self.tally.pending));
         self.loss_causes.absorb(other.loss_causes);
         self.first_seen = self.first_seen.min(other.first_seen);
-        let first_samples = [self.first_sample, other.first_sample];
-        self.first_sample = first_samples.into_iter().flatten().min();
         self.last_seen = self.last_seen.max(other.last_seen);
         self.opened = self.opened.max(other.opened);
         self.uses_network |= other.uses_network;

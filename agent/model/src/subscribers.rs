@@ -352,7 +352,9 @@ impl Subscribers {
         let is_open = |receiver| matches!(receiver, Receiver::Route(route) if route.is_open());
         if self.open > 0 && !is_open(receiver) {
             let is_known = !socket_full && self.repair(sample, context);
-            if (is_known || socket_full) && self.find(receiver).is_none() {
+            // Another multicast socket of the host has a receiver of its own.
+            let is_unicast = route.is_some_and(|route| !route.destination.is_multicast());
+            if is_unicast && (is_known || socket_full) && self.find(receiver).is_none() {
                 return false;
             }
         }

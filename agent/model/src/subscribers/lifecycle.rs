@@ -224,8 +224,7 @@ impl Subscribers {
             let place = index - 1;
             if is_unknown(delivery.receiver()) {
                 let since = readers.since(owner);
-                let first = delivery.first_sample();
-                if since.is_none_or(|since| first.is_some_and(|first| since > first)) {
+                if since.is_none_or(|since| since > delivery.seen().0) {
                     self.discard(place, context);
                     index = 0;
                     continue;
