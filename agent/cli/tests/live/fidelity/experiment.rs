@@ -390,9 +390,11 @@ fn sums_that_differ(
                 counted = Some(sums);
                 let all = seen.topics.iter().flat_map(|topic| &topic.deliveries);
                 rows = all.map(|row| format!("\n{row:?}")).collect();
-                let received = seen.topics.iter().filter_map(|topic| topic.received);
-                let unmatched: u64 = received.map(|sum| sum.unmatched).sum();
-                rows.push_str(&format!("\n{unmatched} unmatched"));
+                let received = seen
+                    .topics
+                    .iter()
+                    .filter_map(|topic| topic.received.as_ref());
+                rows.extend(received.map(|sum| format!("\nin all {sum:?}")));
             }
             let is_lost = (logged.1 - open..=logged.1).contains(&sums.lost());
             (sums.messages == logged.0 && is_lost).then_some(())
