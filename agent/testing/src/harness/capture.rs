@@ -10,8 +10,9 @@ use anyhow::{Context as _, Result, bail};
 use super::network::{INTERFACE, Namespace};
 use super::process::Process;
 
-/// Interval at which tcpdump reads the kernel's buffer; it does not read it at its end.
-pub const SETTLE: Duration = Duration::from_millis(1200);
+/// Time within which tcpdump reads the kernel's buffer, each second and later on a busy machine. It
+/// does not read it at its end.
+pub const SETTLE: Duration = Duration::from_secs(3);
 /// 64 MiB: more than a second of point clouds.
 const BUFFER_KILOBYTES: &str = "65536";
 
