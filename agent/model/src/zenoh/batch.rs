@@ -101,7 +101,7 @@ impl Zenoh {
         self.revision += 1;
     }
 
-    /// Gives up messages of which no FRAGMENT arrives any more, at most once a second.
+    /// Gives up messages whose FRAGMENTs have stopped arriving, at most once a second.
     fn give_up_chains(&mut self, now: Timestamp) {
         if now < self.gave_up + GIVE_UP_INTERVAL {
             return;

@@ -99,11 +99,14 @@ fn every_field_that_can_grow_is_bounded_or_has_a_reason() {
         let mut words = line.split_whitespace();
         let Some(path) = words.next() else { continue };
         let fields = found.get_mut(path);
-        let fields = fields.unwrap_or_else(|| panic!("{path} has no such field any more"));
+        let fields = fields.unwrap_or_else(|| panic!("{path} has no plain field: remove its line"));
         let mut is_whole = true;
         for field in words {
             is_whole = false;
-            assert!(fields.remove(field), "{path} has no plain {field} any more");
+            assert!(
+                fields.remove(field),
+                "{path} has no plain {field}: remove it"
+            );
         }
         if is_whole {
             fields.clear();
