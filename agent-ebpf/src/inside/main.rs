@@ -22,7 +22,13 @@ mod registers;
 #[path = "../settings.rs"]
 mod settings;
 
-use aya_ebpf::{EbpfContext as _, macros::uprobe, programs::ProbeContext};
+use aya_ebpf::{
+    EbpfContext as _,
+    helpers::generated::bpf_get_attach_cookie,
+    macros::{map, uprobe},
+    maps::ProgramArray,
+    programs::ProbeContext,
+};
 use ros2probe_wire::inside::announced;
 
 use crate::registers::{is_aarch64, register};
@@ -61,6 +67,24 @@ macro_rules! arguments {
             )?
         )?
     };
+}
+
+/// Most programs behind [`called`].
+const PROGRAMS: u32 = 32;
+
+/// The programs of functions, by cookie. Set by user space.
+#[map]
+static CALLS: ProgramArray = ProgramArray::with_max_entries(PROGRAMS, 0);
+
+/// At each function of a library that one link covers: calls the program of that function. Loaded
+/// where such links exist (Linux 6.6).
+#[uprobe]
+pub fn called(context: ProbeContext) -> u32 {
+    // SAFETY: the context is the kernel's.
+    let cookie = unsafe { bpf_get_attach_cookie(context.as_ptr()) };
+    // SAFETY: programs of the same type, which user space has set.
+    unsafe { CALLS.tail_call(&context, cookie as u32) };
+    0
 }
 
 calls! {

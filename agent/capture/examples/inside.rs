@@ -11,6 +11,7 @@ use std::os::fd::AsRawFd as _;
 use std::ptr;
 use std::time::Duration;
 
+use ros2probe_capture::breakpoints::Means;
 use ros2probe_capture::inside::programs;
 use ros2probe_capture::inside::table::ProcessTable;
 use ros2probe_capture::memory_reader::read_memory;
@@ -47,7 +48,7 @@ fn main() {
 }
 
 fn check(library: &str, has_callbacks: bool) -> Result<String, Box<dyn Error>> {
-    let (mut programs, mut tables) = programs::load(has_callbacks, None)?;
+    let (mut programs, mut tables) = programs::load(has_callbacks, None, Means::of_this_kernel())?;
     tables.set_clocks(&Clocks::read())?;
     let file = File::open(library)?;
     let attached = programs.attach(&file)?;

@@ -1,14 +1,182 @@
 //! The bpf system call, for commands that aya does not offer in the form needed here.
 
+use std::ffi::CStr;
 use std::io;
-use std::os::fd::{FromRawFd as _, OwnedFd};
+use std::os::fd::{AsRawFd as _, BorrowedFd, FromRawFd as _, OwnedFd};
 
+use aya_obj::Function;
 use libc::c_int;
 
 /// Commands of `linux/bpf.h`.
 const MAP_LOOKUP_ELEM: c_int = 1;
+const MAP_UPDATE_ELEM: c_int = 2;
+const PROG_LOAD: c_int = 5;
+const BTF_LOAD: c_int = 18;
 const LINK_CREATE: c_int = 28;
 const ITER_CREATE: c_int = 33;
+
+/// Type of programs at functions, and the attach type of those that one link puts at many.
+const PROG_TYPE_KPROBE: u32 = 2;
+const TRACE_UPROBE_MULTI: u32 = 48;
+
+/// Attributes of `BPF_PROG_LOAD`.
+#[repr(C)]
+#[derive(Default)]
+struct LoadAttributes {
+    program_type: u32,
+    instruction_count: u32,
+    instructions: u64,
+    license: u64,
+    log_level: u32,
+    log_bytes: u32,
+    log: u64,
+    kernel_version: u32,
+    flags: u32,
+    name: [u8; 16],
+    interface: u32,
+    attach_type: u32,
+    types: u32,
+    function_bytes: u32,
+    functions: u64,
+    function_count: u32,
+    unused: u32,
+}
+
+/// Attributes of `BPF_BTF_LOAD`.
+#[repr(C)]
+#[derive(Default)]
+struct TypesAttributes {
+    types: u64,
+    log: u64,
+    bytes: u32,
+    log_bytes: u32,
+    log_level: u32,
+    unused: u32,
+}
+
+/// Attributes of `BPF_LINK_CREATE` for functions of a file.
+#[repr(C)]
+#[derive(Default)]
+struct FunctionsAttributes {
+    program: u32,
+    target: u32,
+    attach_type: u32,
+    flags: u32,
+    path: u64,
+    offsets: u64,
+    reference_counters: u64,
+    cookies: u64,
+    count: u32,
+    function_flags: u32,
+    process: u32,
+    unused: u32,
+}
+
+/// Attributes of `BPF_MAP_UPDATE_ELEM`.
+#[repr(C)]
+struct UpdateAttributes {
+    map: u32,
+    unused: u32,
+    key: u64,
+    value: u64,
+    flags: u64,
+}
+
+/// Loads types in the format BTF.
+///
+/// # Errors
+/// Fails if the kernel refuses them.
+pub(crate) fn load_types(types: &[u8]) -> io::Result<OwnedFd> {
+    let attributes = TypesAttributes {
+        types: address(types.as_ptr()),
+        bytes: length(types)?,
+        ..TypesAttributes::default()
+    };
+    // SAFETY: the types outlive the call.
+    unsafe { descriptor(BTF_LOAD, &attributes) }
+}
+
+/// Loads a program for [`link_functions`], which aya 0.14 cannot. `license`: as in the object.
+/// `types`: of the object; without them the kernel verifies each global function with its callers.
+///
+/// # Errors
+/// Fails if the verifier refuses the program, or without the capabilities.
+pub(crate) fn load_for_functions(
+    name: &str,
+    function: &Function,
+    license: &CStr,
+    types: Option<BorrowedFd<'_>>,
+) -> io::Result<OwnedFd> {
+    let functions = function.func_info.func_info_bytes();
+    let mut attributes = LoadAttributes {
+        program_type: PROG_TYPE_KPROBE,
+        instruction_count: length(&function.instructions)?,
+        instructions: address(function.instructions.as_ptr()),
+        license: address(license.as_ptr()),
+        attach_type: TRACE_UPROBE_MULTI,
+        ..LoadAttributes::default()
+    };
+    // The last byte is the terminating zero.
+    let name = name.bytes().take(attributes.name.len() - 1);
+    for (to, from) in attributes.name.iter_mut().zip(name) {
+        *to = from;
+    }
+    if let Some(types) = types {
+        attributes.types = number(types);
+        attributes.functions = address(functions.as_ptr());
+        attributes.function_count = length(&function.func_info.func_info)?;
+        attributes.function_bytes = u32::try_from(function.func_info_rec_size)
+            .map_err(|_| io::Error::from(io::ErrorKind::InvalidInput))?;
+    }
+    // SAFETY: instructions, license and functions outlive the call.
+    unsafe { descriptor(PROG_LOAD, &attributes) }
+}
+
+/// Puts a program of [`load_for_functions`] at instructions of a file in all processes, with one
+/// cookie for each (Linux 6.6). Closing the descriptor removes them together.
+///
+/// # Errors
+/// Fails if the kernel has no such links, or if an offset is not an instruction.
+pub(crate) fn link_functions(
+    program: BorrowedFd<'_>,
+    path: &CStr,
+    offsets: &[u64],
+    cookies: &[u64],
+) -> io::Result<OwnedFd> {
+    assert_eq!(offsets.len(), cookies.len(), "one cookie for each offset");
+    let attributes = FunctionsAttributes {
+        program: number(program),
+        attach_type: TRACE_UPROBE_MULTI,
+        path: address(path.as_ptr()),
+        offsets: address(offsets.as_ptr()),
+        cookies: address(cookies.as_ptr()),
+        count: length(offsets)?,
+        ..FunctionsAttributes::default()
+    };
+    // SAFETY: path, offsets and cookies outlive the call.
+    unsafe { descriptor(LINK_CREATE, &attributes) }
+}
+
+/// Sets an entry of an array of programs.
+///
+/// # Errors
+/// Fails if the program cannot be called from those that use the array.
+pub(crate) fn set_program(
+    array: BorrowedFd<'_>,
+    index: u32,
+    program: BorrowedFd<'_>,
+) -> io::Result<()> {
+    let value = number(program);
+    let attributes = UpdateAttributes {
+        map: number(array),
+        unused: 0,
+        key: address(&raw const index),
+        value: address(&raw const value),
+        flags: 0,
+    };
+    // SAFETY: key and value outlive the call, and have the sizes of such an array.
+    unsafe { call(MAP_UPDATE_ELEM, &attributes) }.map(drop)
+}
 
 /// Links a program to a target for an attach type, without flags. Closing the descriptor removes
 /// the link.
@@ -16,7 +184,8 @@ const ITER_CREATE: c_int = 33;
 /// # Errors
 /// Fails if the kernel refuses the link.
 pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Result<OwnedFd> {
-    descriptor(LINK_CREATE, &[program, target, attach_type, 0])
+    // SAFETY: no pointer.
+    unsafe { descriptor(LINK_CREATE, &[program, target, attach_type, 0]) }
 }
 
 /// Starts one run of a linked iterator.
@@ -24,7 +193,8 @@ pub(crate) fn create_link(program: u32, target: u32, attach_type: u32) -> io::Re
 /// # Errors
 /// Fails if the kernel refuses the iterator.
 pub(crate) fn create_iterator(link: u32) -> io::Result<OwnedFd> {
-    descriptor(ITER_CREATE, &[link, 0])
+    // SAFETY: no pointer.
+    unsafe { descriptor(ITER_CREATE, &[link, 0]) }
 }
 
 /// Looks up an element of a map that does not exist. Returns the error: `EPERM`, which the kernel
@@ -33,27 +203,48 @@ pub(crate) fn create_iterator(link: u32) -> io::Result<OwnedFd> {
 pub fn failed_lookup() -> io::Error {
     // -1 is never a valid descriptor; key and value are null.
     let attributes = [u32::MAX, 0, 0, 0, 0, 0, 0, 0];
-    match call(MAP_LOOKUP_ELEM, &attributes) {
+    // SAFETY: no pointer other than null.
+    match unsafe { call(MAP_LOOKUP_ELEM, &attributes) } {
         Ok(_) => io::Error::other("a map that does not exist was found"),
         Err(error) => error,
     }
 }
 
-fn descriptor(command: c_int, attributes: &[u32]) -> io::Result<OwnedFd> {
-    let descriptor = call(command, attributes)?;
-    // SAFETY: both commands return a new descriptor, which nothing else owns.
+fn address<T>(pointer: *const T) -> u64 {
+    pointer.expose_provenance() as u64
+}
+
+fn number(descriptor: BorrowedFd<'_>) -> u32 {
+    descriptor.as_raw_fd().cast_unsigned()
+}
+
+fn length<T>(slice: &[T]) -> io::Result<u32> {
+    u32::try_from(slice.len()).map_err(|_| io::ErrorKind::InvalidInput.into())
+}
+
+/// Calls a command that returns a new descriptor.
+///
+/// # Safety
+/// As for [`call`].
+unsafe fn descriptor<T>(command: c_int, attributes: &T) -> io::Result<OwnedFd> {
+    // SAFETY: the caller's.
+    let descriptor = unsafe { call(command, attributes) }?;
+    // SAFETY: the command returns a new descriptor, which nothing else owns.
     Ok(unsafe { OwnedFd::from_raw_fd(descriptor) })
 }
 
-/// Calls a command whose attributes are words without pointers other than null.
-fn call(command: c_int, attributes: &[u32]) -> io::Result<c_int> {
-    // SAFETY: the attributes' size is passed, and the kernel treats attributes beyond it as zero.
+/// Calls a command with its attributes. The kernel treats those beyond their size as zero.
+///
+/// # Safety
+/// Pointers in the attributes are null, or refer to as much memory as the command reads.
+unsafe fn call<T>(command: c_int, attributes: &T) -> io::Result<c_int> {
+    // SAFETY: the attributes' size is passed; the rest is the caller's.
     let result = unsafe {
         libc::syscall(
             libc::SYS_bpf,
             command,
-            attributes.as_ptr(),
-            size_of_val(attributes),
+            &raw const *attributes,
+            size_of::<T>(),
         )
     };
     match c_int::try_from(result) {

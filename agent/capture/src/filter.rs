@@ -8,7 +8,7 @@ mod host_hook;
 mod uprobe;
 
 use std::io;
-use std::os::fd::{AsFd, BorrowedFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 
 use aya::maps::{Array, HashMap, Map, MapData, MapError, PerCpuArray, ProgramArray, RingBuf};
 use aya::programs::{Program, ProgramError, ProgramFd};
@@ -57,6 +57,12 @@ pub enum FilterError {
     /// The kernel refuses a breakpoint in the library.
     #[error("the kernel refuses the uprobe")]
     Probe(#[source] ProgramError),
+    /// The verifier refuses a program for functions of libraries.
+    #[error("the kernel refuses a program for functions of libraries")]
+    BreakpointProgram(#[source] io::Error),
+    /// The kernel refuses breakpoints in the library.
+    #[error("the kernel refuses breakpoints")]
+    Breakpoint(#[source] io::Error),
     /// The cgroup accepts no program.
     #[error("failed to attach the host hook to the cgroup")]
     Attach(#[source] io::Error),
@@ -115,7 +121,7 @@ impl Default for FilterSettings {
 /// One loaded filter with its maps: of the wire hook, or of the host hook.
 pub struct Filter {
     /// The attached program: the wire hook's entry, or the host hook's for received datagrams.
-    program: ProgramFd,
+    program: OwnedFd,
     /// The wire hook's program, which its entry tail-calls; the kernel empties the array when it is
     /// closed.
     _wire: Option<ProgramArray<MapData>>,
@@ -146,7 +152,7 @@ impl Filter {
         let mut wire: ProgramArray<_> = take(&mut ebpf, "WIRE")?;
         wire.set(0, &program, 0).map_err(failed("WIRE", "set"))?;
         let entry = load_program(&mut ebpf, "wire_entry")?;
-        let filter = Self::with_maps(&mut ebpf, entry, None)?;
+        let filter = Self::with_maps(&mut ebpf, entry.as_fd(), None)?;
         Ok(Self {
             _wire: Some(wire),
             ..filter
@@ -155,7 +161,7 @@ impl Filter {
 
     fn with_maps(
         ebpf: &mut Ebpf,
-        program: ProgramFd,
+        program: BorrowedFd<'_>,
         host: Option<host_hook::HostHook>,
     ) -> Result<Self, FilterError> {
         let mut budget: Array<_, i64> = take(ebpf, "BUDGET")?;
@@ -164,8 +170,9 @@ impl Filter {
                 .set(index as u32, 0, 0)
                 .map_err(failed("BUDGET", "clear"))?;
         }
+        let program = program.try_clone_to_owned();
         Ok(Self {
-            program,
+            program: program.map_err(FilterError::Attach)?,
             _wire: None,
             host,
             pieces: None,
@@ -321,6 +328,13 @@ impl FilterError {
         match not_permitted(&error) {
             Some(error) => Self::NotPermitted(error),
             None => Self::Program(error),
+        }
+    }
+
+    pub(crate) fn breakpoint_program(error: io::Error) -> Self {
+        match error.raw_os_error() {
+            Some(libc::EPERM) => Self::NotPermitted(error),
+            _ => Self::BreakpointProgram(error),
         }
     }
 }

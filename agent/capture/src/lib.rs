@@ -28,6 +28,7 @@
 pub mod ahead;
 pub mod bell;
 pub mod bpf;
+pub mod breakpoints;
 pub mod cgroup;
 pub mod cgroup_paths;
 pub mod clock_step;

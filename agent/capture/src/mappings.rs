@@ -1,8 +1,8 @@
 //! Notices which processes map a library, at that moment.
 //!
 //! The kernel writes a record for each executable mapping of every process into a ring for each CPU
-//! (`PERF_RECORD_MMAP`, perf_event_open(2)). It needs the privileges of uprobes, and changes nothing
-//! in the processes. Processes are identified as in the agent's PID namespace.
+//! (`PERF_RECORD_MMAP`, perf_event_open(2)). It needs CAP_PERFMON, and changes nothing in the
+//! processes. Processes are identified as in the agent's PID namespace.
 
 use std::collections::BTreeSet;
 use std::fs;

@@ -210,7 +210,7 @@ fn socket_losses(
 }
 
 /// Returns the kernel's major and minor version.
-fn release() -> Option<(u32, u32)> {
+pub(crate) fn release() -> Option<(u32, u32)> {
     let release = std::fs::read_to_string("/proc/sys/kernel/osrelease").ok()?;
     let mut parts = release.split(['.', '-', '+']);
     Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?))

@@ -82,7 +82,7 @@ impl Filter {
         let zenoh = load_program(&mut ebpf, "zenoh_ingress")
             .and_then(|ingress| Ok([ingress, load_program(&mut ebpf, "zenoh_egress")?]));
         let (pieces, sockets) = (take(&mut ebpf, "PIECES")?, take(&mut ebpf, "SOCKETS")?);
-        let mut filter = Self::with_maps(&mut ebpf, ingress, None)?;
+        let mut filter = Self::with_maps(&mut ebpf, ingress.as_fd(), None)?;
         filter.host = Some(HostHook {
             programs: Some(ebpf),
             layout,

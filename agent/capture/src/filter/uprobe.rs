@@ -6,18 +6,10 @@
 //! probe lives as long as its descriptor. Nothing is written to `uprobe_events`.
 
 use std::fs::File;
-use std::os::fd::AsRawFd as _;
-use std::path::Path;
+use std::os::fd::AsFd as _;
 
-use aya::Ebpf;
-use aya::programs::uprobe::{UProbeLink, UProbeScope};
-use aya::programs::{ProgramError, UProbe};
-
-use super::{Filter, FilterError, FilterSettings, UNUSED, open, ring_size, take};
-
-/// File in which the kernel announces this type of probe. Without it aya falls back to older
-/// interfaces, whose probes outlive a killed process.
-const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
+use super::{Filter, FilterError, FilterSettings, OBJECT, UNUSED, open, ring_size, take};
+use crate::breakpoints::{Attached, Breakpoints, Means};
 
 /// How a library's function receives its message.
 #[derive(Clone, Copy, PartialEq, Eq, Debug)]
@@ -29,11 +21,20 @@ pub enum Form {
 }
 
 /// The loaded programs; their maps are in the [`Filter`] returned with them.
-pub struct Probes(Ebpf);
+pub struct Probes(Breakpoints);
 
 /// The probe of one library; dropping it removes the breakpoint.
 pub struct Probe {
-    _link: UProbeLink,
+    _attached: Attached,
+}
+
+impl Form {
+    const fn program(self) -> &'static str {
+        match self {
+            Self::Whole => "shm_handed",
+            Self::List => "shm_handed_list",
+        }
+    }
 }
 
 impl Filter {
@@ -47,12 +48,8 @@ impl Filter {
     pub fn load_uprobe(
         settings: &FilterSettings,
         within: Option<u64>,
+        means: Means,
     ) -> Result<(Self, Probes), FilterError> {
-        if !Path::new(KIND).exists() {
-            return Err(FilterError::Missing(
-                "place to attach: uprobes are disabled",
-            ));
-        }
         let sizes = [
             ("PIECES", ring_size(settings.piece_ring_bytes)),
             ("FLOWS", UNUSED),
@@ -60,20 +57,15 @@ impl Filter {
             ("CONNECTIONS", UNUSED),
             ("CANDIDATES", UNUSED),
         ];
-        let mut ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
-        for form in [Form::Whole, Form::List] {
-            program(&mut ebpf, form)?
-                .load()
-                .map_err(FilterError::program)?;
-        }
-        let program = program(&mut ebpf, Form::Whole)?
-            .fd()
-            .map_err(FilterError::Program)?
-            .try_clone()
-            .map_err(|error| FilterError::Program(ProgramError::IOError(error)))?;
-        let mut filter = Self::with_maps(&mut ebpf, program, None)?;
-        filter.pieces = Some(take(&mut ebpf, "PIECES")?);
-        Ok((filter, Probes(ebpf)))
+        let ebpf = open(settings, false, &sizes, None, within.unwrap_or(0))?;
+        let names = [Form::Whole, Form::List].into_iter().map(Form::program);
+        let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, names, None, means)?;
+        let program = breakpoints.program(Form::Whole.program())?;
+        let program = program.try_clone_to_owned().map_err(FilterError::Attach)?;
+        let ebpf = &mut breakpoints.ebpf;
+        let mut filter = Self::with_maps(ebpf, program.as_fd(), None)?;
+        filter.pieces = Some(take(ebpf, "PIECES")?);
+        Ok((filter, Probes(breakpoints)))
     }
 }
 
@@ -81,25 +73,12 @@ impl Probes {
     /// Attaches to a library at an offset in its file: every call there is then seen.
     ///
     /// # Errors
-    /// Returns [`FilterError::Probe`] without CAP_SYS_ADMIN, or if the offset is not an
-    /// instruction.
+    /// Returns [`FilterError::Probe`] or [`FilterError::Breakpoint`] without the privilege for
+    /// `means`, or if the offset is not an instruction.
     pub fn attach(&mut self, file: &File, offset: u64, form: Form) -> Result<Probe, FilterError> {
-        // Refers to the inspected file, even if its path now names another one.
-        let path = format!("/proc/self/fd/{}", file.as_raw_fd());
-        let program = program(&mut self.0, form)?;
-        let link = program
-            .attach(offset, path, UProbeScope::AllProcesses)
-            .and_then(|id| program.take_link(id))
-            .map_err(FilterError::Probe)?;
-        Ok(Probe { _link: link })
+        let attached = self.0.attach(file, &[(form.program(), offset)])?;
+        Ok(Probe {
+            _attached: attached,
+        })
     }
-}
-
-fn program(ebpf: &mut Ebpf, form: Form) -> Result<&mut UProbe, FilterError> {
-    let name = match form {
-        Form::Whole => "shm_handed",
-        Form::List => "shm_handed_list",
-    };
-    let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
-    program.try_into().map_err(FilterError::Program)
 }

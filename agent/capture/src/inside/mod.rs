@@ -24,6 +24,7 @@ use ros2probe_wire::inside::Counter;
 use self::process::ReadMemory;
 use self::programs::{Attached, Programs, Tables};
 use self::table::{ProcessTable, Round};
+use crate::breakpoints::Means;
 use crate::error_chain::in_words;
 use crate::filter::FilterError;
 use crate::mappings::{MappingEvents, UNCONCERNED};
@@ -98,7 +99,7 @@ impl Inside {
         }
         let within = cgroup.map(uprobe::inode).transpose()?;
         let has_callbacks = choice == InsideChoice::Full;
-        let loaded = programs::load(has_callbacks, within);
+        let loaded = programs::load(has_callbacks, within, Means::of_this_kernel());
         let (programs, mut tables) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::InsideScope(error),
             error => error.into(),

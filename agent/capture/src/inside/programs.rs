@@ -5,23 +5,24 @@
 //! ends.
 
 use std::fs::File;
-use std::os::fd::{AsFd as _, AsRawFd as _, BorrowedFd};
-use std::path::Path;
+use std::os::fd::{AsFd as _, BorrowedFd};
 
+use aya::EbpfLoader;
 use aya::maps::{Array, HashMap, MapData, PerCpuArray, RingBuf};
-use aya::programs::UProbe;
-use aya::programs::uprobe::{UProbeLink, UProbeScope};
-use aya::{Ebpf, EbpfLoader};
 use ros2probe_wire::inside::{Counter, Figures, Handle, Process, clock};
 
+use crate::breakpoints::{self, Breakpoints, Dispatcher, Means};
 use crate::filter::{Aligned, FilterError, absent_is_fine, failed, take};
 use crate::system::{Clocks, raw_difference};
 use crate::uprobe::library::{self, LibraryError};
 
 /// The object built by `agent-ebpf/build.sh`. Aligned, because ELF is read in place.
 static OBJECT: &Aligned<[u8]> = &Aligned(*include_bytes!("../../../../agent-ebpf/inside.bpf.o"));
-/// File in which the kernel announces this type of probe.
-const KIND: &str = "/sys/bus/event_source/devices/uprobe/type";
+/// The program of links, which calls the others.
+const DISPATCHER: Dispatcher = Dispatcher {
+    program: "called",
+    array: "CALLS",
+};
 /// Begin of the functions' names.
 const PREFIX: &str = "ros_trace_";
 /// The function that reports messages entering a ring buffer, since Iron. Without it, only
@@ -69,7 +70,7 @@ const _: () = assert!(size_of::<Figures>().is_multiple_of(8));
 
 /// The loaded programs.
 pub struct Programs {
-    ebpf: Ebpf,
+    breakpoints: Breakpoints,
     has_callbacks: bool,
 }
 
@@ -84,7 +85,7 @@ pub struct Tables {
 
 /// The probes in one library; dropping them removes the breakpoints.
 pub struct Attached {
-    _links: Vec<UProbeLink>,
+    _attached: breakpoints::Attached,
     /// The library reports messages that enter ring buffers.
     pub shows_intra_process: bool,
 }
@@ -95,34 +96,31 @@ pub struct Attached {
 /// # Errors
 /// Returns [`FilterError::NotPermitted`] without the capabilities, other errors if the kernel
 /// refuses them.
-pub fn load(has_callbacks: bool, within: Option<u64>) -> Result<(Programs, Tables), FilterError> {
-    if !Path::new(KIND).exists() {
-        return Err(FilterError::Missing(
-            "place to attach: uprobes are disabled",
-        ));
-    }
+pub fn load(
+    has_callbacks: bool,
+    within: Option<u64>,
+    means: Means,
+) -> Result<(Programs, Tables), FilterError> {
     let architecture = u32::from(cfg!(target_arch = "aarch64"));
     let (callbacks, within) = (u32::from(has_callbacks), within.unwrap_or(0));
-    let mut ebpf = EbpfLoader::new()
+    let ebpf = EbpfLoader::new()
         .override_global("ARCHITECTURE", &architecture, true)
         .override_global("CALLBACKS", &callbacks, true)
         .override_global("WITHIN", &within, true)
         .load(&OBJECT.0)
         .map_err(FilterError::load)?;
-    for name in used(has_callbacks) {
-        program(&mut ebpf, name)?
-            .load()
-            .map_err(FilterError::program)?;
-    }
+    let names = used(has_callbacks);
+    let mut breakpoints = Breakpoints::load(ebpf, &OBJECT.0, names, Some(DISPATCHER), means)?;
+    let ebpf = &mut breakpoints.ebpf;
     let tables = Tables {
-        processes: take(&mut ebpf, "PROCESSES")?,
-        handles: take(&mut ebpf, "HANDLES")?,
-        clocks: take(&mut ebpf, "CLOCKS")?,
-        counters: take(&mut ebpf, "INSIDE_COUNTERS")?,
-        announcements: take(&mut ebpf, "ANNOUNCEMENTS")?,
+        processes: take(ebpf, "PROCESSES")?,
+        handles: take(ebpf, "HANDLES")?,
+        clocks: take(ebpf, "CLOCKS")?,
+        counters: take(ebpf, "INSIDE_COUNTERS")?,
+        announcements: take(ebpf, "ANNOUNCEMENTS")?,
     };
     let programs = Programs {
-        ebpf,
+        breakpoints,
         has_callbacks,
     };
     Ok((programs, tables))
@@ -135,11 +133,6 @@ fn used(has_callbacks: bool) -> impl Iterator<Item = &'static str> {
         false => &[RECEIVED.0],
     };
     MESSAGES.into_iter().chain(callbacks.iter().copied())
-}
-
-fn program<'a>(ebpf: &'a mut Ebpf, name: &'static str) -> Result<&'a mut UProbe, FilterError> {
-    let program = ebpf.program_mut(name).ok_or(FilterError::Missing(name))?;
-    program.try_into().map_err(FilterError::Program)
 }
 
 /// Why a library is not observed.
@@ -180,23 +173,12 @@ impl Programs {
             return Err(AttachError::NoFunctions);
         }
         let shows_intra_process = has(ENQUEUE);
-        // Refers to the inspected file, even if its path now names another one.
-        let path = format!("/proc/self/fd/{}", file.as_raw_fd());
-        let mut links = Vec::new();
-        for ((name, _), offset) in found() {
-            let Some(offset) = *offset else { continue };
-            if *name == RECEIVED.0 && shows_intra_process {
-                continue;
-            }
-            let program = program(&mut self.ebpf, name)?;
-            let link = program
-                .attach(offset, &path, UProbeScope::AllProcesses)
-                .and_then(|id| program.take_link(id))
-                .map_err(FilterError::Probe)?;
-            links.push(link);
-        }
+        let found = found().filter_map(|((name, _), offset)| Some((*name, (*offset)?)));
+        let found: Vec<_> = found
+            .filter(|(name, _)| *name != RECEIVED.0 || !shows_intra_process)
+            .collect();
         Ok(Attached {
-            _links: links,
+            _attached: self.breakpoints.attach(file, &found)?,
             shows_intra_process,
         })
     }

@@ -18,6 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use self::search::{Facts, LibrarySearch};
+use super::breakpoints::Means;
 use super::filter::{Filter, FilterError, FilterSettings};
 use super::filter_reader::FilterReader;
 use super::reorder_buffer::ReorderBuffer;
@@ -58,23 +59,37 @@ pub enum UprobeError {
     Filter(#[from] FilterError),
 }
 
-/// Capabilities required by uprobes in other processes. `CAP_PERFMON` alone sufficed from Linux 5.8
-/// on, but later kernels refuse it. Reading the mapped files of other users' processes needs both.
-const REQUIRED: [(CapabilitySet, &str); 2] = [
-    (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
-    (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE"),
-];
+/// Capabilities required by breakpoints in other processes, apart from those that load programs:
+/// for being told of mapped files, and for reading the mapped files of other users' processes. Perf
+/// events need the wider one on recent kernels.
+fn needed() -> [(CapabilitySet, &'static str); 2] {
+    let events = match Means::of_this_kernel() {
+        Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),
+        Means::PerfEvents => (CapabilitySet::SYS_ADMIN, "CAP_SYS_ADMIN"),
+    };
+    [events, (CapabilitySet::SYS_PTRACE, "CAP_SYS_PTRACE")]
+}
 
-/// Returns the capabilities required for attaching uprobes.
+/// Returns the capabilities that attaching programs to libraries can use: those required, and one
+/// for opening a mapped file that another one has replaced.
 #[must_use]
-pub fn required() -> CapabilitySet {
-    REQUIRED.iter().map(|(one, _)| *one).collect()
+pub fn useful() -> CapabilitySet {
+    let required: CapabilitySet = needed().iter().map(|(one, _)| *one).collect();
+    required | CapabilitySet::CHECKPOINT_RESTORE
 }
 
 /// Returns the names of required capabilities that `effective` lacks.
 #[must_use]
 pub fn lacking(effective: CapabilitySet) -> Vec<&'static str> {
-    let lacking = REQUIRED.iter().filter(|(one, _)| !effective.contains(*one));
+    // The older, wider capability includes its successor.
+    let inherited = match effective.contains(CapabilitySet::SYS_ADMIN) {
+        true => CapabilitySet::PERFMON,
+        false => CapabilitySet::empty(),
+    };
+    let needed = needed();
+    let lacking = needed
+        .iter()
+        .filter(|(one, _)| !(effective | inherited).contains(*one));
     lacking.map(|(_, name)| *name).collect()
 }
 
@@ -114,7 +129,7 @@ impl Uprobe {
             piece_ring_bytes: size(ring_bytes),
             ..FilterSettings::default()
         };
-        let loaded = Filter::load_uprobe(&settings, within);
+        let loaded = Filter::load_uprobe(&settings, within, Means::of_this_kernel());
         let (filter, probes) = loaded.map_err(|error| match error {
             FilterError::Program(_) if within.is_some() => UprobeError::Scope(error),
             error => error.into(),

@@ -385,6 +385,7 @@ mod tests {
     use super::super::attachments::{LINGER, RETRY};
     use super::super::processes::Use;
     use super::*;
+    use crate::breakpoints::Means;
     use crate::filter::{Filter, FilterSettings};
     use crate::tables::tests::assert_driven;
     use crate::tables::{Libraries, MappedLibraries};
@@ -420,8 +421,9 @@ mod tests {
         assert_driven::<MappedLibraries>();
         let process = std::process::id();
         let all = Processes::of(process, used.clone());
-        let (_filter, probes) = Filter::load_uprobe(&FilterSettings::default(), None)
-            .expect("loading the kernel filter needs root: run the tests with sudo");
+        let (_filter, probes) =
+            Filter::load_uprobe(&FilterSettings::default(), None, Means::of_this_kernel())
+                .expect("loading the kernel filter needs root: run the tests with sudo");
         let mut attachments = attachments(probes, Arc::default());
         let start = Instant::now();
         attachments.follow(&all, start);

@@ -10,6 +10,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
+use ros2probe_capture::breakpoints::Means;
 use ros2probe_capture::filter::{Filter, FilterSettings, Form, Probe, Probes};
 use ros2probe_capture::piece_assembler::PieceAssembler;
 use ros2probe_capture::uprobe::library;
@@ -38,10 +39,14 @@ struct Handing {
 
 impl Handing {
     fn new(form: Form) -> Result<Handing> {
+        Self::by(Means::of_this_kernel(), form)
+    }
+
+    fn by(means: Means, form: Form) -> Result<Handing> {
         let host = Namespace::alone()?;
         let within = File::open(host.cgroup())?.metadata()?.ino();
         let (mut filter, mut probes) =
-            Filter::load_uprobe(&FilterSettings::default(), Some(within))?;
+            Filter::load_uprobe(&FilterSettings::default(), Some(within), means)?;
         let program = harness::peer::built(match form {
             Form::Whole => "handed",
             Form::List => "handed-list",
@@ -189,8 +194,13 @@ fn what_is_metered_is_what_user_space_finds_in_the_same_messages() -> Result<()>
 
 #[test]
 fn what_is_captured_is_whole() -> Result<()> {
-    for form in [Form::Whole, Form::List] {
-        let mut handing = Handing::new(form)?;
+    for (means, form) in [
+        (Means::of_this_kernel(), Form::Whole),
+        (Means::of_this_kernel(), Form::List),
+        (Means::PerfEvents, Form::Whole),
+        (Means::PerfEvents, Form::List),
+    ] {
+        let mut handing = Handing::by(means, form)?;
         let mut expected: Vec<Vec<u8>> = Vec::new();
         let introduction = handing.talker.introduction("talker");
         for message in introduction {

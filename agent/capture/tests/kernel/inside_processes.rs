@@ -5,6 +5,7 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use std::time::Duration;
 
+use ros2probe_capture::breakpoints::Means;
 use ros2probe_capture::inside::programs::{self, Attached, Programs, Tables};
 use ros2probe_capture::inside::table::{MAX_PROCESS_HITS, ProcessTable, Round};
 use ros2probe_capture::memory_reader::read_memory;
@@ -32,8 +33,12 @@ struct Process {
 impl Robot {
     /// `defines`: such as `-DHUMBLE`.
     fn new(place: u32, defines: &[&str], has_callbacks: bool) -> Self {
+        Self::by(Means::of_this_kernel(), place, defines, has_callbacks)
+    }
+
+    fn by(means: Means, place: u32, defines: &[&str], has_callbacks: bool) -> Self {
         let program = TracedProgram::build(place, defines).unwrap();
-        let (programs, mut tables) = programs::load(has_callbacks, None)
+        let (programs, mut tables) = programs::load(has_callbacks, None, means)
             .expect("loading the kernel programs needs root: run the tests with sudo");
         tables.set_clocks(&Clocks::read()).unwrap();
         Self {
@@ -112,14 +117,19 @@ impl Drop for Process {
     }
 }
 
+/// Returns what this kernel can do, and what each kernel can; the first again if there is no other.
+fn means() -> [Means; 2] {
+    [Means::of_this_kernel(), Means::PerfEvents]
+}
+
 fn milliseconds(duration: Duration) -> f64 {
     duration.as_secs_f64() * 1000.0
 }
 
 #[test]
 fn messages_of_a_running_process_are_counted_and_named_at_either_offset() {
-    for place in [240, 248] {
-        let mut robot = Robot::new(place, &[], false);
+    for (place, means) in [240, 248].into_iter().zip(means()) {
+        let mut robot = Robot::by(means, place, &[], false);
         let mut process = robot.start();
         // Attached while it runs: it has announced nothing.
         process.run("publish 5");
@@ -322,15 +332,17 @@ fn a_killed_process_leaves_its_last_figures_and_no_entry() {
 
 #[test]
 fn no_breakpoint_is_left_once_the_probes_are_gone() {
-    let mut robot = Robot::new(248, &[], true);
-    robot.attach();
-    let mut process = robot.start();
-    process.run("publish 1");
-    assert!(breakpoint(&robot.program, &process));
-    robot.attached = None;
-    process.run("publish 1000");
-    assert!(!breakpoint(&robot.program, &process));
-    assert_eq!(robot.report(&process).publishers[0].published, 1);
+    for means in means() {
+        let mut robot = Robot::by(means, 248, &[], true);
+        robot.attach();
+        let mut process = robot.start();
+        process.run("publish 1");
+        assert!(breakpoint(&robot.program, &process));
+        robot.attached = None;
+        process.run("publish 1000");
+        assert!(!breakpoint(&robot.program, &process));
+        assert_eq!(robot.report(&process).publishers[0].published, 1);
+    }
 }
 
 /// Returns whether the process's code of the library differs from the file.

@@ -106,7 +106,7 @@ fn containers(answers: &Answers) -> Option<Finding> {
     let finding = Finding::new(AREA, "containers", Severity::Warning, sentence);
     let finding = finding.seen("no CAP_SYS_PTRACE", "GET /health capabilities");
     Some(finding.elsewhere(
-        "AmbientCapabilities=CAP_SYS_PTRACE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
+        "AmbientCapabilities=CAP_SYS_PTRACE CAP_CHECKPOINT_RESTORE    # and CapabilityBoundingSet, with systemctl edit ros2probe",
     ))
 }
 
@@ -129,7 +129,7 @@ fn probes(host: &HostState, settings: &CaptureSettings) -> Option<Finding> {
     let finding = Finding::new(AREA, "probes", Severity::Note, sentence);
     let finding = finding.seen(&missing, "CapEff, this process");
     Some(finding.elsewhere(
-        "AmbientCapabilities=CAP_SYS_ADMIN CAP_SYS_PTRACE    # and SystemCallFilter=perf_event_open process_vm_readv, with systemctl edit ros2probe",
+        "AmbientCapabilities=CAP_SYS_PTRACE CAP_CHECKPOINT_RESTORE    # before Linux 6.6 also CAP_SYS_ADMIN; and SystemCallFilter=perf_event_open process_vm_readv, with systemctl edit ros2probe",
     ))
 }
 

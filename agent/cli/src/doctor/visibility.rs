@@ -192,13 +192,17 @@ fn lacking(visibility: &Visibility, ability: Ability) -> Option<Finding> {
         Ability::SharedMemoryExact => (
             Severity::Note,
             "Fast DDS shared memory is sampled; not every message is seen".to_owned(),
-            Some("capture: {shm: {exact: uprobe}}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
+            Some(
+                "capture: {shm: {exact: uprobe}}    # and CAP_SYS_PTRACE, before Linux 6.6 also CAP_SYS_ADMIN",
+            ),
         ),
         Ability::Inside => (
             Severity::Note,
             "messages within one process, with data sharing, iceoryx or security are not counted"
                 .to_owned(),
-            Some("capture: {inside: topics}    # and CAP_SYS_ADMIN, CAP_SYS_PTRACE"),
+            Some(
+                "capture: {inside: topics}    # and CAP_SYS_PTRACE, before Linux 6.6 also CAP_SYS_ADMIN",
+            ),
         ),
         _ => (Severity::Warning, format!("not {}", words(ability)), None),
     };

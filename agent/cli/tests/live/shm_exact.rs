@@ -96,14 +96,14 @@ fn every_message_is_seen_and_none_is_when_the_agent_is_killed() -> Result<()> {
 fn without_the_means_for_uprobes_shared_memory_is_sampled_and_the_reason_reported() -> Result<()> {
     let host = Host::new()?;
     let directory = tempfile::tempdir()?;
-    let lacking = ["setpriv", "--bounding-set", "-sys_admin"].map(str::to_owned);
+    let lacking = ["setpriv", "--bounding-set", "-sys_ptrace"].map(str::to_owned);
     let agent = start_agent(&host.network, directory.path(), &lacking)?;
     let page = agent.scrape()?;
     let reasons = page.labels_of("ros2probe_shm_exact_info", "reason");
     let [reason] = &reasons.into_iter().collect::<Vec<_>>()[..] else {
         panic!("{}", page.0);
     };
-    assert!(reason.contains("CAP_SYS_ADMIN"), "{reason}");
+    assert!(reason.contains("CAP_SYS_PTRACE"), "{reason}");
     let able = |name: &str| page.sum("ros2probe_capture_ability", &[("ability", name)]);
     assert_eq!(able("shared_memory_exact"), 0.0);
     assert_eq!(able("shared_memory"), 1.0);

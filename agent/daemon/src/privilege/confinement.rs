@@ -61,7 +61,7 @@ pub enum Role {
         /// As determined by [`Role::reattach`].
         needs_bpf: bool,
     },
-    /// Attaching uprobes to libraries: `CAP_SYS_ADMIN` and `CAP_SYS_PTRACE`.
+    /// Attaching programs to libraries: those that [`uprobe::useful`] returns.
     Exact,
     /// As [`Role::Exact`], and reading the programs' maps.
     Inside,
@@ -159,7 +159,7 @@ impl Role {
             Self::SharedMemory { needs_nice: true } => {
                 CapabilitySet::SYS_PTRACE | CapabilitySet::SYS_NICE
             }
-            Self::Exact | Self::Inside => uprobe::required(),
+            Self::Exact | Self::Inside => uprobe::useful(),
         }
     }
 }

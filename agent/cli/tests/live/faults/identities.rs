@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use anyhow::{Context as _, Result, ensure};
+use ros2probe_capture::breakpoints::Means;
 use ros2probe_testing::harness::agent::{Agent, Scrape};
 use ros2probe_testing::harness::network::Namespace;
 use ros2probe_testing::harness::process::Process;
@@ -152,7 +153,10 @@ fn without_root_a_library_is_attached_by_its_path_unless_another_file_is_there()
     std::os::unix::fs::symlink(programs[0].library(), &gone)?;
 
     let configuration = configured(&host, directory.path())?;
-    let capabilities = "-all,+net_admin,+bpf,+perfmon,+sys_admin,+sys_ptrace";
+    let capabilities = match Means::of_this_kernel() {
+        Means::Links => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace",
+        Means::PerfEvents => "-all,+net_admin,+bpf,+perfmon,+sys_ptrace,+sys_admin",
+    };
     let start = start_as(UNPRIVILEGED, capabilities, &directory)?;
     let agent = Agent::start(&host, start, &configuration)?;
     let [kept, _] = &mut processes[..] else {
