@@ -20,6 +20,9 @@ pub struct Report {
     pub bytes: u64,
     /// Messages that were sent but are not in the bag.
     pub missing: u64,
+    /// Messages of further topics that had no room in the recording; part of `missing`.
+    #[serde(default)]
+    pub no_room: u64,
     /// Counts of each topic, by name.
     pub topics: BTreeMap<String, TopicReport>,
     /// The first missing messages, by writer and sequence number.

@@ -33,6 +33,30 @@ ros2probe_model::tables! {
     }
     /// Writers that one stream of messages has described
     DescribedWriters { name: "samples.described", entries: 65_536, effect: "further ones are not described" }
+    /// Losses of one subscription, by writer and reason, until its client reads them
+    QueueLosses { name: "queue.losses", entries: 1024, effect: "counted with the last one" }
+    /// Events that one stream has read and not sent
+    StreamEvents { name: "events.stream", entries: 65, effect: "read from the log later" }
+    /// Topics that one stream of messages has described, in `rp`
+    StreamTopics { name: "samples.topics", entries: 65_536, effect: "described again by each message" }
+    /// Their writers
+    StreamWriters { name: "samples.writers", entries: DescribedWriters::CAP, effect: "described again by each message" }
+    /// Topics of one recording
+    RecordedTopics { name: "recording.topics", entries: 2048, effect: "not recorded, and counted in the report" }
+    /// Bytes of their names and types
+    RecordedNames {
+        name: "recording.names", entries: 256 << 10, effect: "not recorded, and counted in the report",
+    }
+    /// Writers of one topic of a recording
+    RecordedWriters { name: "recording.topic.writers", entries: 256, effect: "recorded without their QoS" }
+    /// Writers of one recording
+    RecordingWriters { name: "recording.writers", entries: 2048, effect: "recorded without their QoS" }
+    /// Channels for viewers
+    ViewerChannels { name: "foxglove.channels", entries: 4096 }
+    /// Subscriptions of one viewer
+    ViewerSubscriptions { name: "foxglove.subscriptions", entries: 4096, effect: "closed with 1008" }
+    /// Topics that one viewer's status of losses counts apart
+    ViewerLosses { name: "foxglove.losses", entries: 64, effect: "only in the sum" }
     /// Announcements of one kind that `rp discover` receives from a participant
     ReceivedAnnouncements { name: "discover.received", entries: 4096 }
     /// Endpoints of this participant

@@ -20,11 +20,13 @@ use super::report::{add_missed, add_paused, add_written, custom_data, take_back}
 use super::sample_ring::SampleRing;
 use crate::subscriptions::line::qos;
 use crate::subscriptions::{Item, Topic};
+use crate::tables::{RecordedNames, RecordedTopics, RecordedWriters, RecordingWriters};
 use ros2probe_api::recording_report::{NO_SUBSCRIBER, Report};
 use ros2probe_api::recordings::FilterOptions;
 use ros2probe_bag::{
     Compressed, Error, FileCompression, Schema, Summary, TopicDescription, TopicId, Writer,
 };
+use ros2probe_model::bounded::{Bounded, Sum};
 use ros2probe_model::dispatch::{Offered, Sample};
 
 /// Interval of writes to the operating system, by the time of samples. A killed process loses at
@@ -32,8 +34,6 @@ use ros2probe_model::dispatch::{Offered, Sample};
 const FLUSH: Duration = Duration::from_secs(1);
 /// Interval of syncs to disk. A power failure loses at most this much.
 const SYNC: Duration = Duration::from_secs(5);
-/// Most writers of one topic whose first sequence number is kept.
-const WRITERS: usize = 256;
 
 /// Sources of facts that samples do not contain.
 pub struct Sources<'a> {
@@ -59,7 +59,11 @@ pub struct Recorder<'a> {
     before: Baseline,
     filter: Filter,
     sources: Sources<'a>,
-    topics: HashMap<String, TopicDecision>,
+    topics: Bounded<RecordedTopics, HashMap<String, TopicDecision>>,
+    /// Bytes of their names and types.
+    names: Sum<RecordedNames>,
+    /// Writers of all topics.
+    writers: Sum<RecordingWriters>,
     /// Topics in the bag, in order.
     order: Vec<String>,
     report: Report,
@@ -86,15 +90,17 @@ enum TopicDecision {
     Recorded(Box<RecordedTopic>),
     /// The filter excludes the topic.
     Excluded,
+    /// The filter takes the topic, and the recording has no room for it.
+    NoRoom,
 }
 
 struct RecordedTopic {
     id: TopicId,
     description: TopicDescription,
-    /// Offered QoS of each publisher by its GUID, for the description.
-    offered: BTreeMap<String, Qos>,
+    /// Offered QoS of each publisher with its GUID, in their order, for the description.
+    offered: Bounded<RecordedWriters, Vec<(String, Qos)>>,
     /// Sequence number of the first recorded sample of each writer.
-    first: HashMap<Guid, SequenceNumber>,
+    first: Bounded<RecordedWriters, HashMap<Guid, SequenceNumber>>,
 }
 
 /// Result of a recording.
@@ -138,7 +144,9 @@ impl<'a> Recorder<'a> {
             writer,
             filter,
             sources,
-            topics: HashMap::new(),
+            topics: Bounded::default(),
+            names: Sum::default(),
+            writers: Sum::default(),
             order: Vec::new(),
             report: Report::default(),
             sampled: BTreeSet::new(),
@@ -290,9 +298,9 @@ impl<'a> Recorder<'a> {
         let announced = self.discover(&names);
         for ((name, message_type), announced) in topics.into_iter().zip(announced) {
             let place = self.decide(name, message_type, None, &announced, false)?;
-            // An excluded topic may still be published later.
+            // Other topics may still be published later, or have room.
             if matches!(place, TopicDecision::Recorded(_)) {
-                self.topics.insert(name.to_owned(), place);
+                self.keep(name, place);
             }
         }
         Ok(())
@@ -318,7 +326,7 @@ impl<'a> Recorder<'a> {
                 if self.paused {
                     return Ok(());
                 }
-                if self.place(&missed.topic)?.is_some() {
+                if self.place(&missed.topic, missed.samples)?.is_some() {
                     add_missed(&mut self.report, missed);
                 }
                 Ok(())
@@ -370,19 +378,28 @@ impl<'a> Recorder<'a> {
         };
         let topic = &*sample.topic;
         if self.paused {
-            if self.accepts(&topic.name) {
+            let known = &self.report.topics;
+            let has_room = known.len() < RecordedTopics::CAP || known.contains_key(&*topic.name);
+            if has_room && self.accepts(&topic.name) {
                 add_paused(&mut self.report, &topic.name);
             }
             return Ok(());
         }
-        let Some(taken) = self.place(topic)? else {
+        let are_writers_full = self.writers.is_full();
+        let Some(taken) = self.place(topic, 1)? else {
             return Ok(());
         };
         let id = taken.id;
         if let Some(first) = taken.first.get_mut(&sample.writer) {
             *first = sample.sequence_number.min(*first);
-        } else if taken.first.len() < WRITERS {
-            taken.first.insert(sample.writer, sample.sequence_number);
+        } else if are_writers_full {
+            self.writers.refuse();
+        } else if taken
+            .first
+            .insert(sample.writer, sample.sequence_number)
+            .is_none()
+        {
+            self.writers.add(1);
             self.describe_again(topic, sample.writer)?;
         }
         if let Some(quota) = &mut self.quota {
@@ -422,8 +439,8 @@ impl<'a> Recorder<'a> {
         !matches!(self.topics.get(name), Some(TopicDecision::Excluded))
     }
 
-    /// State of a topic with a message. `None` if it is not recorded.
-    fn place(&mut self, topic: &Topic) -> Result<Option<&mut RecordedTopic>, Error> {
+    /// State of a topic with so many messages. `None` if it is not recorded.
+    fn place(&mut self, topic: &Topic, messages: u64) -> Result<Option<&mut RecordedTopic>, Error> {
         let Topic {
             name, message_type, ..
         } = topic;
@@ -435,7 +452,12 @@ impl<'a> Recorder<'a> {
                 _ => self.discover_one(name),
             };
             let place = self.decide(name, message_type, offered, &announced, true)?;
-            self.topics.insert(name.to_string(), place);
+            if matches!(place, TopicDecision::NoRoom) {
+                self.report.missing += messages;
+                self.report.no_room += messages;
+                return Ok(None);
+            }
+            self.keep(name, place);
         }
         let Some(TopicDecision::Recorded(taken)) = self.topics.get_mut(&**name) else {
             return Ok(None);
@@ -453,6 +475,19 @@ impl<'a> Recorder<'a> {
             return Ok(None);
         }
         Ok(Some(taken))
+    }
+
+    /// Remembers the decision about a topic. Without room, an excluded one is decided again.
+    fn keep(&mut self, name: &str, place: TopicDecision) {
+        let bytes = match &place {
+            TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
+            TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
+        };
+        if bytes > self.names.room() {
+            self.names.refuse();
+        } else if self.topics.insert(name.to_owned(), place).is_none() {
+            self.names.add(bytes);
+        }
     }
 
     /// Announcements about these topics, one result per name.
@@ -492,19 +527,30 @@ impl<'a> Recorder<'a> {
         if !self.filter.takes(&candidate) {
             return Ok(TopicDecision::Excluded);
         }
+        if self.topics.is_full() {
+            self.topics.refuse();
+            return Ok(TopicDecision::NoRoom);
+        }
+        if name.len() + message_type.len() > self.names.room() {
+            self.names.refuse();
+            return Ok(TopicDecision::NoRoom);
+        }
         let type_hash = offered.and_then(|offered| offered.type_hash.as_ref());
         let type_hash = type_hash.map(ToString::to_string);
         let type_hash = type_hash.or_else(|| announced.type_hashes.first().cloned());
-        let publishers = announced.publishers.iter();
-        let offered: BTreeMap<_, _> = publishers
+        let publishers = announced.publishers.iter().take(self.writers.room());
+        let mut offered: Vec<_> = publishers
             .map(|publisher| (publisher.guid.clone(), qos(&publisher.qos)))
             .collect();
+        offered.sort_by(|one, other| one.0.cmp(&other.0));
+        let offered: Bounded<RecordedWriters, Vec<_>> = offered.into_iter().collect();
+        self.writers.add(offered.len());
         let mut description = TopicDescription {
             name: name.to_owned(),
             type_name: message_type.to_owned(),
             schema: (self.sources.schema)(message_type, type_hash.as_deref()),
             type_hash,
-            publishers: offered.values().cloned().collect(),
+            publishers: offered.iter().map(|(_, qos)| qos.clone()).collect(),
         };
         // The description precedes the first message, and includes that of its writer.
         let id = self.writer.topic(description.clone())?;
@@ -516,7 +562,7 @@ impl<'a> Recorder<'a> {
             id,
             description,
             offered,
-            first: HashMap::new(),
+            first: Bounded::default(),
         })))
     }
 
@@ -527,13 +573,21 @@ impl<'a> Recorder<'a> {
         else {
             return Ok(());
         };
-        let before = taken
+        let writer = writer.to_string();
+        let qos = (*offered.qos).clone();
+        let place = taken
             .offered
-            .insert(writer.to_string(), (*offered.qos).clone());
-        if before.is_some_and(|before| before == *offered.qos) {
-            return Ok(());
+            .binary_search_by(|(known, _)| known.cmp(&writer));
+        match place {
+            Ok(place) => match taken.offered.get_mut(place) {
+                Some((_, known)) if *known != qos => *known = qos,
+                _ => return Ok(()),
+            },
+            Err(place) if taken.offered.insert(place, (writer, qos)).is_none() => {}
+            Err(_) => return Ok(()),
         }
-        taken.description.publishers = taken.offered.values().cloned().collect();
+        let publishers = taken.offered.iter().map(|(_, qos)| qos.clone());
+        taken.description.publishers = publishers.collect();
         self.writer.topic(taken.description.clone()).map(drop)
     }
 }

@@ -8,6 +8,7 @@ use ros2probe_api::recording_report::{
 };
 
 use crate::subscriptions::{Missed, MissedReason};
+use crate::tables::RecordedTopics;
 
 /// Most runs of missing samples listed; further ones are counted.
 const RUNS: usize = 256;
@@ -108,7 +109,10 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
             (topic.lost, "lost on the way"),
             (topic.not_captured, "could not be captured"),
             (topic.dropped, "dropped, the storage was too slow"),
-            (topic.unwritten, "not written, the storage was full"),
+            (
+                topic.unwritten,
+                "not written, the storage was full",
+            ),
             (topic.unannounced, "sent before their writer was announced"),
         ];
         let counts = counts.into_iter().filter(|(count, _)| *count > 0);
@@ -124,6 +128,13 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
                 "{name}: {recorded} of {all} messages recorded; {counts}"
             ));
         }
+    }
+    if report.no_room > 0 {
+        let topics = RecordedTopics::CAP;
+        lines.push(format!(
+            "not recorded: {} of further topics than the {topics} that a recording has room for",
+            counted(report.no_room, "message")
+        ));
     }
     for name in &report.sent_before {
         lines.push(format!(

@@ -13,13 +13,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::backlog::Backlog;
 use super::{Choice, Depth, Item, Overflow, Request, Selection, TopicKey};
+use crate::tables::QueueLosses;
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::dispatch::{Missed, MissedReason, Sample};
 use ros2probe_model::selection::SampleRequest;
 
 /// Memory of a queued entry besides its payload, in bytes.
 const OVERHEAD: usize = 256;
-/// Most losses reported separately, by writer and reason; further ones are merged.
-const MISSED: usize = 1024;
 /// Interval at which a source that waits for a reader checks for the end of the agent.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -60,7 +60,7 @@ struct ChannelOptions {
 struct Queue {
     waiting: Backlog,
     /// Samples dropped since the last report to the reader.
-    dropped: Vec<Missed>,
+    dropped: Bounded<QueueLosses, Vec<Missed>>,
     /// Number of those that are not counted yet.
     uncounted: u64,
     end: Option<&'static str>,
@@ -379,9 +379,9 @@ impl Queue {
             known.first = known.first.min(missed.first);
             known.last = known.last.max(missed.last);
             known.samples += missed.samples;
-        } else if self.dropped.len() < MISSED {
-            self.dropped.push(missed);
-        } else if let Some(last) = self.dropped.last_mut() {
+        } else if let Some(missed) = self.dropped.push(missed)
+            && let Some(last) = self.dropped.last_mut()
+        {
             // Their writers are no longer reported, only their number.
             last.samples += missed.samples;
         }

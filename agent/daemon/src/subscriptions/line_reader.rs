@@ -12,16 +12,15 @@ use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber, Times
 
 use super::Item;
 use super::line::announced;
-
-/// Most writers with a stored description; each message of a further one creates its own.
-const WRITERS: usize = 65_536;
+use crate::tables::{StreamTopics, StreamWriters};
+use ros2probe_model::bounded::Bounded;
 
 /// Converts lines to items, with the topics that earlier lines described.
 #[derive(Debug)]
 pub struct LineReader {
-    topics: HashMap<(u32, String), Arc<Topic>>,
+    topics: Bounded<StreamTopics, HashMap<(u32, String), Arc<Topic>>>,
     /// Topics by writer, with the writer's announcement.
-    writers: HashMap<String, Arc<Topic>>,
+    writers: Bounded<StreamWriters, HashMap<String, Arc<Topic>>>,
     open: Open,
 }
 
@@ -30,8 +29,8 @@ impl LineReader {
     #[must_use]
     pub fn new(open: Open) -> Self {
         Self {
-            topics: HashMap::new(),
-            writers: HashMap::new(),
+            topics: Bounded::default(),
+            writers: Bounded::default(),
             open,
         }
     }
@@ -78,10 +77,8 @@ impl LineReader {
         let message_type = Some(facts.message_type.as_str());
         let offered = facts.offered.as_deref();
         let topic = self.topic(facts.domain_id, &facts.topic, message_type, offered);
-        if self.writers.len() < WRITERS {
-            self.writers
-                .insert(facts.writer.clone(), Arc::clone(&topic));
-        }
+        self.writers
+            .insert(facts.writer.clone(), Arc::clone(&topic));
         topic
     }
 
@@ -157,6 +154,38 @@ fn guid(text: &str) -> Guid {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_stream_of_endless_topics_and_writers_is_read_and_not_remembered() {
+        let mut reader = LineReader::new(Open { topics: Vec::new() });
+        let cap = StreamTopics::CAP as u64;
+        for number in (0..cap + 100).chain([3]) {
+            let line = Line::Sample(samples::Sample {
+                topic: format!("/t{number}"),
+                domain_id: 0,
+                message_type: "a/msg/B".to_owned(),
+                time_ns: 1,
+                writer: format!("010f00000000000000000000.{number:08x}"),
+                sequence_number: number,
+                source_timestamp_ns: None,
+                header_stamp_ns: None,
+                size: 4,
+                sampled: false,
+                payload_bytes: None,
+                offered: None,
+            });
+            let Some(Item::Sample(sample)) = reader.item(&line, Bytes::new()) else {
+                panic!("{line:?}");
+            };
+            assert_eq!(*sample.topic.name, format!("/t{number}"));
+            assert_eq!(
+                sample.writer.entity.0,
+                u32::try_from(number).unwrap().to_be_bytes()
+            );
+        }
+        crate::tables::tests::assert_driven::<StreamTopics>();
+        crate::tables::tests::assert_driven::<StreamWriters>();
+    }
 
     #[test]
     fn writers_and_stamps_are_read_as_they_are_written() {

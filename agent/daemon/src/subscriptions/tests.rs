@@ -5,6 +5,7 @@ use ros2probe_wire::{DomainId, EntityId, Guid, GuidPrefix, SequenceNumber};
 use super::*;
 use crate::agent_facts::SourceKind;
 use crate::snapshot_cell::SnapshotCell;
+use crate::tables::QueueLosses;
 
 const LONG: Duration = Duration::from_secs(60);
 
@@ -319,4 +320,32 @@ async fn a_reader_is_woken_told_the_end_and_then_nothing() {
         .open(request(Depth::Arrivals, 1 << 16, Overflow::DropOldest))
         .unwrap();
     assert_eq!(late.next().await, Some(Item::End("end of capture")));
+}
+
+#[test]
+fn losses_of_more_writers_than_are_reported_apart_count_with_the_last_one() {
+    const WRITERS: u64 = 2 * QueueLosses::CAP as u64;
+    let all = subscriptions(caps());
+    let mut slow = all
+        .open(request(Depth::Payloads, 1256, Overflow::DropOldest))
+        .unwrap();
+    for number in 0..=WRITERS {
+        let mut sample = Sample::clone(&sample(number, Some(1000)));
+        let entity = u32::try_from(number).unwrap().to_be_bytes();
+        sample.writer = Guid::new(GuidPrefix([1; 12]), EntityId(entity));
+        let dispatch = Dispatch {
+            to: [1].into(),
+            outcome: SampleOutcome::Sample(Arc::new(sample)),
+        };
+        all.deliver(vec![dispatch], None);
+    }
+    let (mut reports, mut samples, mut kept) = (0, 0, 0);
+    while let Some(item) = slow.try_next() {
+        match item {
+            Item::Missed(missed) => (reports, samples) = (reports + 1, samples + missed.samples),
+            _ => kept += 1,
+        }
+    }
+    assert_eq!((reports, samples, kept), (QueueLosses::CAP, WRITERS, 1));
+    crate::tables::tests::assert_driven::<QueueLosses>();
 }

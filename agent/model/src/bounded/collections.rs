@@ -1,6 +1,7 @@
 //! The methods of bounded containers: those that add an entry apply the cap, the others are those
 //! of the standard library.
 
+use std::borrow::Borrow;
 use std::collections::{
     BTreeMap, BTreeSet, HashMap, HashSet, VecDeque, btree_map, hash_map, vec_deque,
 };
@@ -222,11 +223,19 @@ impl<D: Declared, K: Ord, V> Bounded<D, BTreeMap<K, V>> {
         fn pop_last() -> Option<(K, V)>;
         fn first_entry() -> Option<btree_map::OccupiedEntry<'_, K, V>>;
         fn remove(key: &K) -> Option<V>;
-        fn get_mut(key: &K) -> Option<&mut V>;
         fn iter_mut() -> btree_map::IterMut<'_, K, V>;
         fn values_mut() -> btree_map::ValuesMut<'_, K, V>;
         fn range_mut(range: impl RangeBounds<K>) -> btree_map::RangeMut<'_, K, V>;
         fn retain(keep: impl FnMut(&K, &mut V) -> bool);
+    }
+
+    /// As the standard library's.
+    #[inline]
+    pub fn get_mut<Q: Ord + ?Sized>(&mut self, key: &Q) -> Option<&mut V>
+    where
+        K: Borrow<Q>,
+    {
+        self.inner.get_mut(key)
     }
 
     /// Removes and returns the entries below this key.
@@ -251,10 +260,18 @@ impl<D: Declared, K: Hash + Eq, V> Bounded<D, HashMap<K, V>> {
     forward! {
         fn clear();
         fn remove(key: &K) -> Option<V>;
-        fn get_mut(key: &K) -> Option<&mut V>;
         fn iter_mut() -> hash_map::IterMut<'_, K, V>;
         fn values_mut() -> hash_map::ValuesMut<'_, K, V>;
         fn retain(keep: impl FnMut(&K, &mut V) -> bool);
+    }
+
+    /// As the standard library's.
+    #[inline]
+    pub fn get_mut<Q: Hash + Eq + ?Sized>(&mut self, key: &Q) -> Option<&mut V>
+    where
+        K: Borrow<Q>,
+    {
+        self.inner.get_mut(key)
     }
 
     /// Adds or replaces an entry. Returns the entry that has no room.

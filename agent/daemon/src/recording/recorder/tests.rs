@@ -1,9 +1,12 @@
+use ros2probe_wire::qos::Role;
+use ros2probe_wire::rtps::VendorId;
 use ros2probe_wire::time::SECOND;
 use ros2probe_wire::{DomainId, EntityId, GuidPrefix, SequenceNumber};
 
 use super::*;
 use crate::recording::shortfalls;
 use crate::subscriptions::{Missed, MissedReason};
+use crate::tables::tests::assert_driven;
 use ros2probe_bag::Options;
 
 const KEEPER: &str = r#"{"reliability": "RELIABLE", "durability": "TRANSIENT_LOCAL",
@@ -287,4 +290,83 @@ fn what_was_not_observed_is_counted_from_the_beginning_of_the_recording() {
         .map(|each| (each.domain_id, each.topics, each.messages))
         .collect();
     assert_eq!(others, [(7, 2, Some(40)), (8, 1, None)]);
+}
+
+/// A sample of the numbered writer with its QoS.
+fn sample_of(name: &str, number: u32) -> Item {
+    let Item::Sample(sample) = sample(name, 1) else {
+        unreachable!()
+    };
+    let offered = Offered {
+        type_hash: None,
+        qos: Qos::defaults(Role::Writer, VendorId::CYCLONE).into(),
+    };
+    let mut sample = Sample::clone(&sample);
+    let mut topic = Topic::clone(&sample.topic);
+    topic.offered = Some(Arc::new(offered));
+    sample.topic = Arc::new(topic);
+    sample.writer = Guid::new(GuidPrefix([1; 12]), EntityId(number.to_be_bytes()));
+    Item::Sample(Arc::new(sample))
+}
+
+/// Resident memory of this process.
+fn resident_bytes() -> u64 {
+    let text = std::fs::read_to_string("/proc/self/statm").unwrap();
+    text.split(' ').nth(1).unwrap().parse::<u64>().unwrap() * 4096
+}
+
+#[test]
+fn topics_and_writers_without_end_fill_a_recording_to_its_caps_and_are_counted() {
+    const MOST_BYTES: u64 = 10 << 20;
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    // Pages and buffers of the first use.
+    (0..9).for_each(|number| recorder.take(&sample_of("/first", number)).unwrap());
+    let before = resident_bytes();
+    let topics = u32::try_from(RecordedTopics::CAP).unwrap() + 500;
+    for number in 0..topics {
+        let name = format!("/robot_{number}/camera/image_raw/compressed");
+        recorder.take(&sample_of(&name, number)).unwrap();
+    }
+    for number in 0..500 {
+        recorder.take(&sample_of("/first", number)).unwrap();
+    }
+    let added = resident_bytes().saturating_sub(before);
+    println!("{added} bytes for {} topics", RecordedTopics::CAP);
+    assert!(added < MOST_BYTES, "{added} bytes");
+    assert_driven::<RecordedTopics>();
+    assert_driven::<RecordingWriters>();
+    recorder.pause(true);
+    (0..5_000).for_each(|number| {
+        let name = format!("/paused_{number}");
+        recorder.take(&sample_of(&name, number)).unwrap();
+    });
+    let ended = recorder.finish(None);
+    assert_eq!((ended.report.no_room, ended.report.missing), (501, 501));
+    assert_eq!(ended.report.topics.len(), RecordedTopics::CAP);
+    let text = shortfalls(&ended.report).concat();
+    assert!(
+        text.contains("not recorded: 501 messages of further topics"),
+        "{text}"
+    );
+    assert!(!ended.report.is_complete());
+    assert_eq!(numbers(&ended).len() as u64, ended.report.messages);
+}
+
+#[test]
+fn long_names_and_many_writers_of_one_topic_keep_within_their_caps() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = recorder(&directory.path().join("bag"), FilterOptions::everything());
+    for number in 0..2 * u32::try_from(RecordedWriters::CAP).unwrap() {
+        recorder.take(&sample_of("/tf", number)).unwrap();
+    }
+    assert_driven::<RecordedWriters>();
+    for number in 0..2_000 {
+        let name = format!("/{number:0>255}");
+        recorder.take(&sample_of(&name, number)).unwrap();
+    }
+    assert_driven::<RecordedNames>();
+    let ended = recorder.finish(None);
+    assert!(ended.report.no_room > 1_000, "{:?}", ended.report.no_room);
+    assert_eq!(ended.report.topics["/tf"].messages, 512);
 }

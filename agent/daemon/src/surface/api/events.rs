@@ -32,8 +32,10 @@ use crate::config::{Watch, Watchlist};
 use crate::events::EventLog;
 use crate::events::{EVENTS, Position, Reader, Record, Value};
 use crate::surface::places::Places;
+use crate::tables::StreamEvents;
 use ros2probe_api::attributes::{self, Attributes};
 use ros2probe_api::events::{self as answers, Lagged};
+use ros2probe_model::bounded::Bounded;
 use ros2probe_wire::DomainId;
 
 /// Slots for streams of all listeners: fewer than connections, so that other requests still get
@@ -44,8 +46,8 @@ const MAX_STREAMS: usize = 16;
 const BEAT: Duration = Duration::from_secs(15);
 /// Time after which a disconnected client should reconnect.
 const RETRY: Duration = Duration::from_secs(2);
-/// Largest number of events formatted at once.
-const BATCH: usize = 64;
+/// Largest number of events formatted at once, besides the notice of overwritten ones.
+const BATCH: usize = StreamEvents::CAP - 1;
 /// Largest number of names or topics per filter.
 const MAX_FILTERS: usize = 32;
 /// Largest number of characters in a filter by name, and by topic.
@@ -87,7 +89,7 @@ struct Stream {
     follow: bool,
     /// Number of the last event that was processed.
     place: u64,
-    waiting: VecDeque<Event>,
+    waiting: Bounded<StreamEvents, VecDeque<Event>>,
     _permit: OwnedSemaphorePermit,
 }
 
@@ -153,7 +155,7 @@ async fn events(
         filter,
         follow: selection.follow.unwrap_or(true),
         place,
-        waiting: VecDeque::new(),
+        waiting: Bounded::default(),
         _permit: permit,
     };
     stream.begin(restarted);
@@ -368,7 +370,7 @@ mod tests {
             filter: Filter::default(),
             follow: true,
             place: 0,
-            waiting: VecDeque::new(),
+            waiting: Bounded::default(),
             _permit: STREAMS.take(true).unwrap(),
         }
     }
@@ -385,6 +387,23 @@ mod tests {
         log.record(AgentEvent::Reloaded { watches: 0 });
         assert!(format!("{:?}", stream.next().await).contains("watches"));
         assert_eq!(stream.place, 9);
+    }
+
+    #[tokio::test]
+    async fn a_stream_reads_a_part_of_the_log_at_once() {
+        let (log, stop) = (Arc::new(EventLog::new()), CancellationToken::new());
+        log.overwrite(7);
+        for watches in 0..150 {
+            log.record(AgentEvent::Reloaded { watches });
+        }
+        let mut stream = stream(&log, &stop);
+        stream.follow = false;
+        let mut count = 0;
+        while stream.next().await.is_some() {
+            count += 1;
+        }
+        assert_eq!(count, 151, "the events, and `lagged`");
+        crate::tables::tests::assert_driven::<StreamEvents>();
     }
 
     #[tokio::test]

@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use ros2probe_message::Library;
+use ros2probe_model::bounded::Bounded;
 use ros2probe_model::names::{DdsName, TypeName};
 use ros2probe_model::snapshot::{Snapshot, TopicFacts};
 use ros2probe_wire::DomainId;
@@ -15,14 +16,15 @@ use super::names::DomainNames;
 use super::protocol::Advertised;
 use super::statistics;
 use crate::subscriptions::{Topic, TopicKey};
+use crate::tables::ViewerChannels;
 
-/// Largest number of channels; further topics are left out.
-pub(super) const MAX_CHANNELS: usize = 4096;
 /// Largest total size of definitions in bytes; channels beyond it have no schema.
 const SCHEMA_BYTES: usize = 2 << 20;
 
 /// Channels by id.
-pub(super) type Channels = BTreeMap<u32, Arc<Channel>>;
+pub(super) type Channels = Bounded<ViewerChannels, BTreeMap<u32, Arc<Channel>>>;
+/// Topics that have a channel, in the order of their contents.
+type Wanted<'a> = Bounded<ViewerChannels, BTreeMap<Content, &'a TopicFacts>>;
 
 /// Content of a channel, which identifies it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -92,7 +94,7 @@ pub(super) struct Table {
 pub(super) struct Registry {
     library: Arc<Library>,
     channels: Arc<Channels>,
-    ids: BTreeMap<Content, u32>,
+    ids: Bounded<ViewerChannels, BTreeMap<Content, u32>>,
     /// Number of channels so far; no id is used twice.
     count: u32,
     names: DomainNames,
@@ -150,7 +152,7 @@ impl Registry {
         Self {
             library,
             channels: Arc::default(),
-            ids: BTreeMap::new(),
+            ids: Bounded::default(),
             count: 0,
             names: DomainNames::default(),
             schemas: Schemas::new(SCHEMA_BYTES),
@@ -180,7 +182,7 @@ impl Registry {
     }
 
     /// Finds the definitions of new types. Files are read on another thread.
-    async fn look_up(&mut self, wanted: &BTreeMap<Content, &TopicFacts>) {
+    async fn look_up(&mut self, wanted: &Wanted<'_>) {
         let new = wanted
             .iter()
             .filter(|(content, _)| !self.ids.contains_key(*content));
@@ -213,9 +215,9 @@ impl Registry {
     }
 
     /// Replaces the channels. Those that stay keep their ids.
-    fn change(&mut self, wanted: &BTreeMap<Content, &TopicFacts>) {
-        let mut channels = Channels::new();
-        let mut ids = BTreeMap::new();
+    fn change(&mut self, wanted: &Wanted<'_>) {
+        let mut channels = Channels::default();
+        let mut ids = Bounded::<_, BTreeMap<_, _>>::default();
         for (content, topic) in wanted {
             let known = self.ids.get(content);
             let known = known.and_then(|id| self.channels.get(id).map(Arc::clone));
@@ -285,7 +287,7 @@ impl Schemas {
 }
 
 /// Returns the channels for a snapshot: first those of messages, then those of statistics.
-fn wanted(snapshot: &Snapshot) -> BTreeMap<Content, &TopicFacts> {
+fn wanted(snapshot: &Snapshot) -> Wanted<'_> {
     let topics = snapshot.topics.iter();
     let topics =
         topics.filter(|topic| topic.kind.is_ros_topic() && !topic.hidden && !topic.vanished);
@@ -308,7 +310,7 @@ fn wanted(snapshot: &Snapshot) -> BTreeMap<Content, &TopicFacts> {
         };
         (content, topic)
     });
-    messages.chain(statistics).take(MAX_CHANNELS).collect()
+    messages.chain(statistics).collect()
 }
 
 /// Returns type and hash of a channel's messages, as the first endpoint of that type announces it.

@@ -6,7 +6,6 @@
 
 mod sending;
 
-use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
@@ -30,11 +29,11 @@ use super::protocol::{self, Level, Message, Metadata, Request, Subscribe, parse}
 use super::statistics::{self, Previous};
 use crate::config::Access;
 use crate::subscriptions::{Depth, Item, Overflow, Selection, Subscription, TopicKey};
+use crate::tables::{ViewerLosses, ViewerSubscriptions};
+use ros2probe_model::bounded::Bounded;
 
 /// Largest message of a client, in bytes.
 const MAX_MESSAGE: usize = 256 << 10;
-/// Largest number of subscriptions of one client, including those that one message requests.
-const MAX_SUBSCRIPTIONS: usize = 4096;
 /// Capacity of a client's queue in bytes; `limits.payload_bytes` bounds all queues together.
 const QUEUE_BYTES: usize = 16 << 20;
 /// Size of a fragment of a message to a client, and of an `advertise` message, in bytes.
@@ -50,8 +49,6 @@ const MAX_UNANSWERED: u32 = 3;
 const QUIET_TICKS: u32 = 10;
 /// Topics that the status of losses names.
 const NAMED: usize = 3;
-/// Topics whose losses are counted apart.
-const COUNTED: usize = 64;
 
 /// Longest time until a client reads why it is closed.
 const FAREWELL: Duration = Duration::from_secs(1);
@@ -78,9 +75,9 @@ pub(super) struct Client<S> {
     viewer: Viewer,
     tables: watch::Receiver<Option<Arc<Table>>>,
     channels: Arc<Channels>,
-    subscribed: BTreeMap<u32, Subscribed>,
+    subscribed: Bounded<ViewerSubscriptions, BTreeMap<u32, Subscribed>>,
     /// Ids of the subscriptions by content.
-    ids: BTreeMap<Content, u32>,
+    ids: Bounded<ViewerSubscriptions, BTreeMap<Content, u32>>,
     /// Messages of all subscribed topics.
     messages: Option<Subscription>,
     graph: Option<Arc<Graph>>,
@@ -98,7 +95,7 @@ struct Subscribed {
 #[derive(Default)]
 struct Losses {
     /// By the name that the client knows.
-    topics: BTreeMap<String, u64>,
+    topics: Bounded<ViewerLosses, BTreeMap<String, u64>>,
     messages: u64,
     is_news: bool,
     quiet: u32,
@@ -147,8 +144,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
             viewer,
             tables,
             channels: Arc::default(),
-            subscribed: BTreeMap::new(),
-            ids: BTreeMap::new(),
+            subscribed: Bounded::default(),
+            ids: Bounded::default(),
             messages: None,
             graph: None,
             losses: Default::default(),
@@ -269,7 +266,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
     }
 
     async fn subscribe(&mut self, wanted: &[Subscribe]) -> Result<(), End> {
-        if self.subscribed.len() + wanted.len() > MAX_SUBSCRIPTIONS {
+        if self.subscribed.len() + wanted.len() > ViewerSubscriptions::CAP {
+            self.subscribed.refuse();
             let reason = "more than 4096 subscriptions";
             return Err(End::Closed(CloseCode::Policy, reason));
         }
@@ -285,17 +283,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
                 refused += 1;
                 continue;
             }
-            let (Entry::Vacant(place), Entry::Vacant(its_id)) =
-                (self.subscribed.entry(*id), self.ids.entry(content.clone()))
-            else {
+            if self.subscribed.contains_key(id) || self.ids.contains_key(content) {
                 ignored += 1;
                 continue;
-            };
-            its_id.insert(*id);
-            place.insert(Subscribed {
+            }
+            self.ids.insert(content.clone(), *id);
+            let subscribed = Subscribed {
                 channel: Arc::clone(channel),
                 previous: Previous::default(),
-            });
+            };
+            self.subscribed.insert(*id, subscribed);
             fresh.extend(content.messages_of());
         }
         if !fresh.is_empty() {
@@ -505,7 +502,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Client<S> {
         let mut losses = LOSSES.iter().zip(&mut self.losses);
         let losses = losses.find(|((reason, ..), _)| *reason == missed.reason);
         if let Some((_, losses)) = losses {
-            losses.add(&subscribed.channel, missed.samples);
+            losses.add(subscribed.channel.topic(), missed.samples);
         }
     }
 
@@ -558,12 +555,13 @@ impl<S> Drop for Client<S> {
 }
 
 impl Losses {
-    fn add(&mut self, channel: &Channel, messages: u64) {
+    fn add(&mut self, name: &str, messages: u64) {
         self.messages += messages;
         self.is_news = true;
-        let name = channel.topic();
-        if self.topics.len() < COUNTED || self.topics.contains_key(name) {
-            *self.topics.entry(name.to_owned()).or_default() += messages;
+        if let Some(count) = self.topics.get_mut(name) {
+            *count += messages;
+        } else {
+            self.topics.insert(name.to_owned(), messages);
         }
     }
 
@@ -592,4 +590,24 @@ fn ticks() -> Interval {
     let mut ticks = interval(TICK);
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     ticks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tables::tests::assert_driven;
+
+    #[test]
+    fn losses_of_more_topics_than_are_counted_apart_are_in_the_sum() {
+        let mut losses = Losses::default();
+        for topic in 0..2 * ViewerLosses::CAP as u64 {
+            losses.add(&format!("/t{topic}"), topic);
+        }
+        losses.add("/t63", 1_000);
+        assert_driven::<ViewerLosses>();
+        let text = losses.text("dropped");
+        let sum = (0..128).sum::<u64>() + 1_000;
+        let expected = format!("{sum} messages were dropped: 1063 of /t63, 62 of /t62, 61 of /t61");
+        assert_eq!(text, expected);
+    }
 }

@@ -16,11 +16,12 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
 
-use super::channels::MAX_CHANNELS;
 use super::*;
 use crate::agent_facts::AgentFacts;
 use crate::config::{Retain, Watch};
 use crate::subscriptions::Caps;
+use crate::tables::tests::assert_driven;
+use crate::tables::{ViewerChannels, ViewerSubscriptions};
 
 const MEGABYTE: usize = 1 << 20;
 
@@ -94,7 +95,7 @@ async fn names_of_several_domains_and_several_types_are_channels_of_their_own() 
 #[tokio::test]
 async fn topics_beyond_the_cap_have_no_channel() {
     let mut registry = Registry::new(library());
-    let names: Vec<_> = (0..=MAX_CHANNELS)
+    let names: Vec<_> = (0..=ViewerChannels::CAP)
         .map(|number| format!("/t{number}"))
         .collect();
     let names: Vec<_> = names.iter().map(String::as_str).collect();
@@ -110,7 +111,42 @@ async fn topics_beyond_the_cap_have_no_channel() {
         })
         .collect();
     let table = registry.update(&snapshot, false).await;
-    assert_eq!(table.channels.len(), MAX_CHANNELS);
+    assert_eq!(table.channels.len(), ViewerChannels::CAP);
+    assert_driven::<ViewerChannels>();
+}
+
+#[tokio::test]
+async fn a_viewer_with_all_subscriptions_that_it_may_have_is_closed_at_the_next() {
+    let shared = shared(MEGABYTE);
+    let names: Vec<_> = (0..ViewerSubscriptions::CAP)
+        .map(|number| format!("/t{number}"))
+        .collect();
+    let names: Vec<_> = names.iter().map(String::as_str).collect();
+    let agent = AgentFacts::new(SourceKind::Wire, Instant::now());
+    shared.latest.publish(robot(&names), agent);
+    let mut scene = Scene::of(shared).await;
+    assert_eq!(scene.json().await["op"], "serverInfo");
+    let mut wanted = Vec::new();
+    while wanted.len() < ViewerSubscriptions::CAP {
+        let advertised = scene.json().await;
+        for channel in advertised["channels"].as_array().unwrap() {
+            wanted.push(json!({"id": wanted.len(), "channelId": channel["id"]}));
+        }
+    }
+    let subscribe = |some: &[Value]| json!({"op": "subscribe", "subscriptions": some});
+    scene.send(&subscribe(&wanted)).await;
+    let subscriptions = |scene: &Scene| scene.shared.viewers.connected()[0].subscriptions;
+    while subscriptions(&scene) < ViewerSubscriptions::CAP {
+        tokio::task::yield_now().await;
+    }
+    scene.send(&subscribe(&wanted[..1])).await;
+    let close = loop {
+        if let Message::Close(close) = scene.socket.next().await.unwrap().unwrap() {
+            break close.unwrap();
+        }
+    };
+    assert_eq!(u16::from(close.code), 1008, "{close}");
+    assert_driven::<ViewerSubscriptions>();
 }
 
 /// Shared state of a live agent with one topic.

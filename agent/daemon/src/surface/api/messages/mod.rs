@@ -34,6 +34,7 @@ use ros2probe_message::{Library, Limits, MessageType, decode};
 use ros2probe_model::dispatch::Sample;
 use ros2probe_model::names::{DdsName, TypeName};
 use ros2probe_wire::DomainId;
+use ros2probe_wire::discovery::TypeHash;
 use tree::{ELEMENTS, Tree};
 
 /// Slots for streams of all listeners; each makes the agent capture all payloads of its topic.
@@ -90,7 +91,7 @@ struct Stream {
 #[derive(Clone)]
 struct Known {
     name: TypeName,
-    hash: Option<String>,
+    hash: Option<TypeHash>,
     found: Option<Arc<MessageType>>,
 }
 
@@ -319,8 +320,7 @@ impl Stream {
     async fn find(&mut self, sample: &Sample, lines: &mut Vec<u8>) -> Option<Arc<MessageType>> {
         let name = &sample.topic.message_type;
         let offered = sample.topic.offered.as_ref();
-        let hash = offered.and_then(|offered| offered.type_hash.as_ref());
-        let hash = hash.map(ToString::to_string);
+        let hash = offered.and_then(|offered| offered.type_hash);
         if let Some(known) = &self.known
             && known.name == *name
             && known.hash == hash
@@ -328,7 +328,7 @@ impl Stream {
             return known.found.clone();
         }
         let library = Arc::clone(&self.context.library);
-        let (wanted, announced) = (name.clone(), hash.clone());
+        let (wanted, announced) = (name.clone(), hash.map(|hash| hash.to_string()));
         let found = spawn_blocking(move || look_up(&library, &wanted, announced.as_deref())).await;
         let (line, found) = found.unwrap_or_else(|_| {
             let reason = "looking for its definition failed".to_owned();
