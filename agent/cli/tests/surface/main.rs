@@ -33,6 +33,7 @@ mod limits;
 mod memory_reader;
 mod metrics;
 mod otlp;
+mod otlp_captures;
 mod otlp_tls;
 mod page;
 mod recordings;

@@ -19,7 +19,7 @@ use ros2probe_testing::repository;
 use ros2probe_testing::rotel::{Export, Item, Rotel, exports};
 
 /// Values that change from one reading to the next.
-fn changes(name: &str) -> bool {
+pub(crate) fn changes(name: &str) -> bool {
     name.starts_with("process_")
         || name.starts_with("ros2probe_otlp_")
         || matches!(

@@ -2,8 +2,10 @@
 //! `prometheus-client` writes both from one collector over the catalogue and the snapshot; its
 //! registry holds no series.
 //!
-//! Classic text stays because some clients request nothing else: VictoriaMetrics, Telegraf and
-//! Netdata by default, the Datadog agent without `use_latest_spec`, and browsers.
+//! Classic text stays because some clients request nothing else: VictoriaMetrics
+//! (`lib/promscrape/client.go`), Netdata (`src/go/plugins/pkg/prometheus`) and Telegraf
+//! (`plugins/inputs/prometheus`) by default, the Datadog agent without `use_latest_spec`, and
+//! browsers.
 
 use std::fmt::{self, Write};
 use std::sync::Arc;

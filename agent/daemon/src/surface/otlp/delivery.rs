@@ -32,6 +32,18 @@ pub(super) trait Export {
     async fn export(&self, batch: &Self::Batch) -> OTelSdkResult;
 }
 
+/// Items that wait for the exporter.
+pub(super) trait Queue {
+    /// The exporter's form of items.
+    type Batch;
+
+    /// Completes once items wait.
+    async fn filled(&self);
+
+    /// Returns the oldest items, or `None` without any, and the number of items that had no room.
+    fn take(&mut self) -> (Option<Self::Batch>, u64);
+}
+
 /// An exporter that stops with the agent.
 pub(super) struct Delivery<E> {
     exporter: E,
@@ -81,6 +93,36 @@ impl<E: Export> Delivery<E> {
     /// Counts items that never became part of a batch.
     pub(super) fn overflowed(&self, items: u64) {
         self.drop(Reason::Overflow, items);
+    }
+
+    /// Delivers what is in a queue until the agent stops. Items that come within `gather` after the
+    /// first one are collected into its request.
+    pub(super) async fn drain(mut self, mut queue: impl Queue<Batch = E::Batch>, gather: Duration) {
+        let mut left = Vec::new();
+        while left.is_empty() {
+            let gathered = async {
+                queue.filled().await;
+                sleep(gather).await;
+            };
+            tokio::select! {
+                () = gathered => {}
+                () = self.stopped() => break,
+            }
+            while let Some(batch) = self.next(&mut queue) {
+                if self.deliver(&batch, None).await == Settled::Stopped {
+                    left.push(batch);
+                    break;
+                }
+            }
+        }
+        left.extend(std::iter::from_fn(|| self.next(&mut queue)));
+        self.finish(left).await;
+    }
+
+    fn next(&self, queue: &mut impl Queue<Batch = E::Batch>) -> Option<E::Batch> {
+        let (batch, overflowed) = queue.take();
+        self.overflowed(overflowed);
+        batch
     }
 
     /// Delivers a batch until it is answered, until `newer`, or until the agent stops.

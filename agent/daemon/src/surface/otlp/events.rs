@@ -16,12 +16,12 @@ use opentelemetry_sdk::logs::{
 };
 use ros2probe_wire::Timestamp;
 
-use super::delivery::{Delivery, Export, Settled};
+use super::delivery::{Export, Queue};
 use crate::events::EventLog;
 use crate::events::{self, Batch, Reader, Record, Value};
 
 /// Time for which events are collected into one request.
-const GATHER: Duration = Duration::from_millis(500);
+pub(super) const GATHER: Duration = Duration::from_millis(500);
 /// Largest number of events per request: about 200 KB.
 const MOST: usize = 256;
 
@@ -63,50 +63,6 @@ impl Reporter {
         }
     }
 
-    /// Exports until the agent stops.
-    pub(super) async fn run(mut self, mut delivery: Delivery<LogExport>) {
-        let mut left = Vec::new();
-        while left.is_empty() && self.gather(&delivery).await {
-            while let Some(batch) = self.take(&delivery) {
-                if delivery.deliver(&batch, None).await == Settled::Stopped {
-                    left.push(batch);
-                    break;
-                }
-            }
-        }
-        left.extend(std::iter::from_fn(|| self.take(&delivery)));
-        delivery.finish(left).await;
-    }
-
-    /// Waits for events and for those that follow shortly; returns `false` when the agent stops.
-    async fn gather(&self, delivery: &Delivery<LogExport>) -> bool {
-        let news = async {
-            self.log.wait(self.place).await;
-            tokio::time::sleep(GATHER).await;
-        };
-        tokio::select! {
-            () = news => true,
-            () = delivery.stopped() => false,
-        }
-    }
-
-    /// Returns the next events; `None` if there are no new ones.
-    fn take(&mut self, delivery: &Delivery<LogExport>) -> Option<Vec<SdkLogRecord>> {
-        let Batch {
-            lagged,
-            records,
-            last,
-        } = self.log.read(self.place, MOST);
-        if lagged > 0 {
-            self.log.overtook(Reader::Otlp, lagged);
-            delivery.overflowed(lagged);
-        }
-        self.place = last;
-        let records = records.iter().map(|record| self.log_record(record));
-        let records: Vec<_> = records.collect();
-        (!records.is_empty()).then_some(records)
-    }
-
     fn log_record(&self, record: &Record) -> SdkLogRecord {
         let mut exported = self.logger.create_log_record();
         exported.set_timestamp(time(record.at));
@@ -122,6 +78,29 @@ impl Reporter {
             exported.add_attribute(*name, any(value));
         }
         exported
+    }
+}
+
+impl Queue for Reporter {
+    type Batch = Vec<SdkLogRecord>;
+
+    async fn filled(&self) {
+        self.log.wait(self.place).await;
+    }
+
+    fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
+        let Batch {
+            lagged,
+            records,
+            last,
+        } = self.log.read(self.place, MOST);
+        if lagged > 0 {
+            self.log.overtook(Reader::Otlp, lagged);
+        }
+        self.place = last;
+        let records = records.iter().map(|record| self.log_record(record));
+        let records: Vec<_> = records.collect();
+        ((!records.is_empty()).then_some(records), lagged)
     }
 }
 

@@ -13,14 +13,14 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use super::delivery::{Delivery, Export};
-use super::events::{LogExport, Reporter};
+use super::events::{self, LogExport, Reporter};
 use super::exports::Signal;
 use super::metrics::{Collector, MetricExport};
 use super::own_log::{self, LogQueue};
 use super::points::scope;
 use super::reports::Reports;
 use super::settings::{Settings, SettingsError, Target};
-use super::traces::{SpanExport, SpanQueue, Tracing};
+use super::traces::{self, SpanExport, SpanQueue, Tracing};
 use super::transport::Transport;
 use crate::privilege::{self, Role, SpawnError};
 use crate::surface::collect::MetricSources;
@@ -159,12 +159,13 @@ impl Jobs {
             },
         )?;
         let collector = || Collector::new(sources.clone(), resource, SystemTime::now());
+        let tracing = Tracing::new(settings.host, Arc::clone(&queues.spans));
         let reporter = || Reporter::new(Arc::clone(&sources.events));
         Ok(Self {
             queues,
             metrics: metrics.map(|delivery| (collector(), delivery, settings.interval)),
             events: events.map(|delivery| (reporter(), delivery)),
-            traces: traces.map(|delivery| (Tracing::new(settings.host), delivery)),
+            traces: traces.map(|delivery| (tracing, delivery)),
             log,
         })
     }
@@ -177,17 +178,17 @@ impl Jobs {
         };
         let events = async {
             if let Some((reporter, delivery)) = self.events {
-                reporter.run(delivery).await;
+                delivery.drain(reporter, events::GATHER).await;
             }
         };
         let traces = async {
             if let Some((tracing, delivery)) = self.traces {
-                tracing.run(delivery, &self.queues.spans).await;
+                delivery.drain(tracing, traces::GATHER).await;
             }
         };
         let log = async {
             if let Some((delivery, queue)) = self.log.zip(self.queues.log.as_ref()) {
-                own_log::run(delivery, queue).await;
+                delivery.drain(&**queue, own_log::GATHER).await;
             }
         };
         tokio::join!(metrics, events, traces, log);

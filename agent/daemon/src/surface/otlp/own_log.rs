@@ -20,8 +20,7 @@ use tracing_subscriber::Layer;
 use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::registry::LookupSpan;
 
-use super::delivery::{Delivery, Settled};
-use super::events::LogExport;
+use super::delivery::Queue;
 
 /// Largest number of lines in the queue, their largest size in bytes, and the largest number in one
 /// request.
@@ -29,7 +28,7 @@ const LINES: usize = 1024;
 const LINES_BYTES: usize = 1 << 20;
 const REQUEST: usize = 256;
 /// Time for which lines are collected into one request.
-const GATHER: Duration = Duration::from_millis(500);
+pub(super) const GATHER: Duration = Duration::from_millis(500);
 /// Estimated size of a record or an attribute without its texts.
 const OVERHEAD: usize = 64;
 
@@ -98,29 +97,17 @@ impl LogQueue {
     }
 }
 
-/// Exports lines until the agent stops.
-pub(super) async fn run(mut delivery: Delivery<LogExport>, queue: &LogQueue) {
-    let mut left = Vec::new();
-    while left.is_empty() {
-        let gathered = async {
-            queue.filled().await;
-            tokio::time::sleep(GATHER).await;
-        };
-        tokio::select! {
-            () = gathered => {}
-            () = delivery.stopped() => break,
-        }
-        delivery.overflowed(queue.overflowed.swap(0, Ordering::Relaxed));
-        while let Some(lines) = queue.take() {
-            if delivery.deliver(&lines, None).await == Settled::Stopped {
-                left.push(lines);
-                break;
-            }
-        }
+impl Queue for &LogQueue {
+    type Batch = Vec<SdkLogRecord>;
+
+    async fn filled(&self) {
+        LogQueue::filled(self).await;
     }
-    left.extend(std::iter::from_fn(|| queue.take()));
-    delivery.overflowed(queue.overflowed.swap(0, Ordering::Relaxed));
-    delivery.finish(left).await;
+
+    fn take(&mut self) -> (Option<Vec<SdkLogRecord>>, u64) {
+        let overflowed = self.overflowed.swap(0, Ordering::Relaxed);
+        (LogQueue::take(self), overflowed)
+    }
 }
 
 /// Puts records into the queue.

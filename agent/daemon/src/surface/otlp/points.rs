@@ -184,14 +184,13 @@ impl Points {
     ) -> Option<usize> {
         self.attributes.clear();
         for (name, label) in metric.labels.iter().copied().zip(labels) {
-            if matches!(label, Label::Text("")) {
-                continue;
-            }
             let value = value(label, &mut self.names);
-            bytes += ATTRIBUTE_BYTES + name.len();
-            if let Value::String(text) = &value {
-                bytes += text.as_str().len();
-            }
+            let text = match &value {
+                Value::String(text) if text.as_str().is_empty() => continue,
+                Value::String(text) => text.as_str().len(),
+                _ => 0,
+            };
+            bytes += ATTRIBUTE_BYTES + name.len() + text;
             self.attributes
                 .push(KeyValue::new(Key::from_static_str(name), value));
         }
@@ -295,6 +294,7 @@ mod tests {
 
     use super::*;
     use crate::surface::catalogue::CATALOGUE;
+    use ros2probe_model::snapshot::Subscriber;
 
     fn metric(name: &str) -> &'static Metric {
         CATALOGUE.iter().find(|metric| metric.name == name).unwrap()
@@ -404,6 +404,30 @@ mod tests {
             (latency.count, latency.bucket_counts.iter().sum()),
             (2, 2_u64)
         );
+    }
+
+    #[test]
+    fn a_label_whose_text_is_empty_is_no_attribute() {
+        let mut points = empty();
+        points.begin(1);
+        let subscriber = metric("ros2_subscriber_received_messages_total");
+        points.open(subscriber);
+        let labels = subscriber.labels.iter().map(|label| match *label {
+            "subscriber" => Label::Subscriber(Subscriber::Unknown),
+            "topic" => Label::Text("/points"),
+            _ => Label::Text(""),
+        });
+        points.number(&labels.collect::<Vec<_>>(), Number::Count(1));
+        let [family] = &families(&points.end())[..] else {
+            panic!("one family")
+        };
+        let Some(Data::Sum(sum)) = &family.data else {
+            panic!("{family:?}")
+        };
+        let [point] = &sum.data_points[..] else {
+            panic!("{sum:?}")
+        };
+        assert_eq!(point.attributes, [attribute("topic", text("/points"))]);
     }
 
     #[test]

@@ -20,7 +20,7 @@ use opentelemetry_sdk::trace::{SpanData, SpanEvents, SpanExporter as _, SpanLink
 use ros2probe_wire::Timestamp;
 use tokio::sync::Notify;
 
-use super::delivery::{Delivery, Export, Settled};
+use super::delivery::{Export, Queue};
 use super::events::time;
 use super::exports::{Exports, Reason, Signal};
 use super::points::scope;
@@ -33,7 +33,7 @@ use ros2probe_model::trace::{Span, SpanStage, Spans};
 /// Largest number of spans in one request.
 const REQUEST: usize = 512;
 /// Time for which spans are collected into one request.
-const GATHER: Duration = Duration::from_secs(1);
+pub(super) const GATHER: Duration = Duration::from_secs(1);
 /// W3C trace flags: sampled, and a random trace id.
 const FLAGS: u8 = 0b11;
 
@@ -128,11 +128,31 @@ impl Export for SpanExport {
     }
 }
 
-/// Converts spans to the SDK's form.
+/// Converts spans of the queue to the SDK's form.
 pub(super) struct Tracing {
+    queue: Arc<SpanQueue>,
     /// Identity of this host, for ids of its own spans.
     host: u128,
     scope: InstrumentationScope,
+}
+
+impl Queue for Tracing {
+    type Batch = Vec<SpanData>;
+
+    async fn filled(&self) {
+        self.queue.filled().await;
+    }
+
+    /// The sink counts spans that have no room.
+    fn take(&mut self) -> (Option<Vec<SpanData>>, u64) {
+        let spans = self.queue.take();
+        let exported = spans.iter().map(|span| match span {
+            QueuedSpan::Message(span) => self.of_message(span),
+            QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
+        });
+        let exported: Vec<_> = exported.collect();
+        ((!exported.is_empty()).then_some(exported), 0)
+    }
 }
 
 /// The parts of a span that depend on its kind.
@@ -148,45 +168,12 @@ struct Parts {
 }
 
 impl Tracing {
-    pub(super) fn new(host: u128) -> Self {
+    pub(super) fn new(host: u128, queue: Arc<SpanQueue>) -> Self {
         Self {
+            queue,
             host,
             scope: scope(),
         }
-    }
-
-    /// Exports spans from the queue until the agent stops.
-    pub(super) async fn run(self, mut delivery: Delivery<SpanExport>, queue: &SpanQueue) {
-        let mut left = Vec::new();
-        while left.is_empty() {
-            let gathered = async {
-                queue.filled().await;
-                tokio::time::sleep(GATHER).await;
-            };
-            tokio::select! {
-                () = gathered => {}
-                () = delivery.stopped() => break,
-            }
-            while let Some(batch) = self.take(queue) {
-                if delivery.deliver(&batch, None).await == Settled::Stopped {
-                    left.push(batch);
-                    break;
-                }
-            }
-        }
-        left.extend(std::iter::from_fn(|| self.take(queue)));
-        delivery.finish(left).await;
-    }
-
-    /// Returns the next spans; `None` if the queue is empty.
-    fn take(&self, queue: &SpanQueue) -> Option<Vec<SpanData>> {
-        let spans = queue.take();
-        let exported = spans.iter().map(|span| match span {
-            QueuedSpan::Message(span) => self.of_message(span),
-            QueuedSpan::Chain(span) => self.exported(chains::parts(span, self.host)),
-        });
-        let exported: Vec<_> = exported.collect();
-        (!exported.is_empty()).then_some(exported)
     }
 
     fn of_message(&self, span: &Span) -> SpanData {
@@ -356,7 +343,10 @@ mod tests {
     #[test]
     fn two_hosts_report_one_trace_in_which_each_has_its_own_part() {
         let reader = Guid::new(GuidPrefix([2; 12]), EntityId([0, 0, 1, 4]));
-        let (one, two) = (Tracing::new(1), Tracing::new(2));
+        let (one, two) = (
+            Tracing::new(1, Arc::default()),
+            Tracing::new(2, Arc::default()),
+        );
         let sent = one.of_message(&span(SpanStage::Send));
         assert_eq!(sent, two.of_message(&span(SpanStage::Send)));
         assert_eq!(sent.span_context.trace_flags().to_u8(), FLAGS);
