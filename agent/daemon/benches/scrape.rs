@@ -7,28 +7,30 @@ use ros2probe_daemon::surface::{Exposition, Format, MetricSources};
 use ros2probe_testing::sample_robot;
 
 fn scrape(criterion: &mut Criterion) {
-    let names: Vec<String> = (0..1_000)
-        .map(|index| format!("/robot/sensor_{index:04}"))
-        .collect();
-    let mut group = criterion.benchmark_group("scrape_1000_topics");
-    group.sample_size(20);
-    for (name, histograms) in [("counters", false), ("histograms", true)] {
-        let settings = Settings {
-            histograms,
-            ..Settings::default()
-        };
-        let sources = MetricSources::new(SourceKind::Wire, settings);
-        let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
-        let state = sources.latest.publish(snapshot, sample_robot::agent());
-        sources.limits.note(&state);
-        let exposition = Exposition::new(sources);
-        for format in [Format::OpenMetrics, Format::Classic] {
-            group.bench_function(format!("{name}_{format:?}"), |bencher| {
-                bencher.iter(|| exposition.render(format));
-            });
+    for count in [200, 1_000] {
+        let names: Vec<String> = (0..count)
+            .map(|index| format!("/robot/sensor_{index:04}"))
+            .collect();
+        let mut group = criterion.benchmark_group(format!("scrape_{count}_topics"));
+        group.sample_size(20);
+        for (name, histograms) in [("counters", false), ("histograms", true)] {
+            let settings = Settings {
+                histograms,
+                ..Settings::default()
+            };
+            let sources = MetricSources::new(SourceKind::Wire, settings);
+            let snapshot = sample_robot::snapshot(names.iter().map(String::as_str));
+            let state = sources.latest.publish(snapshot, sample_robot::agent());
+            sources.limits.note(&state);
+            let exposition = Exposition::new(sources);
+            for format in [Format::OpenMetrics, Format::Classic] {
+                group.bench_function(format!("{name}_{format:?}"), |bencher| {
+                    bencher.iter(|| exposition.render(format));
+                });
+            }
         }
+        group.finish();
     }
-    group.finish();
 }
 
 criterion_group!(benches, scrape);
