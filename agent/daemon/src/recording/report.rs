@@ -109,10 +109,7 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
             (topic.lost, "lost on the way"),
             (topic.not_captured, "could not be captured"),
             (topic.dropped, "dropped, the storage was too slow"),
-            (
-                topic.unwritten,
-                "not written, the storage was full",
-            ),
+            (topic.unwritten, "not written, the storage was full"),
             (topic.unannounced, "sent before their writer was announced"),
         ];
         let counts = counts.into_iter().filter(|(count, _)| *count > 0);
