@@ -49,6 +49,8 @@ pub(super) struct FileWriter {
     statistics: Statistics,
     /// Whether the file system can reserve space.
     reserves: bool,
+    /// Whether an incomplete record may follow the complete ones.
+    is_torn: bool,
 }
 
 /// Records that are not in the file yet: the current chunk's, or plain ones.
@@ -79,6 +81,7 @@ impl FileWriter {
             metadata: Vec::new(),
             statistics: Statistics::default(),
             reserves: true,
+            is_torn: false,
         };
         let mut begin = mcap::MAGIC.to_vec();
         mcap::header(&mut begin, "ros2", LIBRARY);
@@ -123,6 +126,7 @@ impl FileWriter {
                 ..Statistics::default()
             },
             reserves: true,
+            is_torn: false,
         };
         let (last, before) = match scan.chunks.split_last() {
             Some((last, before)) => (Some(last.clone()), before),
@@ -407,9 +411,14 @@ impl FileWriter {
     /// Appends all pieces or none.
     fn append(&mut self, pieces: &[&[u8]]) -> io::Result<()> {
         let length: u64 = pieces.iter().map(|piece| piece.len() as u64).sum();
+        if self.is_torn {
+            self.cut()?;
+        }
         for piece in pieces {
             if let Err(error) = self.file.write_all(piece) {
-                self.cut()?;
+                // A storage that fails may not truncate either: the next write does.
+                self.is_torn = true;
+                let _ = self.cut();
                 return Err(error);
             }
         }
@@ -423,7 +432,9 @@ impl FileWriter {
     /// Truncates the file to the last complete record.
     fn cut(&mut self) -> io::Result<()> {
         self.file.set_len(self.position)?;
-        self.file.seek(io::SeekFrom::Start(self.position)).map(drop)
+        self.file.seek(io::SeekFrom::Start(self.position))?;
+        self.is_torn = false;
+        Ok(())
     }
 
     /// Reserves space for this many bytes, and for the end of the file.

@@ -9,7 +9,6 @@ mod contents;
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::{self, DirBuilder, File};
-use std::io;
 use std::os::unix::fs::DirBuilderExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -285,11 +284,7 @@ impl Writer {
     /// Writes the waiting messages, or discards them if the storage fails: then [`Self::unwritten`]
     /// counts them as lost.
     pub fn settle(&mut self) {
-        let full = matches!(
-            self.current.as_mut().map(FileWriter::flush),
-            Some(Err(error)) if is_full(&error)
-        );
-        if full {
+        if matches!(self.current.as_mut().map(FileWriter::flush), Some(Err(_))) {
             self.give_up_waiting();
         }
     }
@@ -307,39 +302,47 @@ impl Writer {
     /// and omissions. If the storage fails, waiting messages are discarded and counted in the
     /// summary, and the file is completed in the reserved space.
     pub fn close(self, custom_data: BTreeMap<String, String>) -> Result<Summary, Error> {
-        self.close_with(custom_data, |work| work.run().map(Some))
+        match self.close_with(custom_data, |work| work.run().map(Some)) {
+            (summary, None) => Ok(summary),
+            (_, Some(error)) => Err(error),
+        }
     }
 
     /// Does the same as [`Self::close`], compressing files with `compress`. If `compress` returns
-    /// `None`, the file stays uncompressed, which [`super::reindex`] accepts.
+    /// `None`, the file stays uncompressed, which [`super::reindex`] accepts. Returns the error of
+    /// the storage beside what is in the bag; the summary alone counts what a full disk refused.
     pub fn close_with(
         mut self,
         custom_data: BTreeMap<String, String>,
         mut compress: impl FnMut(FileCompression) -> Result<Option<Compressed>, Error>,
-    ) -> Result<Summary, Error> {
+    ) -> (Summary, Option<Error>) {
         self.options.custom_data.extend(custom_data);
         let mut refused = None;
-        match self.finish_file() {
-            Err(error @ (Error::DiskFull { .. } | Error::FileTooLarge { .. })) => {
-                self.give_up_waiting();
-                // Without the summary a file is still readable, and `rp bag reindex` completes it.
-                if self.finish_file().is_err() {
-                    self.abandon_file();
-                }
-                refused = Some(error);
+        if let Err(error) = self.finish_file() {
+            self.give_up_waiting();
+            // Without the summary a file is still readable, and `rp bag reindex` completes it.
+            if self.finish_file().is_err() {
+                self.abandon_file();
             }
-            finished => finished?,
+            refused = Some(error);
         }
         for work in self.take_file_compressions() {
-            if let Some(done) = compress(work)? {
-                self.compressed(&done)?;
+            let compressed = compress(work).and_then(|done| match done {
+                Some(done) => self.compressed(&done),
+                None => Ok(()),
+            });
+            if let Err(error) = compressed {
+                refused.get_or_insert(error);
             }
         }
         match self.write_metadata_file() {
-            Err(error) if refused.is_none() && self.unwritten.is_empty() => return Err(error),
+            Err(error) if refused.is_none() && self.unwritten.is_empty() => refused = Some(error),
             _ => {}
         }
-        Ok(self.summary())
+        // The summary counts what a full disk refused.
+        let error = refused
+            .filter(|error| !matches!(error, Error::DiskFull { .. } | Error::FileTooLarge { .. }));
+        (self.summary(), error)
     }
 
     /// Returns the complete files to compress, each once. [`Self::close`] compresses the others.
@@ -575,9 +578,4 @@ impl Writer {
             topics: topics.collect(),
         }
     }
-}
-
-fn is_full(error: &io::Error) -> bool {
-    use io::ErrorKind::{FileTooLarge, QuotaExceeded, StorageFull};
-    matches!(error.kind(), StorageFull | QuotaExceeded | FileTooLarge)
 }

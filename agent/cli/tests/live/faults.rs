@@ -10,6 +10,7 @@ mod descriptors;
 mod disk;
 mod everything;
 mod identities;
+mod input_output_errors;
 mod killed;
 mod log;
 mod memory;

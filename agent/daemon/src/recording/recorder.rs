@@ -360,13 +360,9 @@ impl<'a> Recorder<'a> {
             take_back(&mut self.report, topic, messages, bytes);
         }
         let custom_data = custom_data(&self.report);
-        let closed = self.writer.close_with(custom_data, compress);
-        let (summary, close_error) = match closed {
-            Ok(summary) => (Some(summary), None),
-            Err(error) => (None, Some(error)),
-        };
+        let (summary, close_error) = self.writer.close_with(custom_data, compress);
         Finished {
-            summary,
+            summary: Some(summary),
             report: self.report,
             error: error.or(close_error),
         }

@@ -109,7 +109,10 @@ pub fn shortfalls(report: &Report) -> Vec<String> {
             (topic.lost, "lost on the way"),
             (topic.not_captured, "could not be captured"),
             (topic.dropped, "dropped, the storage was too slow"),
-            (topic.unwritten, "not written, the storage was full"),
+            (
+                topic.unwritten,
+                "not written, the storage failed or was full",
+            ),
             (topic.unannounced, "sent before their writer was announced"),
         ];
         let counts = counts.into_iter().filter(|(count, _)| *count > 0);
@@ -280,7 +283,7 @@ mod tests {
         add_written(&mut report, "/points", 100);
         take_back(&mut report, "/points", 1, 100);
         assert_eq!((report.messages, report.bytes, report.missing), (1, 100, 1));
-        assert!(shortfalls(&report)[0].ends_with("1 not written, the storage was full"));
+        assert!(shortfalls(&report)[0].ends_with("1 not written, the storage failed or was full"));
         let json = &custom_data(&report)[CUSTOM_DATA];
         assert_eq!(serde_json::from_str::<Report>(json).unwrap(), report);
     }

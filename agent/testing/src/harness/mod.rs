@@ -12,6 +12,7 @@ pub mod cgroup;
 pub mod code;
 pub mod dissection;
 pub mod event_log;
+pub mod failing_disk;
 pub mod loss;
 pub mod network;
 pub mod peer;

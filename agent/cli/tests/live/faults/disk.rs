@@ -263,12 +263,12 @@ fn directories_of_another_user(
     disk.accepts(counted, "own")
 }
 
-fn writes(page: &Scrape, outcome: &'static str) -> f64 {
+pub(super) fn writes(page: &Scrape, outcome: &'static str) -> f64 {
     page.sum("ros2probe_state_writes_total", &[("outcome", outcome)])
 }
 
 /// Others read so many messages in it, to its end.
-fn readable(bag: &Path, messages: u64) -> Result<()> {
+pub(super) fn readable(bag: &Path, messages: u64) -> Result<()> {
     let mut found = 0;
     for entry in fs::read_dir(bag)? {
         let path = entry?.path();

@@ -1,0 +1,199 @@
+//! A disk whose reads, writes, syncs and names fail with EIO, as those of a dying one do.
+
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context as _, Result, ensure};
+use serde_json::Value;
+
+use super::disk::{readable, writes};
+use super::{Counted, Scene};
+use ros2probe_testing::harness::agent::ON_THE_WIRE;
+use ros2probe_testing::harness::failing_disk::{Failing, FailingDisk};
+use ros2probe_testing::harness::network::Link;
+use ros2probe_testing::harness::soak::outcome;
+use ros2probe_testing::harness::wait_until;
+
+/// Longest time of an answer, and until a recording ends.
+const PROMPT: Duration = Duration::from_secs(10);
+const EIO: &str = "Input/output error";
+
+struct Robot<'a, 'b> {
+    scene: &'a Scene<'b>,
+    disk: &'a FailingDisk,
+    place: &'a Path,
+}
+
+impl Robot<'_, '_> {
+    fn writes(&self, outcome: &'static str) -> Result<f64> {
+        Ok(writes(&self.scene.agent.scrape()?, outcome))
+    }
+
+    /// Starts a recording.
+    fn record(&self, name: &str) -> Result<()> {
+        let body = format!(r#"{{"name": "{name}"}}"#);
+        let (status, begun) = self.scene.ask("POST", "/recordings", &body)?;
+        ensure!(status == 201, "{status} {begun}");
+        Ok(())
+    }
+
+    /// A recording that begins now is refused with the reason, soon and without a trace.
+    fn refuses(&self, name: &str) -> Result<()> {
+        let began = Instant::now();
+        let body = format!(r#"{{"name": "{name}"}}"#);
+        let (status, problem) = self.scene.ask("POST", "/recordings", &body)?;
+        let detail = problem["detail"].as_str().unwrap_or_default();
+        ensure!(
+            (500..600).contains(&status) && detail.contains(EIO) && began.elapsed() < PROMPT,
+            "{status} {problem} after {:?}",
+            began.elapsed()
+        );
+        Ok(())
+    }
+
+    /// Waits until a part of a recording is on the disk.
+    fn is_on_the_disk(&self, name: &str) -> Result<()> {
+        wait_until("some of it is on the disk", || {
+            let (_, now) = self.scene.ask("GET", &format!("/recordings/{name}"), "")?;
+            Ok(now["file_bytes"]
+                .as_u64()
+                .is_some_and(|bytes| bytes > 100_000))
+        })
+    }
+
+    /// Waits until a recording has ended, and returns the reason and the messages in its bag.
+    fn ended(&self, name: &str) -> Result<(String, u64)> {
+        let path = format!("/recordings/{name}");
+        wait_until(&format!("{name} ends"), || {
+            Ok(self.scene.ask("GET", &path, "")?.1["state"] == "ended")
+        })?;
+        let (_, ended) = self.scene.ask("GET", &path, "")?;
+        let error = ended["error"].as_str().unwrap_or_default();
+        ensure!(error.contains(EIO) && ended["files"] == 1, "{ended}");
+        let kept = ended["report"]["messages"].as_u64();
+        Ok((error.to_owned(), kept.context("no count")?))
+    }
+
+    /// Checks that the bag of a recording that failed has the messages that it counts: as it is,
+    /// and after it was completed.
+    fn has_kept(&self, name: &str, messages: u64) -> Result<()> {
+        ensure!(messages >= 100, "{name}: {messages} messages");
+        let bag = self.place.join("bags").join(name);
+        let bytes = fs::read(bag.join(format!("{name}_0.mcap")))?;
+        let options = mcap::read::Options::IgnoreEndMagic;
+        let found = mcap::MessageStream::new_with_options(&bytes, options.into())?;
+        let found = found.take_while(Result::is_ok).count() as u64;
+        ensure!(found == messages, "{name}: {found} of {messages} messages");
+        ros2probe_bag::reindex::reindex(&bag, ros2probe_wire::Expansion::Limited)?;
+        readable(&bag, messages)
+    }
+
+    /// Everything is written again: the state with this node, and a recording.
+    fn recovers(&self, counted: &mut Counted, node: &str, name: &str) -> Result<()> {
+        let written = self.writes("written")?;
+        self.disk.fail(Failing::NOTHING);
+        wait_until("a state write", || Ok(self.writes("written")? > written))?;
+        let text = fs::read_to_string(self.place.join("state/discovery.json"))?;
+        serde_json::from_str::<Value>(&text).context("half a state")?;
+        ensure!(text.contains(node), "{text}");
+        self.record(name)?;
+        counted.talk(320, 40)?;
+        let (status, ended) = self
+            .scene
+            .ask("DELETE", &format!("/recordings/{name}"), "")?;
+        ensure!(
+            status == 200 && ended["error"].is_null() && ended["report"]["messages"] == 40,
+            "{status} {ended}"
+        );
+        readable(&self.place.join("bags").join(name), 40)
+    }
+}
+
+#[test]
+fn a_disk_that_answers_eio_costs_what_should_lie_there_and_no_message() -> Result<()> {
+    let link = Link::new()?;
+    let directory = tempfile::tempdir()?;
+    let place = directory.path().join("disk");
+    fs::create_dir(&place)?;
+    let disk = FailingDisk::mount(&place)?;
+    ["state", "bags"]
+        .iter()
+        .try_for_each(|name| fs::create_dir(place.join(name)))?;
+    let configuration = format!(
+        "watch: [/**]\nstate_directory: {0}/state\nrecordings:\n  directory: {0}/bags\n  reserve_percent: 0\n  \
+         reserve_bytes: 0\n{ON_THE_WIRE}",
+        place.display()
+    );
+    let scene = Scene::start(&link.robot, &directory, &configuration, &[])?;
+    let robot = Robot {
+        scene: &scene,
+        disk: &disk,
+        place: &place,
+    };
+    let mut counted = Counted::start(&link, 1, "first")?;
+    scene.node_is_known("/first")?;
+    wait_until("a state", || Ok(robot.writes("written")? > 0.0))?;
+    let mut others = Vec::new();
+    for (number, failing, name) in [
+        (2, Failing::WRITES, "writes"),
+        (3, Failing::SYNCS, "syncs"),
+        (4, Failing::NAMES, "names"),
+        (5, Failing::ALL, "all"),
+    ] {
+        let failed = robot.writes("failed")?;
+        robot.record(name)?;
+        counted.talk(1400, 200)?;
+        robot.is_on_the_disk(name)?;
+        disk.fail(failing);
+        let began = Instant::now();
+        counted.talk(1400, 400)?;
+        let node = format!("node_of_{name}");
+        others.push(Counted::start(&link, number, &node)?);
+        let (error, kept) = robot.ended(name)?;
+        let took = began.elapsed();
+        ensure!(took < PROMPT, "{name}: ended after {took:?}");
+        // A file that cannot be synced is noticed when it is.
+        if failing != Failing::SYNCS {
+            robot.refuses(&format!("{name}_refused"))?;
+        }
+        wait_until("a state write that fails", || {
+            Ok(robot.writes("failed")? > failed)
+        })?;
+        scene.node_is_known(&format!("/{node}"))?;
+        counted.check(&scene.agent)?;
+        robot.recovers(&mut counted, &node, &format!("{name}_recovered"))?;
+        robot.has_kept(name, kept)?;
+        outcome(
+            &format!("EIO for {name}"),
+            &format!(
+                "the recording ends after {took:?} (\"{error}\") and its bag has the {kept} messages it counts; \
+                 state is written again; every message counted"
+            ),
+        )?;
+    }
+    // What is being recorded is not read.
+    robot.record("reads")?;
+    disk.fail(Failing::READS);
+    counted.talk(1400, 100)?;
+    let (status, ended) = scene.ask("DELETE", "/recordings/reads", "")?;
+    ensure!(
+        status == 200 && ended["report"]["messages"] == 100,
+        "{status} {ended}"
+    );
+    disk.fail(Failing::NOTHING);
+    readable(&place.join("bags/reads"), 100)?;
+    counted.check(&scene.agent)?;
+    robot.record("last")?;
+    counted.talk(1400, 200)?;
+    robot.is_on_the_disk("last")?;
+    disk.fail(Failing::ALL);
+    let log = scene.log();
+    ensure!(!log.contains("panicked"), "{log}");
+    let took = scene.end()?;
+    ensure!(disk.failures() > 0);
+    outcome(
+        "EIO for all at the end of the agent",
+        &format!("ended in {took:?}"),
+    )
+}
