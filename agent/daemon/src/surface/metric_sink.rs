@@ -9,8 +9,7 @@ use std::hash::{Hash as _, Hasher as _};
 use std::net::SocketAddr;
 
 use prometheus_client::encoding::{
-    DescriptorEncoder, EncodeLabelSet, LabelSetEncoder, LabelValueEncoder, MetricEncoder,
-    NoLabelSet,
+    DescriptorEncoder, EncodeLabelSet, LabelSetEncoder, MetricEncoder, NoLabelSet,
 };
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
@@ -131,7 +130,7 @@ impl Family<'_> {
                 for (bucket, filled) in buckets.iter_mut().zip(values.buckets()) {
                     *bucket = filled;
                 }
-                let labels = WrittenLabels::new(self.metric, labels)?;
+                let labels = LabelSet::new(self.metric, labels);
                 family
                     .encode_family(&labels)?
                     .encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
@@ -181,60 +180,15 @@ impl<'a> LabelSet<'a> {
 impl EncodeLabelSet for LabelSet<'_> {
     fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
         for (name, label) in self.names.iter().zip(self.values) {
-            encode_label(encoder, name, |value| label.write(value))?;
+            let mut encoder = encoder.encode_label();
+            let mut key = encoder.encode_label_key()?;
+            key.write_str(name)?;
+            let mut value = key.encode_label_value()?;
+            label.write(&mut value)?;
+            value.finish()?;
         }
         Ok(())
     }
-}
-
-/// The labels of a histogram: the encoder repeats them for each bucket, so their values are written
-/// as text once.
-#[derive(Debug)]
-struct WrittenLabels {
-    names: &'static [&'static str],
-    /// All values, one behind the other.
-    text: String,
-    /// Where each value ends.
-    ends: Vec<usize>,
-}
-
-impl WrittenLabels {
-    fn new(metric: &'static Metric, values: &[Label<'_>]) -> Result<Self, fmt::Error> {
-        let names = metric.labels;
-        debug_assert_eq!(names.len(), values.len(), "{}", metric.name);
-        let mut text = String::new();
-        let mut ends = Vec::with_capacity(values.len());
-        for value in values {
-            value.write(&mut text)?;
-            ends.push(text.len());
-        }
-        Ok(Self { names, text, ends })
-    }
-}
-
-impl EncodeLabelSet for WrittenLabels {
-    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
-        let mut start = 0;
-        for (name, end) in self.names.iter().zip(&self.ends) {
-            let text = self.text.get(start..*end).ok_or(fmt::Error)?;
-            encode_label(encoder, name, |value| value.write_str(text))?;
-            start = *end;
-        }
-        Ok(())
-    }
-}
-
-fn encode_label(
-    encoder: &mut LabelSetEncoder<'_>,
-    name: &str,
-    write: impl FnOnce(&mut LabelValueEncoder<'_>) -> fmt::Result,
-) -> fmt::Result {
-    let mut encoder = encoder.encode_label();
-    let mut key = encoder.encode_label_key()?;
-    key.write_str(name)?;
-    let mut value = key.encode_label_value()?;
-    write(&mut value)?;
-    value.finish()
 }
 
 impl Label<'_> {
