@@ -473,12 +473,18 @@ impl<'a> Recorder<'a> {
         Ok(Some(taken))
     }
 
-    /// Remembers the decision about a topic. Without room, an excluded one is decided again.
+    /// Remembers the decision about a topic. Excluded ones leave half of the room to others, and are
+    /// decided again beyond that.
     fn keep(&mut self, name: &str, place: TopicDecision) {
         let bytes = match &place {
             TopicDecision::Recorded(taken) => name.len() + taken.description.type_name.len(),
             TopicDecision::Excluded | TopicDecision::NoRoom => name.len(),
         };
+        let is_half_full = self.topics.len() >= RecordedTopics::CAP / 2
+            || self.names.room() < RecordedNames::CAP / 2;
+        if is_half_full && matches!(place, TopicDecision::Excluded) {
+            return;
+        }
         if bytes > self.names.room() {
             self.names.refuse();
         } else if self.topics.insert(name.to_owned(), place).is_none() {

@@ -370,3 +370,20 @@ fn long_names_and_many_writers_of_one_topic_keep_within_their_caps() {
     assert!(ended.report.no_room > 1_000, "{:?}", ended.report.no_room);
     assert_eq!(ended.report.topics["/tf"].messages, 512);
 }
+
+#[test]
+fn excluded_topics_without_end_leave_room_for_others() {
+    let directory = tempfile::tempdir().unwrap();
+    let options = FilterOptions {
+        exclude_regex: Some("/excluded_.*".to_owned()),
+        ..FilterOptions::everything()
+    };
+    let mut recorder = recorder(&directory.path().join("bag"), options);
+    for number in 0..2 * u32::try_from(RecordedTopics::CAP).unwrap() {
+        let name = format!("/excluded_{number:0>100}");
+        recorder.take(&sample_of(&name, number)).unwrap();
+    }
+    recorder.take(&sample_of("/scan", 1)).unwrap();
+    let ended = recorder.finish(None);
+    assert_eq!((ended.report.messages, ended.report.no_room), (1, 0));
+}
