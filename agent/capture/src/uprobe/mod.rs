@@ -59,9 +59,9 @@ pub enum UprobeError {
     Filter(#[from] FilterError),
 }
 
-/// Capabilities required by breakpoints in other processes, apart from those that load programs:
-/// for being told of mapped files, and for reading the mapped files of other users' processes. Perf
-/// events need the wider one on recent kernels.
+/// Returns the capabilities required by breakpoints in other processes, apart from those that load
+/// programs: for events of mapped files, and for reading mapped files of other users' processes.
+/// Perf events need the wider one on recent kernels.
 fn needed() -> [(CapabilitySet, &'static str); 2] {
     let events = match Means::of_this_kernel() {
         Means::Links => (CapabilitySet::PERFMON, "CAP_PERFMON"),

@@ -24,7 +24,7 @@ const FILE: u32 = 0o100_000;
 pub struct Failing(u32);
 
 impl Failing {
-    /// None.
+    /// No operation.
     pub const NOTHING: Self = Self(0);
     /// Reads of files and directories.
     pub const READS: Self = Self(1);

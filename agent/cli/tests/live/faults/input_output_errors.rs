@@ -172,7 +172,7 @@ fn a_disk_that_answers_eio_costs_what_should_lie_there_and_no_message() -> Resul
             ),
         )?;
     }
-    // What is being recorded is not read.
+    // A recording reads nothing.
     robot.record("reads")?;
     disk.fail(Failing::READS);
     counted.talk(1400, 100)?;
