@@ -55,7 +55,7 @@ pub(crate) struct Dispatcher {
     pub(crate) array: &'static str,
 }
 
-/// Programs in the kernel, and the maps that nobody has taken.
+/// Programs in the kernel, and the maps that remain of their object.
 pub(crate) struct Breakpoints {
     pub(crate) ebpf: Ebpf,
     /// The programs, unless aya has loaded them.

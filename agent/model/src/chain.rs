@@ -11,6 +11,7 @@
 
 pub mod causality;
 mod evidence;
+pub mod exemplar;
 pub mod expected;
 pub(crate) mod graph;
 pub mod path;

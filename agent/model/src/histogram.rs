@@ -55,19 +55,27 @@ impl Histogram {
 
     /// Adds a value in seconds. A value that is not finite is ignored.
     pub fn observe(&mut self, seconds: f64) {
-        if !seconds.is_finite() {
+        let Some(bucket) = self.bucket(seconds) else {
             return;
-        }
+        };
         if self.counts.iter().all(|count| *count == 0) {
             (self.minimum, self.maximum) = (seconds, seconds);
         }
-        let bucket = self.bounds().partition_point(|bound| seconds > *bound);
         if let Some(count) = self.counts.get_mut(bucket) {
             *count += 1;
         }
         self.sum += seconds;
         self.minimum = self.minimum.min(seconds);
         self.maximum = self.maximum.max(seconds);
+    }
+
+    /// Returns the position of the bucket of this value; `None` if the value is not finite.
+    #[must_use]
+    pub fn bucket(&self, seconds: f64) -> Option<usize> {
+        let bounds = self.bounds();
+        seconds
+            .is_finite()
+            .then(|| bounds.partition_point(|bound| seconds > *bound))
     }
 
     /// Adds all values of `other`, which must have the same bounds.

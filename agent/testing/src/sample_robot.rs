@@ -10,6 +10,7 @@ use ros2probe_daemon::agent_facts::{
     AgentFacts, ExactFacts, InterfaceFacts, SharedMemoryFacts, SourceKind,
 };
 use ros2probe_daemon::state::StateFacts;
+use ros2probe_model::chain::exemplar::Exemplars;
 use ros2probe_model::chain::expected::{ChainState, ExpectedChain, ExpectedFacts};
 use ros2probe_model::chain::path::{ChainFacts, ChainsFacts, HopHistograms, Quantiles};
 use ros2probe_model::chain::trace::{HopTimes, Method, Path, Point};
@@ -62,11 +63,13 @@ fn chains() -> ChainsFacts {
     };
     let traces: Vec<_> = (0..100).map(trace).collect();
     let mut histogram = Histogram::default();
+    let mut exemplars = Exemplars::default();
     let mut hops = vec![HopHistograms::default(); 2];
-    for points in &traces {
+    for (trace_id, points) in (1..).zip(&traces) {
         let seconds =
             |input: &Point, output: &Point| HopTimes::between(input, output).whole.as_secs_f64();
-        histogram.observe(seconds(&points[0], &points[2]));
+        let (whole, at) = (seconds(&points[0], &points[2]), points[2].published);
+        exemplars.observe(&mut histogram, whole, Some(trace_id), at);
         for (hop, ends) in hops.iter_mut().zip(points.windows(2)) {
             let times = HopTimes::between(&ends[0], &ends[1]);
             hop.whole.observe(times.whole.as_secs_f64());
@@ -89,6 +92,7 @@ fn chains() -> ChainsFacts {
             method: Some(Method::Stamps),
             state: ChainState::Slow,
             histogram,
+            exemplars: exemplars.clone(),
             latency: Quantiles::of(ends),
         }],
         chains: vec![ChainFacts {
@@ -97,6 +101,7 @@ fn chains() -> ChainsFacts {
             last: traces[99][2].published,
             traces: Arc::new(traces.into_iter().collect()),
             whole: histogram,
+            exemplars,
             hops,
         }],
     }

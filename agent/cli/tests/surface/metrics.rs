@@ -618,6 +618,32 @@ fn the_format_follows_the_accept_header() {
 }
 
 #[test]
+fn buckets_of_chains_have_exemplars_while_traces_are_exported() {
+    let sources = MetricSources::new(SourceKind::Wire, settings());
+    let snapshot = sample_robot::snapshot(["/points"]);
+    sources.latest.publish(snapshot, sample_robot::agent());
+    let exposition = Exposition::new(sources.clone());
+    let render = |format| exposition.render(format).unwrap();
+    let exemplars = |page: &str| page.matches(" # {trace_id=").count();
+    assert_eq!(exemplars(&render(Format::OpenMetrics)), 0);
+    sources.exports.enable(Signal::Traces);
+    assert_eq!(exemplars(&render(Format::Classic)), 0);
+    let page = render(Format::OpenMetrics);
+    let lines: Vec<_> = page
+        .lines()
+        .filter(|line| line.contains("trace_id"))
+        .collect();
+    let [line] = lines[..] else {
+        panic!("{lines:#?}")
+    };
+    // The newest of 100 durations of 16 ms, of which each has its own trace.
+    assert!(line.starts_with("ros2_chain_latency_seconds_bucket{le=\"0.02\","));
+    let wanted = " 100 # {trace_id=\"00000000000000000000000000000064\"} 0.016";
+    assert!(line.contains(wanted), "{line}");
+    assert_eq!(promtool(&render(Format::Classic)), "");
+}
+
+#[test]
 fn a_page_of_a_thousand_measured_topics_stays_below_16_kb_a_topic() {
     let names: Vec<String> = (0..1_000)
         .map(|index| format!("/robot/sensor_{index:04}"))

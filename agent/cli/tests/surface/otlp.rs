@@ -408,7 +408,7 @@ fn traced(
     capture: &Path,
     watches: &str,
     is_whole: impl Fn(&str) -> bool,
-) -> Vec<Item> {
+) -> (Vec<Item>, String) {
     let mut receiver = Rotel::start(&mut Command::new(Rotel::binary()), directory, None);
     let configuration = directory.join("traced.yaml");
     let yaml = format!(
@@ -425,6 +425,7 @@ fn traced(
     ];
     let mut agent = LocalAgent::replay(&mut rp(), capture, &arguments);
     agent.wait_for_log("the capture has ended");
+    let page = agent.request("GET", "/metrics", OPENMETRICS).body;
     agent.signal("-TERM");
     assert!(agent.wait().success());
     let text = receiver.wait_for("spans have come", is_whole);
@@ -433,10 +434,8 @@ fn traced(
         .iter()
         .map(|export| export.resource["service.name"].as_str());
     assert!(services.into_iter().all(|name| name == "ros2probe"));
-    exports
-        .into_iter()
-        .flat_map(|export| export.items)
-        .collect()
+    let items = exports.into_iter().flat_map(|export| export.items);
+    (items.collect(), page)
 }
 
 #[test]
@@ -445,7 +444,7 @@ fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says(
     let watch = "{topic: /chatter, trace: 1}";
     let capture = local_agent::capture();
     let is_whole = |text: &str| text.contains("settle /chatter");
-    let traced = || traced(directory.path(), &capture, watch, is_whole);
+    let traced = || traced(directory.path(), &capture, watch, is_whole).0;
     let (spans, again) = (traced(), traced());
     let identity = |span: &Item| {
         let field = |name: &str| span.fields[name].clone();
@@ -491,6 +490,8 @@ fn a_replay_gives_the_same_traces_every_time_and_they_say_what_the_capture_says(
     assert!(attributes.contains_key("source_timestamp_unix_nano"));
 }
 
+/// Accepts OpenMetrics only.
+const OPENMETRICS: &str = "Accept: application/openmetrics-text\r\n";
 /// Commands of the capture whose whole way is in `GET /chains`.
 const COMMANDS: usize = 259;
 
@@ -506,7 +507,7 @@ fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
         published.len() >= COMMANDS && last.contains("-> stamp: Str(") && last.ends_with('\n')
     };
     let traced = || traced(directory.path(), &capture, watches, is_whole);
-    let (spans, again) = (traced(), traced());
+    let ((spans, page), (again, _)) = (traced(), traced());
     let is_of_chain = |span: &&Item| span.attributes.contains_key("method");
     let of_chains: Vec<_> = spans.iter().filter(is_of_chain).collect();
     let again: Vec<_> = again.iter().filter(is_of_chain).collect();
@@ -554,6 +555,19 @@ fn a_chain_is_one_trace_with_the_spans_of_its_messages_and_nodes() {
         );
         let took = time("node /points", "End time") - time("node /points", "Start time");
         assert!(took > 12_000_000, "the filter sleeps 12 ms: {took}");
+    }
+
+    // Each exemplar is the id of such a trace.
+    for family in ["ros2_chain_latency", "ros2_chain_hop_latency"] {
+        let bucket = format!("{family}_seconds_bucket{{");
+        let lines = page.lines().filter(|line| line.starts_with(&bucket));
+        let ids = lines.filter_map(|line| {
+            let (_, exemplar) = line.split_once(" # {trace_id=\"")?;
+            Some(exemplar.split_once("\"} ").unwrap().0)
+        });
+        let ids: Vec<_> = ids.collect();
+        assert!(!ids.is_empty(), "{family}");
+        assert!(ids.iter().all(|id| traces.contains_key(*id)), "{ids:?}");
     }
 
     // The messages' own traces are apart. A publication on the traced topic links to its message.

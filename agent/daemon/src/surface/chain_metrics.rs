@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fmt;
 
+use ros2probe_model::chain::exemplar::Exemplars;
 use ros2probe_model::chain::expected::{ChainState, ExpectedFacts};
 use ros2probe_model::chain::path::Quantiles;
 use ros2probe_model::histogram::Histogram;
@@ -16,14 +17,16 @@ use crate::settings_cell::Settings;
 struct Figures<'a, const LABELS: usize> {
     labels: [Label<'a>; LABELS],
     histogram: &'a Histogram,
+    exemplars: &'a Exemplars,
     latest: Quantiles,
 }
 
-/// Writes the metrics of chains.
+/// Writes the metrics of chains, with exemplars if traces are exported.
 pub(super) fn chains(
     sink: &mut MetricSink<'_>,
     snapshot: &Snapshot,
     settings: &Settings,
+    has_traces: bool,
 ) -> fmt::Result {
     let chains = shown(&snapshot.chains.chains);
     let whole = whole(snapshot, &chains);
@@ -32,10 +35,11 @@ pub(super) fn chains(
         &metric::CHAIN_P50,
         &metric::CHAIN_P99,
     ];
-    write(sink, of_chains, &whole, settings)?;
+    let show = (settings.histograms, has_traces);
+    write(sink, of_chains, &whole, show)?;
     let hops: Vec<_> = chains.iter().flat_map(|chain| hops(chain)).collect();
     let of_hops = [&metric::HOP_LATENCY, &metric::HOP_P50, &metric::HOP_P99];
-    write(sink, of_hops, &hops, settings)?;
+    write(sink, of_hops, &hops, show)?;
     sink.family(&metric::CHAIN_STATE, |family| {
         let mut seen = BTreeSet::new();
         for facts in &snapshot.chains.expected {
@@ -65,11 +69,14 @@ fn write<const LABELS: usize>(
     sink: &mut MetricSink<'_>,
     [histogram, p50, p99]: [&'static Metric; 3],
     all: &[Figures<'_, LABELS>],
-    settings: &Settings,
+    (has_histograms, has_traces): (bool, bool),
 ) -> fmt::Result {
     sink.family(histogram, |family| {
-        let mut wanted = all.iter().filter(|_| settings.histograms);
-        wanted.try_for_each(|each| family.histogram(&each.labels, each.histogram))
+        let mut wanted = all.iter().filter(|_| has_histograms);
+        wanted.try_for_each(|each| {
+            let exemplars = Some(each.exemplars).filter(|_| has_traces);
+            family.traced_histogram(&each.labels, each.histogram, exemplars)
+        })
     })?;
     sink.family(p50, |family| {
         let mut all = all.iter();
@@ -118,6 +125,7 @@ fn whole<'a>(snapshot: &'a Snapshot, chains: &[&'a ChainFacts]) -> Vec<Figures<'
         Some(Figures {
             labels: labels(chain)?,
             histogram: &chain.whole,
+            exemplars: &chain.exemplars,
             latest: chain.between(0, chain.path.topics.len().checked_sub(1)?),
         })
     }));
@@ -133,6 +141,7 @@ fn of_expected(facts: &ExpectedFacts) -> Option<Figures<'_, 4>> {
             Label::Text(facts.method?.label()),
         ],
         histogram: &facts.histogram,
+        exemplars: &facts.exemplars,
         latest: facts.latency?,
     })
 }
@@ -163,6 +172,7 @@ fn hops(chain: &ChainFacts) -> impl Iterator<Item = Figures<'_, 6>> {
                 Label::Text(node),
             ],
             histogram: &histograms.whole,
+            exemplars: &histograms.exemplars,
             latest: chain.hop(position).whole,
         })
     })

@@ -13,7 +13,7 @@ use super::diagnosis_metrics;
 use super::foxglove::Viewers;
 use super::inside_metrics::{self, Callbacks};
 use super::metric_sink::MetricSink;
-use super::otlp::Exports;
+use super::otlp::{Exports, Signal};
 use super::ros2_daemon::Ros2DaemonFigures;
 use super::ros2_metrics::{self, TopicRows};
 use super::service_metrics;
@@ -67,6 +67,22 @@ impl MetricSources {
             lost_lines: Arc::default(),
         }
     }
+
+    /// Returns whether a page shows exemplars.
+    pub(super) fn has_exemplars(&self) -> bool {
+        let state = self.latest.state();
+        let chains = &state.known().chains;
+        let mut of_chains = chains.chains.iter().map(|chain| &chain.exemplars);
+        let mut expected = chains.expected.iter().map(|chain| &chain.exemplars);
+        self.has_traces()
+            && (of_chains.any(|all| !all.is_empty()) || expected.any(|all| !all.is_empty()))
+    }
+
+    /// Returns whether traces are exported, so that exemplars lead somewhere.
+    pub(super) fn has_traces(&self) -> bool {
+        let mut signals = self.exports.signals();
+        signals.any(|signal| signal == Signal::Traces)
+    }
 }
 
 /// Writes all metrics to `sink`; `previous` is the duration of the last collection.
@@ -85,7 +101,8 @@ pub(super) fn collect(
     ros2_metrics::graph(sink, snapshot)?;
     diagnosis_metrics::diagnoses(sink, snapshot)?;
     service_metrics::services(sink, snapshot, &settings)?;
-    chain_metrics::chains(sink, snapshot, &settings)?;
+    let has_traces = sources.has_traces();
+    chain_metrics::chains(sink, snapshot, &settings, has_traces)?;
     let deliveries = Deliveries::new(&rows.shown);
     ros2_metrics::topics(sink, &rows.shown, &settings)?;
     delivery_metrics::sums(sink, &rows.shown, &settings)?;

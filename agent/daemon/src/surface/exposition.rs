@@ -17,6 +17,7 @@ use prometheus_client::encoding::{DescriptorEncoder, prometheus_text, text};
 use prometheus_client::registry::Registry;
 
 use super::collect::{MetricSources, collect};
+use super::exemplar_lines::{ExemplarLines, Waiting};
 use super::metric_sink::MetricSink;
 
 /// The two text formats.
@@ -32,6 +33,7 @@ pub enum Format {
 #[derive(Debug)]
 pub struct Exposition {
     registry: Registry,
+    sources: MetricSources,
     last_scrape_nanoseconds: Arc<AtomicU64>,
 }
 
@@ -40,6 +42,8 @@ pub struct Exposition {
 struct Page {
     sources: MetricSources,
     last_scrape_nanoseconds: Arc<AtomicU64>,
+    /// Accepts exemplars, if the page shows them.
+    exemplars: Option<Arc<Waiting>>,
 }
 
 impl Format {
@@ -92,13 +96,14 @@ impl Exposition {
     #[must_use]
     pub fn new(sources: MetricSources) -> Self {
         let last_scrape_nanoseconds = Arc::default();
-        let mut registry = Registry::default();
-        registry.register_collector(Box::new(Page {
-            sources,
+        let page = Page {
+            sources: sources.clone(),
             last_scrape_nanoseconds: Arc::clone(&last_scrape_nanoseconds),
-        }));
+            exemplars: None,
+        };
         Self {
-            registry,
+            registry: page.registry(),
+            sources,
             last_scrape_nanoseconds,
         }
     }
@@ -120,6 +125,7 @@ impl Exposition {
     pub fn write(&self, format: Format, page: &mut impl Write) -> fmt::Result {
         let start = Instant::now();
         match format {
+            Format::OpenMetrics if self.sources.has_exemplars() => self.write_exemplars(page)?,
             Format::OpenMetrics => text::encode(page, &self.registry)?,
             Format::Classic => prometheus_text::encode(page, &self.registry)?,
         }
@@ -127,11 +133,32 @@ impl Exposition {
         self.last_scrape_nanoseconds.store(took, Ordering::Relaxed);
         Ok(())
     }
+
+    /// Writes a page whose collector and writer share exemplars.
+    fn write_exemplars(&self, page: &mut impl Write) -> fmt::Result {
+        let waiting = Arc::<Waiting>::default();
+        let collector = Page {
+            sources: self.sources.clone(),
+            last_scrape_nanoseconds: Arc::clone(&self.last_scrape_nanoseconds),
+            exemplars: Some(Arc::clone(&waiting)),
+        };
+        let mut lines = ExemplarLines::new(page, &waiting);
+        text::encode(&mut lines, &collector.registry())
+    }
+}
+
+impl Page {
+    fn registry(self) -> Registry {
+        let mut registry = Registry::default();
+        registry.register_collector(Box::new(self));
+        registry
+    }
 }
 
 impl Collector for Page {
     fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let last = Duration::from_nanos(self.last_scrape_nanoseconds.load(Ordering::Relaxed));
-        collect(&mut MetricSink::Page(encoder), &self.sources, last)
+        let mut sink = MetricSink::Page(encoder, self.exemplars.clone());
+        collect(&mut sink, &self.sources, last)
     }
 }

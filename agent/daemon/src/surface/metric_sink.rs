@@ -7,6 +7,7 @@ use std::collections::hash_map::DefaultHasher;
 use std::fmt::{self, Write as _};
 use std::hash::{Hash as _, Hasher as _};
 use std::net::SocketAddr;
+use std::sync::Arc;
 
 use prometheus_client::encoding::{
     DescriptorEncoder, EncodeLabelSet, LabelSetEncoder, MetricEncoder, NoLabelSet,
@@ -14,11 +15,13 @@ use prometheus_client::encoding::{
 use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::exemplar::Exemplar;
 use prometheus_client::registry::Unit;
+use ros2probe_model::chain::exemplar::Exemplars;
 use ros2probe_model::snapshot::Subscriber;
 use ros2probe_wire::Guid;
 use ros2probe_wire::rtps::VendorId;
 
 use super::catalogue::{Kind, Metric};
+use super::exemplar_lines::Waiting;
 use super::otlp::points::Points;
 use ros2probe_model::histogram::{BOUNDS, Histogram};
 
@@ -45,7 +48,7 @@ pub(super) enum Number {
 
 /// A scrape or export in progress.
 pub(super) enum MetricSink<'a> {
-    Page(DescriptorEncoder<'a>),
+    Page(DescriptorEncoder<'a>, Option<Arc<Waiting>>),
     Points(&'a mut Points),
 }
 
@@ -56,7 +59,7 @@ pub(super) struct Family<'a> {
 }
 
 enum FamilyOut<'a> {
-    Page(MetricEncoder<'a>),
+    Page(MetricEncoder<'a>, Option<&'a Waiting>),
     Points(&'a mut Points),
 }
 
@@ -68,12 +71,12 @@ impl MetricSink<'_> {
         samples: impl FnOnce(&mut Family<'_>) -> fmt::Result,
     ) -> fmt::Result {
         match self {
-            Self::Page(encoder) => {
+            Self::Page(encoder, waiting) => {
                 // The encoder appends the unit to the name, and for some types a suffix.
                 let (name, unit) = (metric.stem(), metric.unit.map(unit));
                 let kind = metric_type(metric.kind);
                 let family = encoder.encode_descriptor(name, metric.help, unit.as_ref(), kind)?;
-                let out = FamilyOut::Page(family);
+                let out = FamilyOut::Page(family, waiting.as_deref());
                 samples(&mut Family { metric, out })
             }
             Self::Points(points) => {
@@ -98,7 +101,7 @@ impl Family<'_> {
     /// Writes a sample of a counter, gauge or info; the value of an info is ignored.
     pub(super) fn sample(&mut self, labels: &[Label<'_>], value: impl Into<Number>) -> fmt::Result {
         let family = match &mut self.out {
-            FamilyOut::Page(family) => family,
+            FamilyOut::Page(family, _) => family,
             FamilyOut::Points(points) => {
                 points.number(labels, value.into());
                 return Ok(());
@@ -124,8 +127,21 @@ impl Family<'_> {
 
     /// Writes a histogram.
     pub(super) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) -> fmt::Result {
+        self.traced_histogram(labels, values, None)
+    }
+
+    /// Writes a histogram, with its exemplars if it has any.
+    pub(super) fn traced_histogram(
+        &mut self,
+        labels: &[Label<'_>],
+        values: &Histogram,
+        exemplars: Option<&Exemplars>,
+    ) -> fmt::Result {
         match &mut self.out {
-            FamilyOut::Page(family) => {
+            FamilyOut::Page(family, waiting) => {
+                if let Some((waiting, exemplars)) = waiting.zip(exemplars) {
+                    waiting.add(exemplars, BOUNDS.len() + 1);
+                }
                 let mut buckets = [(0.0, 0); BOUNDS.len() + 1];
                 for (bucket, filled) in buckets.iter_mut().zip(values.buckets()) {
                     *bucket = filled;
@@ -136,7 +152,7 @@ impl Family<'_> {
                     .encode_histogram::<NoLabelSet>(values.sum(), values.count(), &buckets, None)
             }
             FamilyOut::Points(points) => {
-                points.histogram(labels, values);
+                points.histogram(labels, values, exemplars);
                 Ok(())
             }
         }

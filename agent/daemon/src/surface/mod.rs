@@ -12,6 +12,7 @@ mod compressed_text;
 mod connection;
 mod delivery_metrics;
 mod diagnosis_metrics;
+mod exemplar_lines;
 pub mod exposition;
 pub mod foxglove;
 pub mod http;

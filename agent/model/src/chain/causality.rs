@@ -220,6 +220,7 @@ impl Hop {
         let trace = Trace {
             path: Arc::new(path),
             points: std::mem::take(&mut self.points),
+            trace_id: self.traced.map(|traced| traced.trace_id()),
         };
         paths.add(trace, expected);
     }

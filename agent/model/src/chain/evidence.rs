@@ -176,8 +176,8 @@ impl Evidence {
             messages: &messages.list,
             causes: &causes,
         };
-        stamped.trace(tracer);
-        traces(&messages.list, &causes)
+        let exported = stamped.trace(tracer);
+        traces(&messages.list, &causes, &exported)
     }
 
     /// Returns the findings about nodes whose outputs have new stamps although they have the rate of
@@ -374,18 +374,25 @@ fn counts<'a>(
     })
 }
 
-/// Returns the ways of messages that no accepted hop continues.
-fn traces(messages: &[&Published], causes: &[Option<usize>]) -> Vec<Trace> {
-    let messages_of = |way: Vec<usize>| -> Vec<&Published> {
+/// Returns the ways of messages that no accepted hop continues. `exported`: the trace of each
+/// message with a span.
+fn traces(
+    messages: &[&Published],
+    causes: &[Option<usize>],
+    exported: &[Option<u128>],
+) -> Vec<Trace> {
+    let trace_of = |way: Vec<usize>| {
+        // All messages of a way are in one trace.
+        let trace_id = way.iter().find_map(|index| *exported.get(*index)?);
         let message = |index| messages.get(index).copied();
-        way.into_iter().filter_map(message).collect()
+        let way: Vec<_> = way.into_iter().filter_map(message).collect();
+        trace(&way, trace_id)
     };
-    let ways = ways(causes).map(messages_of);
-    ways.filter_map(|way| trace(&way)).collect()
+    ways(causes).filter_map(trace_of).collect()
 }
 
 /// Returns the times of these messages, each of which caused the next.
-fn trace(way: &[&Published]) -> Option<Trace> {
+fn trace(way: &[&Published], trace_id: Option<u128>) -> Option<Trace> {
     let domain_id = way.first()?.output.node.domain_id;
     let topic = |message: &&Published| {
         let Output { key, node, .. } = &*message.output;
@@ -406,5 +413,6 @@ fn trace(way: &[&Published]) -> Option<Trace> {
             topics: way.iter().map(topic).collect(),
         }),
         points: way.iter().enumerate().map(point).collect(),
+        trace_id,
     })
 }

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::{DomainId, Timestamp};
 
+use super::exemplar::Exemplars;
 use super::graph::{INFRASTRUCTURE, is_stamped, key, owners};
 use super::path::Quantiles;
 use super::trace::{HopTimes, Method, Trace};
@@ -61,6 +62,8 @@ pub struct ExpectedFacts {
     pub state: ChainState,
     /// Durations since the start.
     pub histogram: Histogram,
+    /// Exemplars of these.
+    pub exemplars: Exemplars,
     /// Quantiles of the latest 256 durations.
     pub latency: Option<Quantiles>,
 }
@@ -78,6 +81,7 @@ pub(super) struct ExpectedChains {
 #[derive(Debug, Default)]
 struct Progress {
     histogram: Histogram,
+    exemplars: Exemplars,
     /// Publication of the last message, and of the first.
     recent: Bounded<ExpectedTimes, VecDeque<(Timestamp, Timestamp)>>,
 }
@@ -170,7 +174,9 @@ impl ExpectedChains {
                 continue;
             }
             let whole = HopTimes::between(first, last).whole;
-            progress.histogram.observe(whole.as_secs_f64());
+            let (histogram, exemplars) = (&mut progress.histogram, &mut progress.exemplars);
+            let whole = whole.as_secs_f64();
+            exemplars.observe(histogram, whole, trace.trace_id, last.published);
             progress.recent.push_back(pair);
         }
     }
@@ -208,6 +214,7 @@ impl ExpectedChains {
                     method: Some(*method),
                     state: progress.state(chain, now),
                     histogram: progress.histogram,
+                    exemplars: progress.exemplars.clone(),
                     latency: Quantiles::of(progress.durations()),
                 });
             }
@@ -218,6 +225,7 @@ impl ExpectedChains {
                     method: None,
                     state: ChainState::Idle,
                     histogram: Histogram::default(),
+                    exemplars: Exemplars::default(),
                     latency: None,
                 });
             }

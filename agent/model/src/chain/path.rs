@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use ros2probe_wire::Timestamp;
 
+use super::exemplar::Exemplars;
 use super::expected::{ExpectedChains, ExpectedFacts};
 use super::trace::{HopTimes, Path, Point, Trace};
 use crate::bounded::{Bounded, Counted};
@@ -32,15 +33,18 @@ struct Progress {
     traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
     count: u64,
     whole: Histogram,
+    exemplars: Exemplars,
     hops: Vec<HopHistograms>,
     last: Timestamp,
 }
 
 /// Durations of a hop since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct HopHistograms {
     /// From the publication of the input to that of the output.
     pub whole: Histogram,
+    /// Exemplars of these.
+    pub exemplars: Exemplars,
     /// From the publication of the input to its arrival at the node.
     pub transit: Histogram,
     /// From the arrival to the publication of the output.
@@ -68,6 +72,8 @@ pub struct ChainFacts {
     pub traces: Arc<Bounded<ChainTraces, VecDeque<Vec<Point>>>>,
     /// Durations from the first publication to the last.
     pub whole: Histogram,
+    /// Exemplars of these.
+    pub exemplars: Exemplars,
     /// Durations of each hop.
     pub hops: Vec<HopHistograms>,
     /// Publication of the latest last message.
@@ -111,7 +117,11 @@ impl Paths {
 
     /// Adds a message's way without regard to configured chains.
     pub(super) fn add_found(&mut self, trace: Trace) {
-        let Trace { path, points } = trace;
+        let Trace {
+            path,
+            points,
+            trace_id,
+        } = trace;
         if path.topics.len() > MAX_TOPICS {
             self.paths.refuse();
             return;
@@ -141,11 +151,12 @@ impl Paths {
             traces: Arc::default(),
             count: 0,
             whole: Histogram::default(),
+            exemplars: Exemplars::default(),
             hops: vec![HopHistograms::default(); hops],
             last,
         };
         if let Some(known) = self.paths.get_or_insert_with(path, new) {
-            known.add(points, last);
+            known.add(points, trace_id, last);
         }
     }
 
@@ -164,6 +175,7 @@ impl Paths {
             count: progress.count,
             traces: Arc::clone(&progress.traces),
             whole: progress.whole,
+            exemplars: progress.exemplars.clone(),
             hops: progress.hops.clone(),
             last: progress.last,
         });
@@ -176,10 +188,11 @@ impl Paths {
 }
 
 impl Progress {
-    fn add(&mut self, points: Vec<Point>, last: Timestamp) {
+    fn add(&mut self, points: Vec<Point>, trace_id: Option<u128>, last: Timestamp) {
         if let (Some(first), Some(end)) = (points.first(), points.last()) {
-            let whole = HopTimes::between(first, end).whole;
-            self.whole.observe(whole.as_secs_f64());
+            let whole = HopTimes::between(first, end).whole.as_secs_f64();
+            let at = end.published;
+            self.exemplars.observe(&mut self.whole, whole, trace_id, at);
         }
         for (ends, histograms) in points.windows(2).zip(&mut self.hops) {
             let [input, output] = ends else { continue };
@@ -189,7 +202,9 @@ impl Progress {
                     histogram.observe(duration.as_secs_f64());
                 }
             };
-            observe(&mut histograms.whole, Some(times.whole));
+            let (whole, at) = (times.whole.as_secs_f64(), output.published);
+            let exemplars = &mut histograms.exemplars;
+            exemplars.observe(&mut histograms.whole, whole, trace_id, at);
             observe(&mut histograms.transit, times.transit);
             observe(&mut histograms.node, times.node);
         }

@@ -47,6 +47,8 @@ pub struct Trace {
     pub path: Arc<Path>,
     /// One point for each topic.
     pub points: Vec<Point>,
+    /// Its OpenTelemetry trace, if this agent exports spans of it.
+    pub trace_id: Option<u128>,
 }
 
 /// Durations of a hop. The parts that are known add up to the whole.

@@ -18,9 +18,9 @@ use opentelemetry_proto::tonic::collector::metrics::v1::{
 };
 use opentelemetry_proto::tonic::common::v1::{InstrumentationScope, KeyValue};
 use opentelemetry_proto::tonic::metrics::v1::{
-    AggregationTemporality, Gauge, Histogram as HistogramFamily, HistogramDataPoint,
-    Metric as Family, NumberDataPoint, ResourceMetrics, ScopeMetrics, metric::Data,
-    number_data_point,
+    AggregationTemporality, Exemplar as EncodedExemplar, Gauge, Histogram as HistogramFamily,
+    HistogramDataPoint, Metric as Family, NumberDataPoint, ResourceMetrics, ScopeMetrics, exemplar,
+    metric::Data, number_data_point,
 };
 use opentelemetry_proto::tonic::resource::v1::Resource;
 use opentelemetry_sdk::error::{OTelSdkError, OTelSdkResult};
@@ -35,6 +35,7 @@ use tonic::transport::Channel;
 use super::reports;
 use super::transport::SentHeaders;
 use crate::surface::catalogue::Metric;
+use ros2probe_model::chain::exemplar::Exemplar;
 use ros2probe_model::histogram::Histogram;
 
 /// Families of such points, until they are sent.
@@ -61,11 +62,11 @@ impl Encoded {
     }
 
     /// Adds a histogram that counts since `start`, in Unix nanoseconds.
-    pub(super) fn histogram(
+    pub(super) fn histogram<'a>(
         &mut self,
         metric: &Metric,
         attributes: &[opentelemetry::KeyValue],
-        values: &Histogram,
+        (values, exemplars): (&Histogram, impl Iterator<Item = &'a Exemplar>),
         [start, now]: [u64; 2],
     ) {
         let (bounds, counts): (Vec<f64>, Vec<u64>) = values.buckets().unzip();
@@ -81,6 +82,7 @@ impl Encoded {
                 .into_iter()
                 .filter(|bound| bound.is_finite())
                 .collect(),
+            exemplars: exemplars.map(encoded).collect(),
             ..HistogramDataPoint::default()
         };
         let empty = || {
@@ -148,6 +150,15 @@ impl Encoded {
         // A family of this name was just found or added.
         let data = self.families.get_mut(last).map(|family| &mut family.data);
         data.map_or_else(|| unreachable!(), |data| data.get_or_insert_with(empty))
+    }
+}
+
+fn encoded(exemplar: &Exemplar) -> EncodedExemplar {
+    EncodedExemplar {
+        time_unix_nano: exemplar.at.0,
+        trace_id: exemplar.trace_id.get().to_be_bytes().to_vec(),
+        value: Some(exemplar::Value::AsDouble(exemplar.seconds)),
+        ..EncodedExemplar::default()
     }
 }
 

@@ -16,15 +16,18 @@ use super::instruments::{self, Instruments, REQUEST_POINTS, is_real};
 use super::starts::Starts;
 use crate::surface::catalogue::{Kind, Metric};
 use crate::surface::metric_sink::{Label, Number, write_capped};
+use ros2probe_model::chain::exemplar::Exemplars;
 use ros2probe_model::histogram::Histogram;
 
 /// Estimated size in bytes at which a request ends.
 const REQUEST_BYTES: usize = 1 << 20;
 /// Largest estimated size of a collection; further points are dropped and counted.
 const COLLECTION_BYTES: usize = 16 << 20;
-/// Estimated size of a point without attributes, of a bucket, and of an attribute without its texts.
+/// Estimated size of a point without attributes, of a bucket, of an exemplar, and of an attribute
+/// without its texts.
 const POINT_BYTES: usize = 30;
 const BUCKET_BYTES: usize = 17;
+const EXEMPLAR_BYTES: usize = 38;
 const ATTRIBUTE_BYTES: usize = 8;
 
 /// Gathers one collection after the other.
@@ -160,10 +163,18 @@ impl Points {
         }
     }
 
-    /// Adds a histogram.
-    pub(in crate::surface) fn histogram(&mut self, labels: &[Label<'_>], values: &Histogram) {
+    /// Adds a histogram, with its exemplars if it has any.
+    pub(in crate::surface) fn histogram(
+        &mut self,
+        labels: &[Label<'_>],
+        values: &Histogram,
+        exemplars: Option<&Exemplars>,
+    ) {
         let Some(metric) = self.metric else { return };
-        let bytes = POINT_BYTES + BUCKET_BYTES * values.buckets().count();
+        let exemplars = || exemplars.into_iter().flat_map(Exemplars::iter);
+        let bytes = POINT_BYTES
+            + BUCKET_BYTES * values.buckets().count()
+            + EXEMPLAR_BYTES * exemplars().count();
         let Some(bytes) = self.attributes(metric, labels, bytes) else {
             return;
         };
@@ -171,6 +182,7 @@ impl Points {
         let start = self.starts.start(metric, labels, values.count() as f64);
         self.encoded_has_room(bytes);
         let encoded = &mut self.encoded.points;
+        let values = (values, exemplars());
         encoded.histogram(metric, &self.attributes, values, [start, self.now]);
     }
 
@@ -354,7 +366,7 @@ mod tests {
         points.open(metric("ros2probe_build_info"));
         points.number(&[Label::Text("1"), Label::Text("")], Number::Count(44));
         points.open(metric("ros2_topic_latency_seconds"));
-        points.histogram(&topic, &histogram);
+        points.histogram(&topic, &histogram, None);
         let collection = points.end();
         assert_eq!((items(&collection), collection.batches.len()), (4, 3));
 

@@ -284,6 +284,7 @@ fn traces(
         traces.push(Trace {
             path: Arc::new(path),
             points: way.iter().map(point).collect(),
+            trace_id: None,
         });
     }
 }

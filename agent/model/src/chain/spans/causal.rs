@@ -32,6 +32,13 @@ pub(in crate::chain) struct Step<'a> {
     pub(in crate::chain) output: Point,
 }
 
+impl Traced {
+    /// Returns the id of the trace.
+    pub(in crate::chain) const fn trace_id(&self) -> u128 {
+        self.trace_id
+    }
+}
+
 impl Step<'_> {
     /// Completes the spans of a publication that begins a chain, if its trace is exported. `known`
     /// are the latest traced publications.

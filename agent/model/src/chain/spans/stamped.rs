@@ -37,12 +37,14 @@ struct Hop<'a> {
 }
 
 impl Stamped<'_> {
-    /// Completes the spans of all messages whose trace is exported.
-    pub(in crate::chain) fn trace(&self, tracer: &mut ChainTracer) {
+    /// Completes the spans of all messages whose trace is exported. Returns the trace of each
+    /// message with a span, by position; an empty list if no topic is traced.
+    pub(in crate::chain) fn trace(&self, tracer: &mut ChainTracer) -> Vec<Option<u128>> {
         let is_traced = |message: &&Published| message.output.share.is_some();
         if !self.messages.iter().any(is_traced) {
-            return;
+            return Vec::new();
         }
+        let mut exported = vec![None; self.messages.len()];
         let messages = self.messages.iter().enumerate();
         for (index, message) in messages.filter(|(_, message)| message.is_local) {
             if let Some(trace_id) = self.trace_id(index) {
@@ -50,8 +52,12 @@ impl Stamped<'_> {
                     self.pass(index, &hop, trace_id, tracer);
                 }
                 self.publish(index, message, trace_id, tracer);
+                if let Some(exported) = exported.get_mut(index) {
+                    *exported = Some(trace_id);
+                }
             }
         }
+        exported
     }
 
     /// Returns the trace of a message, or `None` if it is in no chain or not exported. If a node of
